@@ -1,0 +1,160 @@
+"""What the labels mean: SemanticKITTI's 19 training classes and the tables of other datasets.
+
+Inside the package a label is a train id 0..18 as uint8, and ``IGNORE`` (255) where there is none.
+The sources are http://www.semantic-kitti.org/dataset.html (``semantic-kitti.yaml``),
+https://www.cvlibs.net/datasets/kitti-360/documentation.php and
+https://www.nuscenes.org/nuscenes#lidarseg.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+
+IGNORE = 255
+
+NAMES = (
+    "car", "bicycle", "motorcycle", "truck", "other-vehicle", "person", "bicyclist",
+    "motorcyclist", "road", "parking", "sidewalk", "other-ground", "building", "fence",
+    "vegetation", "trunk", "terrain", "pole", "traffic-sign",
+)  # fmt: skip
+"""Class names; the position is the train id."""
+
+TRAIN_ID = {name: i for i, name in enumerate(NAMES)}
+"""Train id by class name."""
+
+COLOURS = np.array(
+    [
+        (100, 150, 245), (100, 230, 245), (30, 60, 150), (80, 30, 180), (0, 0, 255),
+        (255, 30, 30), (255, 40, 200), (150, 30, 90), (255, 0, 255), (255, 150, 255),
+        (75, 0, 75), (175, 0, 75), (255, 200, 0), (255, 120, 50), (0, 175, 0),
+        (135, 60, 0), (150, 240, 80), (255, 240, 150), (255, 0, 0),
+    ],
+    dtype=np.uint8,
+)  # fmt: skip
+"""(19, 3) RGB in SemanticKITTI's own colours, by train id."""
+
+
+@dataclass(frozen=True)
+class Taxonomy:
+    """How one dataset's class ids meet the train ids.
+
+    Args:
+        name: the dataset.
+        to_train: train id (or ``IGNORE``) of every id that the dataset knows.
+        from_train: the id to write for each train id; ``None`` where the dataset has no file format
+            that the package writes.
+    """
+
+    name: str
+    to_train: Mapping[int, int]
+    from_train: tuple[int, ...] | None = None
+
+    @cached_property
+    def _table(self) -> NDArray[np.int16]:
+        table = np.full(max(self.to_train) + 1, -1, np.int16)
+        table[list(self.to_train)] = list(self.to_train.values())
+        return table
+
+    def decode(self, ids: NDArray[np.integer], where: str = "the labels") -> NDArray[np.uint8]:
+        """Train ids of a dataset's own class ids.
+
+        Args:
+            ids: any shape, the dataset's class ids (SemanticKITTI: the lower 16 bits of the file).
+            where: what to name in the error, usually the path.
+
+        Returns:
+            The same shape as uint8: 0..18 or ``IGNORE``.
+
+        Raises:
+            DataError: on an id that the dataset does not define.
+        """
+        ids = np.asarray(ids).astype(np.int64, copy=False)
+        inside = (ids >= 0) & (ids < len(self._table))
+        train = self._table[np.where(inside, ids, 0)]
+        unknown = ~inside | (train < 0)
+        if unknown.any():
+            raise DataError(
+                f"{where}: unknown class ids {np.unique(ids[unknown])[:8].tolist()}",
+                f"class ids of {self.name}",
+                "Check that the labels belong to this dataset, or map them before reading.",
+            )
+        return train.astype(np.uint8)
+
+    def encode(self, train: NDArray[np.uint8]) -> NDArray[np.uint32]:
+        """The dataset's (static) class ids of train ids, 0 for ``IGNORE``; the inverse of ``decode``
+        up to the classes that share a train id.
+
+        Raises:
+            DataError: on a train id that is neither 0..18 nor ``IGNORE``, or where the dataset has no
+                table to write.
+        """
+        if self.from_train is None:
+            raise DataError(f"no table from train ids to {self.name}", "SemanticKITTI or KITTI-360")
+        table = np.zeros(256, np.uint32)
+        table[: len(NAMES)] = self.from_train
+        bad = (train >= len(NAMES)) & (train != IGNORE)
+        if bad.any():
+            raise DataError(f"train ids {np.unique(train[bad])[:8].tolist()}", "0..18, or 255 = ignore")
+        return table[train]
+
+
+def _by_name(table: Mapping[str, tuple[int, ...]], known: range) -> dict[int, int]:
+    """{id: train id} from {class name: ids}; the ids of ``known`` that no class names are ignored."""
+    ids = dict.fromkeys(known, IGNORE)
+    return ids | {i: TRAIN_ID[name] for name, group in table.items() for i in group}
+
+
+SEMANTIC_KITTI = Taxonomy(
+    "SemanticKITTI",
+    dict.fromkeys((0, 1, 52, 99), IGNORE)
+    | _by_name(
+        {
+            "car": (10, 252), "bicycle": (11,), "motorcycle": (15,), "truck": (18, 258),
+            "other-vehicle": (13, 16, 20, 256, 257, 259), "person": (30, 254),
+            "bicyclist": (31, 253), "motorcyclist": (32, 255), "road": (40, 60), "parking": (44,),
+            "sidewalk": (48,), "other-ground": (49,), "building": (50,), "fence": (51,),
+            "vegetation": (70,), "trunk": (71,), "terrain": (72,), "pole": (80,),
+            "traffic-sign": (81,),
+        },
+        range(0),
+    ),
+    (10, 11, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81),
+)  # fmt: skip
+"""``learning_map`` of semantic-kitti.yaml and its inverse to the static classes."""
+
+KITTI360 = Taxonomy(
+    "KITTI-360",
+    _by_name(
+        {
+            "car": (26,), "bicycle": (33,), "motorcycle": (32,), "truck": (27,),
+            "other-vehicle": (28, 29, 30, 31, 43), "person": (24,), "bicyclist": (25,),
+            "road": (7,), "parking": (9,), "sidewalk": (8,), "other-ground": (6, 10),
+            "building": (11, 34), "fence": (12, 13, 14, 35), "vegetation": (21,),
+            "terrain": (22,), "pole": (17, 18, 37, 38), "traffic-sign": (20,),
+        },
+        range(45),
+    ),
+    (26, 33, 32, 27, 43, 24, 25, 25, 7, 9, 8, 6, 11, 13, 21, 21, 22, 17, 20),
+)  # fmt: skip
+"""KITTI-360's semantic ids. Lossy: its riders have no vehicle (all become bicyclists), walls and guard
+rails become fence as in SemanticKITTI, and vegetation holds the trunks."""
+
+NUSCENES = Taxonomy(
+    "nuScenes-lidarseg",
+    _by_name(
+        {
+            "car": (17, 20), "bicycle": (14,), "motorcycle": (21,), "truck": (23,),
+            "other-vehicle": (15, 16, 18, 19, 22), "person": (2, 3, 4, 5, 6), "road": (24,),
+            "sidewalk": (26,), "other-ground": (25,), "building": (28,), "fence": (9,),
+            "vegetation": (30,), "terrain": (27,),
+        },
+        range(32),
+    ),
+)  # fmt: skip
+"""nuScenes-lidarseg's 32 ids. Lossy: ``static.manmade`` is building, poles and signs alike; a
+motorcycle or bicycle holds its rider; barriers become fence."""
