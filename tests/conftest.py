@@ -1,0 +1,63 @@
+"""Where tests find what is not in the repository, and the small scans they share."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor, presets
+
+
+def _folder(variable: str) -> Path:
+    value = os.environ.get(variable)
+    if not value:
+        pytest.skip(f"{variable} is not set")
+    path = Path(value)
+    if not path.is_dir() or not any(path.iterdir()):
+        pytest.fail(f"{variable}={value} leads to no folder with files")
+    return path
+
+
+@pytest.fixture(scope="session")
+def real_scans() -> Path:
+    """Folder with real scans of KITTI-360, SemanticKITTI, KITTI and nuScenes; skips where there is none."""
+    return _folder("LIDAR_SYNTH_REAL_SCANS")
+
+
+@pytest.fixture(scope="session")
+def golden() -> Path:
+    """Folder with numbers from running the peers' code; skips where there is none."""
+    return _folder("LIDAR_SYNTH_GOLDEN")
+
+
+@pytest.fixture(params=sorted(presets()))
+def sensor(request: pytest.FixtureRequest) -> Sensor:
+    """Every preset in turn."""
+    return presets()[request.param]
+
+
+def random_scan(sensor: Sensor, count: int = 3000, seed: int = 0) -> Scan:
+    """Points all around the sensor with reflectance, labels and instances; a few out of its view or range."""
+    rng = np.random.default_rng(seed)
+    azimuth = rng.uniform(-np.pi, np.pi, count)
+    elevation = np.radians(rng.uniform(sensor.down - 1, sensor.up + 1, count))
+    distance = np.exp(rng.uniform(np.log(max(sensor.range_min, 0.5) * 0.9), np.log(sensor.range_max * 1.1), count))
+    points = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), -np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1
+    )
+    raw = rng.choice([0, 10, 40, 50, 70, 80, 252], count).astype(np.uint32) | (
+        rng.integers(0, 50, count).astype(np.uint32) << 16
+    )
+    from lidar_synth.classes import SEMANTIC_KITTI
+
+    return Scan(
+        points=(points * distance[:, None]).astype(np.float32),
+        reflectance=(rng.integers(0, 100, count) / 100).astype(np.float32),
+        sensor=sensor,
+        label=SEMANTIC_KITTI.decode(raw & 0xFFFF),
+        raw_label=raw,
+        instance=(raw >> 16).astype(np.int32),
+        id=f"random-{seed}",
+    )

@@ -1,0 +1,210 @@
+"""Points to range image and back: inverses, invariants, and the same bits on numpy and torch."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from conftest import random_scan
+from hypothesis import given, settings
+from hypothesis.extra import numpy as hnp
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.projection import fill_points, locate, project, project_batch, unfold, unproject, unproject_batch
+from lidar_synth.projection.angles import asin, atan2, torch_asin, torch_atan2
+from lidar_synth.scan import RangeImage, Scan
+from lidar_synth.sensor import Sensor, presets
+
+SMALL = {
+    "linear": Sensor("linear", 32, 1.0, 80.0, rows=8, fov_up=10.0, fov_down=-20.0),
+    "table": Sensor("table", 16, 0.0, 80.0, elevations=(12.0, 7.0, 1.0, -2.0, -9.0, -25.0)),
+}
+
+
+def image_of(sensor: Sensor, seed: int, share: float = 0.7) -> RangeImage:
+    rng = np.random.default_rng(seed)
+    low = max(sensor.range_min * 1.001, 0.01)
+    distance = np.exp(rng.uniform(np.log(low), np.log(sensor.range_max * 0.999), sensor.shape))
+    distance[rng.random(sensor.shape) > share] = 0
+    label = np.where(distance > 0, rng.integers(0, 19, sensor.shape), IGNORE).astype(np.uint8)
+    return RangeImage(distance.astype(np.float32), sensor, {"label": label})
+
+
+@pytest.mark.parametrize("beams", [False, True])
+def test_every_cell_returns_to_itself(sensor: Sensor, beams: bool) -> None:
+    sensor = sensor.by_beams() if beams else sensor
+    image = image_of(sensor, 1)
+    back = project(unproject(image))
+    assert np.array_equal(back.mask, image.mask)
+    assert np.array_equal(back.label, image.label)
+    assert np.allclose(back.range, image.range, rtol=3e-7, atol=0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(kind=st.sampled_from(sorted(SMALL)), data=st.data())
+def test_every_cell_returns_to_itself_whatever_the_image(kind: str, data: st.DataObject) -> None:
+    sensor = SMALL[kind]
+    ranges = st.one_of(st.just(0.0), st.floats(1.5, 79.5, width=32))
+    image = RangeImage(data.draw(hnp.arrays(np.float32, sensor.shape, elements=ranges)), sensor)
+    back = project(unproject(image))
+    assert np.array_equal(back.mask, image.mask)
+    assert np.allclose(back.range, image.range, rtol=3e-7, atol=0)
+
+
+def test_a_kept_point_moves_by_at_most_half_a_cell(sensor: Sensor) -> None:
+    scan = random_scan(sensor, 20000)
+    cells = locate(scan.points, sensor)
+    image = project(scan)
+    back = unproject(image)
+    kept = cells.point[cells.point >= 0]
+    before, after = scan.points[kept].astype(np.float64), back.points.astype(np.float64)
+    elevation = [np.arcsin(p[:, 2] / np.linalg.norm(p, axis=1)) for p in (before, after)]
+    azimuth = [-np.arctan2(p[:, 1], p[:, 0]) for p in (before, after)]
+    inside = (elevation[0] <= np.radians(sensor.up)) & (elevation[0] >= np.radians(sensor.down))
+    half = np.abs(np.diff(sensor.edges)).max() / 2 if sensor.elevations is None else np.abs(np.diff(sensor.edges)).max()
+    assert inside.sum() > 5000
+    assert np.abs(elevation[1] - elevation[0])[inside].max() <= half + 1e-6
+    turned = (azimuth[1] - azimuth[0] + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(turned).max() <= np.pi / sensor.columns + 1e-6
+
+
+@pytest.mark.parametrize("name", sorted(presets()))
+def test_the_nearest_point_of_each_cell_wins_as_in_brute_force(name: str) -> None:
+    sensor = presets()[name]
+    scan = random_scan(sensor, 4000, seed=3)
+    scan = scan[np.r_[0:4000, 0:4000]]  # every point twice: the first of equals has to win
+    cells = locate(scan.points, sensor)
+    best: dict[int, int] = {}
+    for i, (cell, distance) in enumerate(zip(cells.cell, cells.range, strict=True)):
+        if cell >= 0 and (cell not in best or distance < cells.range[best[cell]]):
+            best[int(cell)] = i
+    expected = np.full(sensor.shape[0] * sensor.columns, -1)
+    expected[list(best)] = list(best.values())
+    assert np.array_equal(cells.point.reshape(-1), expected)
+    image = project(scan)
+    assert image.reflectance is not None
+    assert np.array_equal(image.reflectance[cells.point >= 0], scan.reflectance[cells.point[cells.point >= 0]])
+    assert np.all(image.label[~image.mask] == IGNORE)
+
+
+def test_range_limits_hold_before_the_scatter() -> None:
+    """A return nearer than the limit must not erase the one behind it (R2Flow masks afterwards)."""
+    sensor = SMALL["linear"]
+    points = np.array([[0.5, 0, 0], [20, 0, 0], [90, 0, 0], [0, 0, 0]], np.float32)
+    image = project(Scan(points, np.arange(4, dtype=np.float32) / 4, sensor))
+    assert image.range[image.mask].tolist() == [20.0]
+    assert locate(points, sensor).cell.tolist().count(-1) == 3
+
+
+def test_conventions() -> None:
+    """Straight ahead is the edge between W/2-1 and W/2, columns run clockwise, the seam is behind, row 0 is up."""
+    sensor = SMALL["linear"]
+    points = np.array(
+        [[9, -0.1, 0], [9, 0.1, 0], [0.01, -9, 0], [-9, 0.1, 0], [-9, -0.1, 0], [9, -0.1, 1.5]], np.float32
+    )
+    cell = locate(points, sensor).cell
+    assert (cell % 32).tolist() == [16, 15, 23, 0, 31, 16]
+    assert cell[5] // 32 < cell[0] // 32
+    straight_up = locate(np.array([[0, 0, 9], [0, 0, -9]], np.float32), sensor).cell
+    assert (straight_up // 32).tolist() == [0, 7]
+
+
+@settings(max_examples=200, deadline=None)
+@given(hnp.arrays(np.float32, (50, 2), elements=st.floats(-200, 200, width=32)))
+def test_angles_are_right_and_the_same_in_torch(xy: np.ndarray) -> None:
+    xy = xy + np.float32(0)  # without negative zeros, whose side of the seam is a matter of taste
+    y, x = torch.from_numpy(xy).unbind(-1)
+    ours = np.array([atan2(b, a) for b, a in xy], np.float32)
+    assert np.abs(ours - np.arctan2(*xy.astype(np.float64).T)).max() < 5e-7
+    assert np.array_equal(ours, torch_atan2(y, x).numpy())
+    s = np.clip(xy[:, 0] / 200, -1, 1).astype(np.float32)
+    ours = np.array([asin(v) for v in s], np.float32)
+    assert np.abs(ours - np.arcsin(s.astype(np.float64))).max() < 5e-7
+    assert np.array_equal(ours, torch_asin(torch.from_numpy(s)).numpy())
+
+
+def devices() -> list[str]:
+    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+@pytest.mark.parametrize("device", devices())
+@pytest.mark.parametrize("beams", [False, True])
+def test_batches_on_any_device_are_the_same_cell_for_cell(sensor: Sensor, device: str, beams: bool) -> None:
+    sensor = sensor.by_beams() if beams else sensor
+    scans = [random_scan(sensor, n, seed) for seed, n in enumerate((5000, 1, 3000))]
+    points = np.concatenate([np.c_[s.points, s.reflectance, s.label] for s in scans]).astype(np.float32)
+    offsets = torch.tensor(np.cumsum([0, *map(len, scans)]), device=device)
+    batch = project_batch(torch.from_numpy(points).to(device), offsets, sensor)
+    for b, scan in enumerate(scans):
+        image, cells = project(scan), locate(scan.points, sensor)
+        assert np.array_equal(batch.range[b].cpu().numpy(), image.range)
+        assert np.array_equal(batch.channels[b, 0].cpu().numpy(), image.reflectance)
+        shown = batch.point[b].cpu().numpy()
+        assert np.array_equal(shown - np.where(shown >= 0, int(offsets[b]), 0), cells.point)
+        xyz = unproject_batch(batch.range[b : b + 1], sensor)[0].cpu().numpy()
+        assert np.array_equal(xyz[:, image.mask].T, unproject(image).points)
+
+
+def test_unfolding_puts_each_ring_on_its_beam_even_when_rings_are_missing() -> None:
+    sensor = presets()["hdl64e_kitti360"]
+    full = image_of(sensor.by_beams(), 5, share=0.9)
+    in_file_order = {"points": [], "row": []}
+    for row in range(64):
+        order = np.argsort(-sensor.column_azimuths() % (2 * np.pi))  # counter-clockwise from straight ahead
+        order = order[full.range[row, order] > 0]
+        in_file_order["points"].append(full.range[row, order, None] * sensor.by_beams().ray_directions()[row, order])
+        in_file_order["row"].append(np.full(len(order), row))
+    points, rows = (np.concatenate(in_file_order[k]) for k in ("points", "row"))
+    for kept in (rows >= 0, rows < 39, rows >= 20, (rows < 10) | (rows > 30)):
+        scan = Scan(points[kept].astype(np.float32), np.zeros(kept.sum(), np.float32), sensor)
+        image = unfold(scan)
+        expected = np.where(np.isin(np.arange(64), rows[kept])[:, None], full.range, 0)
+        assert np.allclose(image.range, expected, rtol=3e-7)
+        assert np.array_equal(project(unproject(image)).mask, image.mask)
+    with pytest.raises(DataError, match=r"rings found for the 64 lasers.*project\(\)"):
+        unfold(scan[np.random.default_rng(0).permutation(len(scan))])
+
+
+def test_a_known_ring_needs_no_order() -> None:
+    sensor = presets()["hdl32e_nuscenes"]
+    image = image_of(sensor, 2)
+    scan = unproject(image)
+    rows = np.nonzero(image.mask)[0].astype(np.int16)
+    scan.ring = rows
+    mixed = np.random.default_rng(1).permutation(len(scan))
+    assert np.allclose(unfold(scan[mixed]).range, image.range, rtol=3e-7)
+
+
+def test_hidden_points_ask_their_neighbours() -> None:
+    sensor = SMALL["linear"]
+    wall = np.full(sensor.shape, 30, np.float32)
+    wall[3:6, 10:20] = 8  # a car before the wall
+    labels = np.where(wall < 10, 0, 12).astype(np.uint8)
+    car = unproject(RangeImage(wall, sensor))
+    hidden = sensor.ray_directions()[4, 10] * 30.2  # wall behind the car's left edge
+    beyond = sensor.ray_directions()[4, 15] * 95  # outside the range limits
+    points = np.concatenate([car.points, hidden[None], beyond[None]]).astype(np.float32)
+    cells = locate(points, sensor)
+    filled = fill_points(labels, project(car).range, cells)
+    assert np.array_equal(filled[:-2], labels[wall > 0])
+    assert filled[-2:].tolist() == [12, IGNORE]
+    with pytest.raises(DataError, match="odd window"):
+        fill_points(labels, wall, cells, window=4)
+
+
+def test_bad_input_is_refused() -> None:
+    sensor = SMALL["linear"]
+    scan = random_scan(sensor, 10)
+    with pytest.raises(DataError, match="float32"):
+        locate(scan.points.astype(np.float64), sensor)
+    with pytest.raises(ConfigError, match="no \\['colour'\\]"):
+        project(scan, channels=["colour"])
+    with pytest.raises(DataError, match=r"\(H, W\)|rows and columns"):
+        RangeImage(np.zeros((3, 3), np.float32), sensor)
+    with pytest.raises(DataError, match="non-finite"):
+        unproject(RangeImage(np.full(sensor.shape, np.nan, np.float32), sensor))
+    with pytest.raises(DataError, match="offsets"):
+        project_batch(torch.zeros(4, 3), torch.tensor([0, 5]), sensor)
+    with_nan = scan.points.copy()
+    with_nan[0] = np.nan
+    assert locate(with_nan, sensor).cell[0] == -1
