@@ -27,7 +27,7 @@ def ring_numbers(points: NDArray[np.float32]) -> NDArray[np.int16]:
     Args:
         points: (N, 3) float32 metres, in the order of the file.
     """
-    first = (points[:, 0] > 0) & (points[:, 1] >= 0)
+    first = (points[:, 0] >= 0) & (points[:, 1] >= 0)
     fourth = (points[:, 0] >= 0) & (points[:, 1] < 0)
     starts = np.zeros(len(points), np.int16)
     starts[1:] = fourth[:-1] & first[1:]

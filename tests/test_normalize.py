@@ -1,0 +1,72 @@
+"""Ranges, reflectance and labels to tensors and back."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis.extra import numpy as hnp
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.normalize import (
+    NORMALISATIONS,
+    Normalisation,
+    decode_labels,
+    decode_reflectance,
+    encode_labels,
+    encode_reflectance,
+)
+
+
+@pytest.mark.parametrize("name", sorted(NORMALISATIONS))
+@given(distances=hnp.arrays(np.float32, 40, elements=st.floats(0, 100, width=32)))
+def test_decode_inverts_encode_inside_the_limits_and_drops_the_rest(name: str, distances: np.ndarray) -> None:
+    scale = NORMALISATIONS[name]
+    d = torch.from_numpy(distances)
+    x = scale.encode(d)
+    assert x.abs().max() <= 1
+    near_limit = (d / scale.range_min - 1).abs().minimum((d / scale.range_max - 1).abs()) < 1e-5
+    expected = torch.where(scale.inside(d), d, 0)
+    assert torch.allclose(scale.decode(x)[~near_limit], expected[~near_limit], rtol=2e-5)
+    assert Normalisation(**scale.to_dict()) == scale
+
+
+def test_no_return_is_minus_one_and_the_farthest_return_one() -> None:
+    scale = NORMALISATIONS["r2flow"]
+    x = scale.encode(torch.tensor([0.0, 79.9999, 1.45, 80.0]))
+    assert x.tolist() == [-1, pytest.approx(1, abs=1e-6), -1, -1]
+    assert scale.decode(torch.tensor([-3.0, -1.0, 1.0, 3.0])).tolist() == [0, 0, 0, 0]  # 80 m is outside
+
+
+def test_reflectance() -> None:
+    r = torch.linspace(0, 1, 11)
+    assert torch.allclose(decode_reflectance(encode_reflectance(r)), r, atol=1e-7)
+    assert decode_reflectance(torch.tensor([-2.0, 2.0])).tolist() == [0, 1]
+
+
+@given(noise=st.floats(-0.45, 0.45), seed=st.integers(0, 100))
+def test_labels_survive_any_noise_below_half_a_bit(noise: float, seed: int) -> None:
+    label = torch.cat([torch.arange(19), torch.tensor([IGNORE])]).to(torch.uint8).view(1, 4, 5)
+    bits = encode_labels(label)
+    signs = torch.randint(0, 2, bits.shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+    decoded, confidence = decode_labels(bits + noise * signs)
+    assert torch.equal(decoded, label)
+    assert torch.allclose(confidence, torch.full_like(confidence, 1 - abs(noise)), atol=1e-6)
+
+
+def test_the_code_is_five_bits_highest_first_and_19_for_no_label() -> None:
+    bits = encode_labels(torch.tensor([[[0, 18, IGNORE]]], dtype=torch.uint8))
+    assert bits[0, :, 0].T.tolist() == [[-1] * 5, [1, -1, -1, 1, -1], [1, -1, -1, 1, 1]]
+    assert decode_labels(torch.zeros(1, 5, 1, 1))[1].item() == 0
+    label, confidence = decode_labels(torch.ones(1, 5, 1, 1))  # 31 is no class; 15 is one bit away
+    assert (label.item(), confidence.item()) == (15, 0)
+
+
+def test_bad_input_is_refused() -> None:
+    with pytest.raises(DataError, match=r"train ids \[20\]"):
+        encode_labels(torch.full((1, 2, 2), 20, dtype=torch.uint8))
+    with pytest.raises(ConfigError, match="log, linear or inverse"):
+        Normalisation("cubic", 1, 2)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="range_min < range_max"):
+        Normalisation("log", 5, 2)

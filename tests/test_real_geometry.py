@@ -1,0 +1,93 @@
+"""The way there and back on every full HDL-64E scan of the real datasets."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidar_synth.formats.files import read_points
+from lidar_synth.projection import fill_points, locate, project, ring_numbers, unfold, unproject
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor, load_sensor
+
+FULL_TURN = 100_000  # points; fewer is a scan cut off or cropped to a camera's view
+ROOTS = ("kitti360", "semantic_kitti", "kitti_object", "kitti_raw")
+
+
+def scans_below(root: Path) -> list[Scan]:
+    found = []
+    for path in sorted(p for folder in ROOTS for p in (root / folder).rglob("*.bin")):
+        points = read_points(path)
+        sensor = load_sensor("hdl64e_semantic_kitti" if "semantic" in str(path) else "hdl64e_kitti")
+        found.append(Scan(points[:, :3], points[:, 3], sensor, id=str(path.relative_to(root))))
+    return found
+
+
+@pytest.fixture(scope="module")
+def scans(real_scans: Path) -> list[Scan]:
+    return scans_below(real_scans)
+
+
+def elevation(points: np.ndarray) -> np.ndarray:
+    return np.arcsin(points[:, 2].astype(np.float64) / np.linalg.norm(points.astype(np.float64), axis=1))
+
+
+def test_every_cell_returns_to_itself(scans: list[Scan]) -> None:
+    full = [s for s in scans if len(s) > FULL_TURN]
+    assert len(full) >= 29
+    for scan in full:
+        for image in (project(scan), unfold(scan)):
+            back = project(unproject(image))
+            assert np.array_equal(back.mask, image.mask), scan.id
+            assert np.allclose(back.range, image.range, rtol=3e-7, atol=0), scan.id
+            assert np.array_equal(back.reflectance, image.reflectance), scan.id
+
+
+def test_a_kept_point_moves_by_at_most_half_a_cell(scans: list[Scan]) -> None:
+    for scan in scans:
+        sensor = scan.sensor
+        kept = locate(scan.points, sensor).point
+        before, after = scan.points[kept[kept >= 0]], unproject(project(scan)).points
+        seen = (elevation(before) <= np.radians(sensor.up)) & (elevation(before) >= np.radians(sensor.down))
+        half = np.radians(sensor.up - sensor.down) / sensor.shape[0] / 2
+        assert seen.mean() > 0.9
+        assert np.abs(elevation(after) - elevation(before))[seen].max() <= half + 1e-6, scan.id
+        turned = np.arctan2(after[:, 1], after[:, 0]) - np.arctan2(before[:, 1], before[:, 0])
+        turned = (turned + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(turned).max() <= np.pi / sensor.columns + 1e-6, scan.id
+
+
+def test_unfolding_finds_the_beam_of_each_ring_also_in_cut_scans(scans: list[Scan]) -> None:
+    """The truncated scan has the upper 39 rings, the camera-cropped one the upper 46: both start in row 0."""
+    rows = {s.id: np.flatnonzero(unfold(s).mask.any(axis=1)) for s in scans}
+    for scan_id, filled in rows.items():
+        count = {"drive_0052": 39, "velodyne_reduced": 46}
+        expected = next((n for key, n in count.items() if key in scan_id), 64)
+        assert filled.tolist() == list(range(expected)), scan_id
+
+
+def test_the_beam_table_is_where_the_rings_are(scans: list[Scan]) -> None:
+    """Median over full scans of each ring's elevation against the preset's ``beams``."""
+    sensor: Sensor = load_sensor("hdl64e_kitti360")
+    medians = []
+    for scan in (s for s in scans if len(s) > FULL_TURN):
+        ring = ring_numbers(scan.points)
+        assert ring[-1] == 63, scan.id
+        medians.append([np.median(elevation(scan.points[ring == i])) for i in range(64)])
+    assert np.degrees(np.abs(np.median(medians, axis=0) - sensor.laser_elevations)).max() < 0.03
+
+
+def test_labels_come_back_to_every_point(real_scans: Path) -> None:
+    """Labels shown by the cells, filled back: nearly all points of a labelled scan get their own class."""
+    points = read_points(real_scans / "semantic_kitti/sequences/00/velodyne/000000.bin")
+    raw = np.fromfile(real_scans / "semantic_kitti/sequences/00/labels/000000.label", np.uint32)
+    label = (raw & 0xFF).astype(np.uint8)
+    scan = Scan(points[:, :3], points[:, 3], load_sensor("hdl64e_semantic_kitti"), label=label)
+    image = project(scan)
+    filled = fill_points(image.label, image.range, locate(scan.points, scan.sensor))
+    shown = locate(scan.points, scan.sensor).point
+    shown = shown[shown >= 0]
+    assert np.array_equal(filled[shown], label[shown])
+    naive = image.label.reshape(-1)[locate(scan.points, scan.sensor).cell]
+    assert (filled == label).mean() > 0.985
+    assert (filled == label).mean() > (naive == label).mean()
