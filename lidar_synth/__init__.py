@@ -1,0 +1,42 @@
+"""lidar_synth: synthetic LiDAR scans for perception training.
+
+Names are imported when they are first used, so that ``import lidar_synth`` and the command line start at once.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Boxes": "scan",
+    "LidarSynthError": "errors",
+    "RangeImage": "scan",
+    "Scan": "scan",
+    "Sensor": "sensor",
+    "Source": "scan",
+    "load_sensor": "sensor",
+    "project": "projection",
+    "unfold": "projection",
+    "unproject": "projection",
+}
+
+__all__ = ["__version__", *_HOME]
+
+if TYPE_CHECKING:
+    from lidar_synth.errors import LidarSynthError as LidarSynthError
+    from lidar_synth.projection import project as project
+    from lidar_synth.projection import unfold as unfold
+    from lidar_synth.projection import unproject as unproject
+    from lidar_synth.scan import Boxes as Boxes
+    from lidar_synth.scan import RangeImage as RangeImage
+    from lidar_synth.scan import Scan as Scan
+    from lidar_synth.scan import Source as Source
+    from lidar_synth.sensor import Sensor as Sensor
+    from lidar_synth.sensor import load_sensor as load_sensor
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'lidar_synth' has no attribute {name!r}")
+    return getattr(import_module(f"lidar_synth.{_HOME[name]}"), name)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.projection.angles import Grid, asin, atan2, column_of, grid_of, row_in_table, row_of
+from lidar_synth.projection.angles import asin, atan2, column_of, grid_of, row_in_table, row_of
 from lidar_synth.scan import POINT_FIELDS, RangeImage, Scan
 from lidar_synth.sensor import Rays, Sensor
 
@@ -54,6 +54,25 @@ def _locate_block(x, y, z, grid, cell, distance):  # type: ignore[no-untyped-def
                 cell[i] = cell[i] % columns + row_in_table(asin(z[i] / distance[i]), grid.edges) * columns
 
 
+@numba.njit(error_model="numpy", cache=True, inline="always")
+def _scatter(cell, distance, start, image, index):  # type: ignore[no-untyped-def]
+    """Lets points start, start + 1, ... into their cells where they are nearer than what is there."""
+    for i in range(len(cell)):
+        c, r = cell[i], distance[i]
+        if r < image[c]:
+            image[c] = r
+            index[c] = start + i
+
+
+@numba.njit(error_model="numpy", cache=True, inline="always")
+def _close(image, index):  # type: ignore[no-untyped-def]
+    """Marks the cells that no point reached."""
+    for c in range(len(image)):
+        if image[c] == _INF:
+            image[c] = 0
+            index[c] = -1
+
+
 @numba.njit(error_model="numpy", cache=True)
 def _nearest(points, grid, image, index):  # type: ignore[no-untyped-def]
     """Fills image (H*W,) with the smallest range per cell (0 = none) and index with its point (-1)."""
@@ -65,15 +84,18 @@ def _nearest(points, grid, image, index):  # type: ignore[no-untyped-def]
         for i in range(n):
             x[i], y[i], z[i] = points[start + i, 0], points[start + i, 1], points[start + i, 2]
         _locate_block(x[:n], y[:n], z[:n], grid, cell, distance)
-        for i in range(n):
-            c, r = cell[i], distance[i]
-            if r < image[c]:
-                image[c] = r
-                index[c] = start + i
-    for c in range(len(image)):
-        if image[c] == _INF:
-            image[c] = 0
-            index[c] = -1
+        _scatter(cell[:n], distance[:n], start, image, index)
+    _close(image, index)
+
+
+@numba.njit(error_model="numpy", cache=True)
+def _nearest_in(cell, distance, image, index):  # type: ignore[no-untyped-def]
+    """``_nearest`` for points whose cells (-1 = none) are known."""
+    image[:] = _INF
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            _scatter(cell[i : i + 1], distance[i : i + 1], i, image, index)
+    _close(image, index)
 
 
 @numba.njit(error_model="numpy", cache=True)
@@ -113,11 +135,24 @@ def locate(points: NDArray[np.float32], sensor: Sensor) -> Cells:
         sensor: whose grid.
     """
     points = _checked(points)
-    grid = grid_of(sensor)
     cell, distance = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
-    _locate(points, grid, cell, distance)
-    _, index = _show(points, grid)
-    return Cells(cell, distance, index.reshape(sensor.shape))
+    _locate(points, grid_of(sensor), cell, distance)
+    return Cells(cell, distance, nearest_in(cell, distance, sensor)[1])
+
+
+def nearest_in(
+    cell: NDArray[np.int32], distance: NDArray[np.float32], sensor: Sensor
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """(H, W) range and (H, W) point of the nearest of the points in each cell, the first among equals.
+
+    Args:
+        cell: (N,) row * W + column, -1 = none.
+        distance: (N,) metres.
+        sensor: whose grid.
+    """
+    image, index = np.empty(sensor.shape, np.float32), np.empty(sensor.shape, np.int32)
+    _nearest_in(cell, distance, image.reshape(-1), index.reshape(-1))
+    return image, index
 
 
 def project(scan: Scan, sensor: Sensor | None = None, channels: Iterable[str] | None = None) -> RangeImage:
@@ -139,8 +174,9 @@ def project(scan: Scan, sensor: Sensor | None = None, channels: Iterable[str] | 
         DataError: on points that are not float32.
     """
     sensor = sensor or scan.sensor
-    image, index = _show(_checked(scan.points), grid_of(sensor))
-    return RangeImage(image.reshape(sensor.shape), sensor, carry(scan, index.reshape(sensor.shape), channels))
+    image, index = np.empty(sensor.shape, np.float32), np.empty(sensor.shape, np.int32)
+    _nearest(_checked(scan.points), grid_of(sensor), image.reshape(-1), index.reshape(-1))
+    return RangeImage(image, sensor, carry(scan, index, channels))
 
 
 def carry(scan: Scan, index: NDArray[np.int32], channels: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
@@ -188,13 +224,6 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
     fields: dict[str, Any] = {name: v.reshape(-1)[index] for name, v in image.channels.items() if name in POINT_FIELDS}
     fields.setdefault("reflectance", np.zeros(count, np.float32))
     return Scan(points, sensor=image.sensor, **fields)
-
-
-def _show(points: NDArray[np.float32], grid: Grid) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    image = np.empty(grid.rows * grid.columns, np.float32)
-    index = np.empty(grid.rows * grid.columns, np.int32)
-    _nearest(points, grid, image, index)
-    return image, index
 
 
 def _checked(points: NDArray[Any]) -> NDArray[np.float32]:

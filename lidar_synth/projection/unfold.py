@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.projection.angles import grid_of
-from lidar_synth.projection.spherical import carry, locate
+from lidar_synth.projection.spherical import carry, locate, nearest_in
 from lidar_synth.scan import RangeImage, Scan
 from lidar_synth.sensor import Sensor
 
@@ -27,10 +26,9 @@ def ring_numbers(points: NDArray[np.float32]) -> NDArray[np.int16]:
     Args:
         points: (N, 3) float32 metres, in the order of the file.
     """
-    first = (points[:, 0] >= 0) & (points[:, 1] >= 0)
-    fourth = (points[:, 0] >= 0) & (points[:, 1] < 0)
-    starts = np.zeros(len(points), np.int16)
-    starts[1:] = fourth[:-1] & first[1:]
+    ahead, left = points[:, 0] >= 0, points[:, 1] >= 0
+    starts = np.zeros(len(points), bool)
+    starts[1:] = (ahead[:-1] & ~left[:-1]) & (ahead[1:] & left[1:])
     return np.cumsum(starts, dtype=np.int16)
 
 
@@ -39,8 +37,8 @@ def _rows_by_elevation(elevations: NDArray[np.float64], beams: NDArray[np.float3
     distance = np.abs(elevations[:, None] - beams[None].astype(np.float64))
     total = np.full((len(elevations) + 1, len(beams) + 1), np.inf)
     total[0] = 0
-    for ring, row_distance in enumerate(distance):
-        total[ring + 1, 1:] = np.minimum.accumulate(total[ring, :-1] + row_distance)
+    for ring, to_beam in enumerate(distance):
+        total[ring + 1, 1:] = np.minimum.accumulate(total[ring, :-1] + to_beam)
     rows = np.empty(len(elevations), np.int64)
     end = len(beams)
     for ring in reversed(range(len(elevations))):
@@ -55,7 +53,7 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
     Args:
         scan: N points in raw ring order, or in any order with ``scan.ring`` known.
         sensor: whose lasers and columns; the scan's own by default.
-        anchor: how a ring finds its row.
+        anchor: how a ring finds its row, where ``scan.ring`` does not tell it.
 
     Returns:
         An image on ``sensor.by_beams()``, whose rays point where the lasers do.
@@ -64,34 +62,34 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         DataError: on more rings than the sensor has lasers: the scan is not in ring order.
     """
     lasers = (sensor or scan.sensor).by_beams()
-    rings = scan.ring if scan.ring is not None else ring_numbers(scan.points)
-    present, ring = np.unique(rings, return_inverse=True)
-    if len(present) > lasers.shape[0]:
+    height, width = lasers.shape
+    cell, distance, _ = locate(scan.points, lasers)
+    if scan.ring is not None:
+        rows, ring = np.arange(height), scan.ring
+    else:
+        ring = ring_numbers(scan.points)
+        rows = _rows_of_rings(scan, ring, distance, lasers, anchor)
+    if len(scan) and (rows.size > height or ring.min() < 0 or ring.max() >= len(rows)):
         raise DataError(
-            f"scan {scan.id!r}: {len(present)} rings found for the {lasers.shape[0]} lasers of {lasers.name!r}",
+            f"scan {scan.id!r}: {int(ring.max()) + 1} rings found for the {height} lasers of {lasers.name!r}",
             "points ring by ring, as KITTI stores them",
             "Use project() for a scan in another order, or set scan.ring.",
         )
-    cells = locate(scan.points, lasers)
-    if scan.ring is not None:
-        rows = present.astype(np.int64)
-    elif anchor == "last":
-        rows = np.arange(len(present)) + lasers.shape[0] - len(present)
-    else:
-        elevation = np.arcsin(scan.points[:, 2] / np.maximum(cells.range, grid_of(lasers).range_min + 1e-6))
-        rows = _rows_by_elevation(
-            np.array([np.median(elevation[ring == i]) for i in range(len(present))]), lasers.laser_elevations
-        )
-    cell = np.where(cells.cell < 0, -1, rows[ring] * lasers.columns + cells.cell % lasers.columns)
-    return _nearest_of(scan, cell, cells.range, lasers)
+    cell = np.where(cell < 0, -1, rows[ring] * width + cell % width).astype(np.int32)
+    image, index = nearest_in(cell, distance, lasers)
+    return RangeImage(image, lasers, carry(scan, index))
 
 
-def _nearest_of(scan: Scan, cell: NDArray[np.int64], distance: NDArray[np.float32], sensor: Sensor) -> RangeImage:
-    """The image whose cells show the nearest of their points, the first in the file among equals."""
-    seen = np.flatnonzero(cell >= 0)
-    far_first = seen[np.lexsort((-seen, -distance[seen]))]
-    index = np.full(sensor.shape[0] * sensor.columns, -1, np.int32)
-    index[cell[far_first]] = far_first
-    image = np.where(index >= 0, distance[index], np.float32(0)) if len(seen) else np.zeros(len(index), np.float32)
-    shape = sensor.shape
-    return RangeImage(image.reshape(shape), sensor, carry(scan, index.reshape(shape)))
+def _rows_of_rings(
+    scan: Scan, ring: NDArray[np.int16], distance: NDArray[np.float32], lasers: Sensor, anchor: Anchor
+) -> NDArray[np.int64]:
+    """The row of each ring; all -1 where there are more rings than rows."""
+    bounds = np.flatnonzero(np.diff(ring)) + 1
+    count = len(bounds) + 1
+    if count > lasers.shape[0]:
+        return np.full(count, -1)
+    if anchor == "last":
+        return np.arange(count) + lasers.shape[0] - count
+    sine = scan.points[:, 2] / np.where(distance > 0, distance, 1)
+    medians = np.arcsin([np.median(s) for s in np.split(sine, bounds)])
+    return _rows_by_elevation(medians, lasers.laser_elevations)

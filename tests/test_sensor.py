@@ -1,0 +1,92 @@
+"""Sensors as data."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.sensor import Sensor, load_sensor, presets
+
+DESIGN = {"hdl64e_kitti360", "hdl64e_kitti", "hdl32e_nuscenes", "os1_128", "town"}
+
+
+def test_the_presets_of_the_design_are_there() -> None:
+    assert set(presets()) >= DESIGN
+    values = {k: v for k, v in presets()["town"].to_dict().items() if k not in ("name", "description")}
+    assert values == {k: presets()["hdl64e_kitti360"].to_dict()[k] for k in values}
+
+
+def test_a_sensor_survives_yaml_pickle_and_a_file(sensor: Sensor, tmp_path: Path) -> None:
+    assert Sensor.from_dict(yaml.safe_load(yaml.safe_dump(sensor.to_dict()))) == sensor
+    assert pickle.loads(pickle.dumps(sensor)) == sensor
+    values = sensor.to_dict()
+    file = tmp_path / "mine.yaml"
+    file.write_text(yaml.safe_dump({values.pop("name"): values}))
+    assert load_sensor(file) == load_sensor(str(file)) == load_sensor(sensor) == sensor
+
+
+@pytest.mark.parametrize("rays", ["centre", "corner"])
+def test_rays_are_unit_vectors_that_follow_the_conventions(sensor: Sensor, rays: str) -> None:
+    for s in (sensor, sensor.by_beams()):
+        rays_xyz = s.ray_directions(rays)  # type: ignore[arg-type]
+        assert rays_xyz.shape == (*s.shape, 3)
+        assert np.allclose(np.linalg.norm(rays_xyz, axis=-1), 1, atol=1e-6)
+        assert np.all(np.diff(rays_xyz[:, 0, 2]) < 0)  # row 0 is the highest
+        middle = s.columns // 2
+        assert rays_xyz[0, middle, 0] > 0 and rays_xyz[0, 0, 0] < 0  # ahead in the middle, the seam behind
+        assert rays_xyz[0, middle + s.columns // 4, 1] < 0  # clockwise: to the right of ahead is -y
+        assert not rays_xyz.flags.writeable
+
+
+def test_rows_lie_between_their_edges(sensor: Sensor) -> None:
+    for s in (sensor, sensor.by_beams()):
+        centres = s.row_elevations()
+        assert np.all(s.edges[:-1] > centres) and np.all(centres > s.edges[1:])
+        assert np.array_equal(s.row_elevations("corner"), s.edges[:-1])
+
+
+def test_lasers_point_where_the_table_says() -> None:
+    assert np.allclose(np.degrees(presets()["town"].laser_elevations[[0, -1]]), [2.53, -23.62], atol=1e-5)
+    linear = presets()["os1_128"]
+    assert np.array_equal(linear.laser_elevations, linear.row_elevations())
+    assert linear.by_beams() is linear
+
+
+GOOD = {"name": "x", "columns": 8, "range_min": 1.0, "range_max": 9.0, "rows": 4, "fov_up": 2.0, "fov_down": -2.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"columns": 7}, "an even number"),
+        ({"range_max": 0.5}, "range_min < range_max"),
+        ({"range_max": float("nan")}, "range_min < range_max"),
+        ({"fov_down": 3.0}, "fov_up > fov_down"),
+        ({"rows": None}, "either all of rows"),
+        ({"elevations": [2.0, 1.0]}, "or elevations"),
+        ({"beams": [1.0]}, r"one per row \(4\)"),
+        ({"beams": [1.0, 2.0, 3.0, 4.0]}, "highest first"),
+        ({"beans": 4}, r"sensor keys \['beans'\]"),
+    ],
+)
+def test_what_no_sensor_has_is_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Sensor.from_dict({**GOOD, **change})
+
+
+def test_a_wrong_name_or_file_says_what_there_is(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="hdl64e_kitti360.*or a .yaml file"):
+        load_sensor("hdl65")
+    with pytest.raises(FileError, match="cannot be read"):
+        load_sensor(tmp_path / "none.yaml")
+    (tmp_path / "two.yaml").write_text("a: {}\nb: {}\n")
+    with pytest.raises(ConfigError, match="exactly one entry"):
+        load_sensor(tmp_path / "two.yaml")
+    (tmp_path / "code.yaml").write_text("a: !!python/object/apply:os.getcwd []\n")
+    with pytest.raises(ConfigError, match="not YAML"):
+        load_sensor(tmp_path / "code.yaml")
+    with pytest.raises(ConfigError, match="numbers, as in sensors.yaml"):
+        Sensor.from_dict({"name": "x"})

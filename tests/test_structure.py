@@ -1,0 +1,68 @@
+"""The shape of the package: imports run one way, and what is public stays small enough to read."""
+
+import ast
+from pathlib import Path
+
+import lidar_synth
+
+ORDER = """errors classes sensor scan projection normalize noise nets codec conditions flow solvers timesteps distill
+checkpoint importers generator labels augment formats bank mixing service convert bake town metrics train config viz
+doctor cli""".split()
+"""A module may import only from those before it."""
+
+PACKAGE = Path(lidar_synth.__file__).parent
+INTEGRATIONS = PACKAGE.parent / "integrations"
+
+
+def imported(path: Path) -> set[str]:
+    """The second part of every ``lidar_synth.<part>`` that a file imports."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: relative import"
+            names = [f"{node.module}.{a.name}" for a in node.names] if node.module == "lidar_synth" else [node.module]
+        elif isinstance(node, ast.Import):
+            names = [a.name for a in node.names]
+        else:
+            continue
+        found |= {n.split(".")[1] for n in names if n.startswith("lidar_synth.")}
+    return found
+
+
+def backward_imports(root: Path) -> list[str]:
+    """Every import in the package that runs against ``ORDER``."""
+    wrong = []
+    for path in sorted(root.rglob("*.py")):
+        part = path.relative_to(root).parts[0].removesuffix(".py")
+        if part in ("__init__", "__main__"):
+            continue
+        assert part in ORDER, f"{path}: give it its place in ORDER"
+        wrong += [f"{part} imports {o}" for o in imported(path) if o not in ORDER[: ORDER.index(part) + 1]]
+    return wrong
+
+
+def test_imports_run_one_way() -> None:
+    assert backward_imports(PACKAGE) == []
+
+
+def test_a_backward_import_is_noticed(tmp_path: Path) -> None:
+    (tmp_path / "sensor.py").write_text("from lidar_synth.scan import Scan\n")
+    (tmp_path / "scan.py").write_text("import numpy\nfrom lidar_synth import sensor\n")
+    assert backward_imports(tmp_path) == ["sensor imports scan"]
+
+
+def test_the_package_never_imports_its_integrations() -> None:
+    assert all("integrations" not in imported(p) for p in PACKAGE.rglob("*.py") if INTEGRATIONS not in p.parents)
+
+
+def test_open3d_is_imported_by_nothing_at_import_time() -> None:
+    """On a bare machine its import fails; everything else has to work."""
+    for path in PACKAGE.rglob("*.py"):
+        top = [n for n in ast.parse(path.read_text()).body if isinstance(n, ast.Import | ast.ImportFrom)]
+        names = [a.name for n in top for a in n.names] + [n.module or "" for n in top if isinstance(n, ast.ImportFrom)]
+        assert not any(n.split(".")[0] == "open3d" for n in names), path
+
+
+def test_what_the_package_offers_can_be_imported() -> None:
+    for name in lidar_synth.__all__:
+        assert getattr(lidar_synth, name) is not None

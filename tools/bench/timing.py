@@ -1,0 +1,43 @@
+"""Side-by-side timing for the benchmark scripts: what stands in one table was measured in one run, in turns."""
+
+import platform
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+from tqdm import tqdm
+
+
+def time_in_turns(calls: Mapping[str, Callable[[], object]], rounds: int = 60) -> dict[str, float]:
+    """Median seconds of each call; the calls take turns, so that a noisy machine is noisy for all of them."""
+    for call in calls.values():
+        call()
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in tqdm(range(rounds), desc="timing", leave=False):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: median(values) for name, values in seconds.items()}
+
+
+def machine() -> str:
+    """One line on what this ran on: processor, cores, AVX-512, Python and numpy."""
+    info = Path("/proc/cpuinfo")
+    text = info.read_text() if info.exists() else ""
+    model = next((line.split(":")[1].strip() for line in text.splitlines() if line.startswith("model name")), "")
+    cores = text.count("processor\t") or 1
+    vector = "AVX-512" if "avx512f" in text else "no AVX-512"
+    return (
+        f"{model or platform.processor() or platform.machine()}, {cores} cores, {vector}; "
+        f"Python {platform.python_version()}, numpy {np.__version__}; {time.strftime('%Y-%m-%d')}"
+    )
+
+
+def print_table(title: str, seconds: Mapping[str, float], base: str) -> None:
+    """A Markdown table of milliseconds and of ratios to one of the rows."""
+    print(f"\n### {title}\n\n{machine()}\n\n| what | ms | times '{base}' |\n|---|---:|---:|")
+    for name, value in seconds.items():
+        print(f"| {name} | {1e3 * value:.3f} | {value / seconds[base]:.2f} |")
