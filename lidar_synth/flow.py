@@ -1,0 +1,128 @@
+"""Rectified flow: the path between noise and data, and what a velocity network is trained on.
+
+With data y0, standard normal noise y1 and time t in [0, 1], t = 1 noise and t = 0 data (the paper's
+preliminaries; Liu et al., "Flow Straight and Fast", ICLR 2023)::
+
+    y_t = (1 - t) y0 + t y1                                   the path
+    v   = y1 - y0                                             its velocity dy/dt
+    L   = E_{y0, y1, t} m(v_theta(y_t, t, c), v)              flow matching, Eq. (1) and (3)
+
+The network may be any callable ``v(y, t, cond)``. Peers' conventions of time and sign end at the importers.
+
+To add a training metric or a distribution of t: write the function, enter it in ``METRICS`` or
+``TIMESTEPS``; the tests run over the dictionaries.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lidar_synth.errors import DataError
+
+Velocity = Callable[[Tensor, Tensor, Any], Tensor]
+"""``v(y, t, cond)``: y (B, ...), t (B,) float32 in [0, 1], cond whatever the network takes (None =
+unconditional) -> dy/dt of y's shape. Guidance is a callable of this kind around another one."""
+
+Metric = Callable[[Tensor, Tensor], Tensor]
+"""The paper's m: two (B, ...) tensors of one shape -> (B,) mean over the elements of each sample."""
+
+PSEUDO_HUBER = 0.00054
+"""R2Flow's coefficient: c = 0.00054 sqrt(elements of a sample), 0.1955 for 2x64x1024."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """One batch of supervision: at ``y`` and ``t`` the velocity network shall answer ``velocity``.
+
+    Args:
+        y: (B, ...) states.
+        t: (B,) float32 times.
+        velocity: (B, ...) targets.
+        teacher_evaluations: evaluations of a teacher that the batch took, one per sample and step.
+    """
+
+    y: Tensor
+    t: Tensor
+    velocity: Tensor
+    teacher_evaluations: int = 0
+
+
+def per_sample(t: Tensor, y: Tensor) -> Tensor:
+    """Times (B,) as (B, 1, ..., 1) in the dtype of y (B, ...), to multiply it."""
+    return t.to(y.dtype).reshape(-1, *[1] * (y.ndim - 1))
+
+
+def interpolate(y0: Tensor, y1: Tensor, t: Tensor) -> Tensor:
+    """y_t = (1 - t) y0 + t y1 for y0, y1 (B, ...) and t (B,)."""
+    t = per_sample(t, y0)
+    return (1 - t) * y0 + t * y1
+
+
+def flow_matching(y0: Tensor, y1: Tensor, t: Tensor) -> Example:
+    """The supervision of a teacher, Eq. (1): y_t on the straight path and its velocity y1 - y0.
+
+    Args:
+        y0: (B, ...) data.
+        y1: (B, ...) noise.
+        t: (B,) times, from one of ``TIMESTEPS``.
+    """
+    return Example(interpolate(y0, y1, t), t, y1 - y0)
+
+
+def velocity_loss(velocity: Velocity, example: Example, metric: Metric, cond: Any = None) -> Tensor:
+    """E m(v_theta(y_t, t, c), v), the scalar that training lowers; the same for teacher and student."""
+    return metric(velocity(example.y, example.t, cond), example.velocity).mean()
+
+
+def squared_l2(a: Tensor, b: Tensor) -> Tensor:
+    """(B,) mean of (a - b)^2; the paper's metric for latent models and 1-RF teachers."""
+    return _error(a, b).square().mean(1)
+
+
+def l1(a: Tensor, b: Tensor) -> Tensor:
+    """(B,) mean of |a - b|."""
+    return _error(a, b).abs().mean(1)
+
+
+def pseudo_huber(a: Tensor, b: Tensor, coefficient: float = PSEUDO_HUBER) -> Tensor:
+    """(B,) mean of sqrt(e^2 + c^2) - c with e = a - b and c = coefficient sqrt(elements of a sample); the
+    paper's metric for pixel models, from R2Flow and Song and Dhariwal (ICLR 2024)."""
+    error = _error(a, b)
+    c = coefficient * math.sqrt(error.shape[1])
+    return (error.square().add_(c * c).sqrt() - c).mean(1)
+
+
+def _error(a: Tensor, b: Tensor) -> Tensor:
+    """(B, elements) a - b, at least in float32."""
+    if a.shape != b.shape:
+        raise DataError(f"a metric of shapes {tuple(a.shape)} and {tuple(b.shape)}", "one shape (B, ...)")
+    error = a - b
+    return error.to(torch.promote_types(error.dtype, torch.float32)).flatten(1)
+
+
+METRICS: dict[str, Metric] = {"squared_l2": squared_l2, "pseudo_huber": pseudo_huber, "l1": l1}
+"""Training metrics m by name."""
+
+
+def u_shaped(u: Tensor, sharpness: float = 4.0) -> Tensor:
+    """Density proportional to cosh(a (t - 1/2)) with a = ``sharpness``: more often near both ends, for reflow
+    (Lee et al., "Improving the Training of Rectified Flows", NeurIPS 2024)."""
+    return 0.5 + torch.asinh((2 * u - 1) * math.sinh(sharpness / 2)) / sharpness
+
+
+def logit_normal(u: Tensor, mean: float = 0.0, std: float = 1.0) -> Tensor:
+    """t = sigmoid(n) with n normal (Esser et al., "Scaling Rectified Flow Transformers", ICML 2024)."""
+    return torch.sigmoid(mean + std * torch.special.ndtri(u))
+
+
+TIMESTEPS: dict[str, Callable[[Tensor], Tensor]] = {
+    "uniform": lambda u: u,
+    "u_shaped": u_shaped,
+    "logit_normal": logit_normal,
+}
+"""Distributions of t as quantile functions: uniform numbers u in (0, 1), such as ``noise.uniform`` gives, to
+times of the same shape. Feeding them numbers keyed by (seed, index) makes training repeatable."""

@@ -1,0 +1,133 @@
+"""Random numbers that are a function of (seed, index) alone.
+
+The design's contract: the noise of scan ``index`` under ``seed`` is the same on every device, in every
+batch and in every order, so that a teacher and its student, or two checkpoints, can be compared from the
+same noise, and a bake can be resumed or spread over machines. A counter-based generator gives it:
+Philox4x32 with ten rounds (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011), whose
+output depends on nothing but its 64-bit key (the seed) and its 128-bit counter::
+
+    counter = (block, index mod 2^32, index div 2^32, stream)
+
+A block is four 32-bit words; element ``e`` of a scan (row-major) comes from word ``e mod 4`` of block
+``e div 4``, so that a smaller shape is a prefix of a larger one. Streams keep numbers of different use apart.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lidar_synth.errors import ConfigError
+
+_ROUNDS = 10
+_MULTIPLIERS = 0xD2511F53, 0xCD9E8D57
+_KEY_STEPS = 0x9E3779B9, 0xBB67AE85
+_WORD = 0xFFFFFFFF
+_GAUSSIAN, _UNIFORM = 0, 1  # streams
+
+
+def gaussian(
+    seed: int,
+    indices: Sequence[int],
+    shape: Sequence[int],
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Standard normal noise, one sample per index.
+
+    Computed in float64 by Box and Muller's transform and rounded once, so that devices agree to float
+    rounding.
+
+    Args:
+        seed: 0 <= seed < 2^64.
+        indices: B numbers, 0 <= index < 2^63, in any order.
+        shape: of one sample, such as (C, H, W).
+        device: where the noise is made.
+        dtype: floating type of the result.
+
+    Returns:
+        (B, *shape) noise; sample b depends on ``seed`` and ``indices[b]`` only.
+
+    Raises:
+        ConfigError: on a seed, an index or a shape out of range.
+    """
+    words, count = _words(seed, indices, shape, device, _GAUSSIAN)
+    radius = ((words[0::2].double() + 0.5) * 2.0**-32).log_().mul_(-2).sqrt_()
+    angle = words[1::2].double() * (2 * math.pi * 2.0**-32)
+    lanes = torch.stack([radius * angle.cos(), radius * angle.sin()], 1).flatten(0, 1)
+    return _samples(lanes.to(dtype), shape, count, device)
+
+
+def uniform(
+    seed: int,
+    indices: Sequence[int],
+    shape: Sequence[int] = (),
+    device: torch.device | str = "cpu",
+) -> Tensor:
+    """Uniform float32 numbers in the open interval (0, 1), one sample per index.
+
+    Odd multiples of 2^-24, exact in float32, so that every device gives the same bits. Independent of
+    ``gaussian`` of the same seed and index.
+
+    Args:
+        seed: 0 <= seed < 2^64.
+        indices: B numbers, 0 <= index < 2^63, in any order.
+        shape: of one sample; () gives one number per index.
+        device: where they are made.
+
+    Returns:
+        (B, *shape) numbers.
+
+    Raises:
+        ConfigError: on a seed, an index or a shape out of range.
+    """
+    words, count = _words(seed, indices, shape, device, _UNIFORM)
+    # 23 bits: the half after a 24th would round to 1.
+    return _samples(((words >> 9).float() + 0.5) * 2.0**-23, shape, count, device)
+
+
+def philox(counter: Tensor, seed: int) -> Tensor:
+    """Philox4x32-10.
+
+    Args:
+        counter: (4, ...) int64, words 0 .. 2^32 - 1, the first one lowest.
+        seed: the key, 0 <= seed < 2^64.
+
+    Returns:
+        (4, ...) int64, random words 0 .. 2^32 - 1.
+    """
+    c0, c1, c2, c3 = counter.unbind()
+    key0, key1 = seed & _WORD, seed >> 32
+    for _ in range(_ROUNDS):
+        # A product of two words fills 64 bits: signed overflow wraps, and what it leaves above bit 31 of
+        # the upper half is cut off. Lower halves meet only xor before the next cut.
+        product0, product1 = c0 * _MULTIPLIERS[0], c2 * _MULTIPLIERS[1]
+        c0, c1 = (product1 >> 32).bitwise_xor_(c1).bitwise_xor_(key0).bitwise_and_(_WORD), product1
+        c2, c3 = (product0 >> 32).bitwise_xor_(c3).bitwise_xor_(key1).bitwise_and_(_WORD), product0
+        key0, key1 = (key0 + _KEY_STEPS[0]) & _WORD, (key1 + _KEY_STEPS[1]) & _WORD
+    return torch.stack([c0, c1 & _WORD, c2, c3 & _WORD])
+
+
+def _words(
+    seed: int, indices: Sequence[int], shape: Sequence[int], device: torch.device | str, stream: int
+) -> tuple[Tensor, int]:
+    """(4, B, blocks) random words and the number of elements of a sample."""
+    count = math.prod(shape)
+    if not 0 <= seed < 2**64:
+        raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
+    if any(not 0 <= i < 2**63 for i in indices):
+        raise ConfigError(f"index {next(i for i in indices if not 0 <= i < 2**63)}", "0 <= index < 2^63")
+    if min(shape, default=1) < 1 or count >= 2**34:
+        raise ConfigError(f"noise of shape {tuple(shape)}", "positive sizes, less than 2^34 elements in all")
+    # Float64 is at hand on CPU and CUDA; for another device the noise is made on the CPU and moved.
+    place = torch.device(device) if torch.device(device).type == "cuda" else torch.device("cpu")
+    blocks = torch.arange(-(-count // 4), device=place)
+    index = torch.tensor(list(indices), dtype=torch.int64, device=place)[:, None]
+    counter = (blocks, index & _WORD, index >> 32, blocks.new_tensor(stream))
+    return philox(torch.stack([word.expand(len(index), len(blocks)) for word in counter]), seed), count
+
+
+def _samples(lanes: Tensor, shape: Sequence[int], count: int, device: torch.device | str) -> Tensor:
+    """(B, *shape) on ``device`` from (4, B, blocks)."""
+    return lanes.movedim(0, -1).flatten(1)[:, :count].reshape(-1, *shape).to(device)

@@ -1,0 +1,228 @@
+"""Measures of realism against the numbers of both protocols, and by hand."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import random_scan
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors.numpy import load_file
+from scipy.linalg import sqrtm
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import jensenshannon
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.metrics import (
+    PROTOCOLS,
+    Score,
+    evaluate,
+    frechet_distance,
+    jensen_shannon_distance,
+    lidm,
+    r2flow,
+    squared_mmd,
+)
+from lidar_synth.metrics import protocols as protocols_module
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor, presets
+
+SENSOR = presets()["hdl64e_kitti360"]
+PAIRS = [("real", "fake", ""), ("real", "real", "_self"), ("dense_real", "dense_fake", "_dense")]
+Vectors = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def vectors(golden: Path) -> Vectors:
+    return load_file(golden / "metrics.safetensors")
+
+
+def clouds(vectors: Vectors, name: str) -> list[np.ndarray]:
+    return [v for k, v in sorted(vectors.items()) if k.startswith(f"clouds_{name}/")]
+
+
+def scans(count: int, seed: int, scale: float = 1.0) -> list[Scan]:
+    """The same street seen with a little noise, and by ``scale`` larger or smaller."""
+    street = np.random.default_rng(9).normal(0, (20, 20, 0.5), (3000, 3)) * scale
+    made = []
+    for i in range(count):
+        points = (street + np.random.default_rng([seed, i]).normal(0, 0.02, street.shape)).astype(np.float32)
+        made.append(Scan(points, np.zeros(3000, np.float32), SENSOR, id=f"{seed}-{i}"))
+    return made
+
+
+def test_r2flow_histogram(vectors: Vectors) -> None:
+    histogram = r2flow.bev_histogram(clouds(vectors, "real")[0])
+    assert np.array_equal(np.argwhere(histogram), vectors["r2flow/hist_real0_nonzero"])
+    assert np.array_equal(histogram[histogram > 0], vectors["r2flow/hist_real0_values"])
+
+
+@pytest.mark.parametrize(("real", "fake", "suffix"), PAIRS)
+def test_r2flow_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> None:
+    a, b = ([r2flow.bev_histogram(c) for c in clouds(vectors, name)] for name in (real, fake))
+    assert r2flow.jsd(a, b) == pytest.approx(vectors[f"r2flow/jsd{suffix}"][0], rel=1e-6)
+    assert r2flow.maximum_mean_discrepancy(a, b) == pytest.approx(vectors[f"r2flow/mmd{suffix}"][0], abs=1e-6)
+
+
+def test_lidm_cells(vectors: Vectors) -> None:
+    counts = sum(np.bincount(lidm.occupied(c, lidm.FINE), minlength=2000**2) for c in clouds(vectors, "real"))
+    assert np.array_equal(np.argwhere(counts.reshape(2000, 2000)), vectors["lidm/bev_sum_nonzero"])
+    assert np.array_equal(counts[counts > 0], vectors["lidm/bev_sum_values"])
+    coarse = np.stack(np.divmod(lidm.occupied(clouds(vectors, "real")[0], lidm.COARSE), 200), 1) / 200
+    assert {tuple(c) for c in coarse.astype(np.float32)} == {tuple(c) for c in vectors["lidm/bev_bin_real0"]}
+
+
+@pytest.mark.parametrize(("real", "fake", "suffix"), PAIRS)
+def test_lidm_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> None:
+    a, b = ([lidm.occupancy(c) for c in clouds(vectors, name)] for name in (real, fake))
+    assert lidm.jsd(a, b) == pytest.approx(vectors[f"lidm/jsd{suffix}"][0], rel=1e-5)
+    assert lidm.minimum_matching_distance(a, b) == pytest.approx(vectors[f"lidm/mmd{suffix}"][0], rel=1e-4)
+
+
+def test_figures_of_features(vectors: Vectors) -> None:
+    a, b = vectors["features_a"], vectors["features_b"]
+    assert frechet_distance(a, b) == pytest.approx(vectors["r2flow/frechet"][0], rel=1e-9)
+    assert frechet_distance(b, a) == pytest.approx(vectors["lidm/frechet"][0], rel=1e-9)
+    rng = np.random.RandomState(6003)
+    assert squared_mmd(a, b, rng) == pytest.approx(vectors["r2flow/squared_mmd"][0], rel=1e-9)
+    rng = np.random.RandomState(6003)
+    few = squared_mmd(a, b, rng, subsets=10, size=100)
+    assert few == pytest.approx(vectors["r2flow/squared_mmd_subsets10_size100"][0], rel=1e-9)
+
+
+def test_frechet_distance_by_hand() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(50, 6)), rng.normal(1, 2, (40, 6)) @ rng.normal(size=(6, 6))
+    root = sqrtm(np.cov(a.T) @ np.cov(b.T)).real
+    expected = ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(np.cov(a.T) + np.cov(b.T) - 2 * root)
+    assert frechet_distance(a, b) == pytest.approx(expected, rel=1e-9)
+    assert frechet_distance(a, a) == pytest.approx(0, abs=1e-9)
+    assert frechet_distance(a, a + 3) == pytest.approx(6 * 9)
+    few = a[:3]  # covariances of rank 2 in 6 dimensions
+    assert frechet_distance(few, few + 1) == pytest.approx(6, abs=1e-6)
+    assert frechet_distance(few, few.astype(np.float32)) == pytest.approx(0, abs=1e-6)
+
+
+@given(data=st.data(), bins=st.integers(1, 20))
+def test_jensen_shannon_distance_is_scipys(data: st.DataObject, bins: int) -> None:
+    weights = st.lists(st.integers(0, 9), min_size=bins, max_size=bins).filter(any)
+    p, q = np.array(data.draw(weights)), np.array(data.draw(weights))
+    assert jensen_shannon_distance(p, q) == pytest.approx(jensenshannon(p, q), abs=1e-7)
+    assert jensen_shannon_distance(p, 3 * p) == pytest.approx(0, abs=1e-7)
+
+
+def test_distance_maps_are_exact() -> None:
+    occupied = [lidm.occupancy(s.points) for s in scans(3, 0)]
+    occupied.append(lidm.Occupancy(occupied[0].fine, np.array([0], np.int32)))  # one corner: the longest ways
+    for ours, one in zip(lidm._distance_maps(occupied), occupied, strict=True):
+        mask = np.zeros((200, 200), bool)
+        mask.flat[one.coarse] = True
+        assert np.array_equal(ours.reshape(200, 200), np.round(distance_transform_edt(~mask) ** 2))
+
+
+def test_minimum_matching_distance_by_nearest_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lidm, "_BLOCK", 2)
+    real, fake = ([lidm.occupancy(s.points) for s in scans(n, seed)] for n, seed in ((5, 1), (3, 2)))
+    grids = [[np.stack(np.divmod(o.coarse, 200), 1) / 200 for o in side] for side in (real, fake)]
+
+    def chamfer(a: np.ndarray, b: np.ndarray) -> float:
+        return ((cKDTree(b).query(a)[0] ** 2).mean() + (cKDTree(a).query(b)[0] ** 2).mean()) / 2
+
+    expected = np.mean([min(chamfer(r, f) for f in grids[1]) for r in grids[0]])
+    assert lidm.minimum_matching_distance(real, fake) == pytest.approx(expected, rel=1e-5)
+
+
+def test_maximum_mean_discrepancy_by_its_definition(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(r2flow, "_BLOCK", 2)
+    real, fake = ([r2flow.bev_histogram(s.points) for s in scans(n, seed)] for n, seed in ((5, 1), (3, 2)))
+    p, q = (np.array([h / h.sum() for h in side]).reshape(len(side), -1) for side in (real, fake))
+    kernel = lambda a, b: np.exp(-2 * ((a[:, None] - b) ** 2).sum(-1)).mean()  # noqa: E731
+    expected = kernel(p, p) + kernel(q, q) - 2 * kernel(p, q)
+    assert r2flow.maximum_mean_discrepancy(real, fake) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_each_protocol_tells_near_from_far(name: str) -> None:
+    real = scans(8, 0)
+    same, near, far = (evaluate(real, s, name, progress=False) for s in (real, scans(6, 1), scans(6, 2, 0.8)))
+    for zero, small, large in zip(same, near, far, strict=True):
+        assert zero.value == pytest.approx(0, abs=1e-6) or name == "r2flow"  # whose two sets are made differently
+        assert small.value < large.value
+        assert (small.protocol, small.real, small.generated) == (name, 8, 6)
+        assert f"({name} protocol, 8 real, 6 generated)" in str(small)
+
+
+def test_the_clouds_of_the_protocols() -> None:
+    scan = random_scan(SENSOR, 5000)
+    own = {tuple(p) for p in scan.points}
+    real, fake = r2flow.cloud(scan, False), r2flow.cloud(scan, True)
+    assert len(real) == len(fake) and {tuple(p) for p in real} <= own and not {tuple(p) for p in fake} & own
+    assert np.allclose(np.sort(np.linalg.norm(real, axis=1)), np.sort(np.linalg.norm(fake, axis=1)), rtol=1e-5)
+    assert np.linalg.norm(real, axis=1).min() >= 1.45 and 60 < np.linalg.norm(real, axis=1).max() < 63
+    both = lidm.cloud(scan, False), lidm.cloud(scan, True)
+    assert np.array_equal(*both)
+    corners = SENSOR.column_azimuths("corner")
+    for points in (fake, both[0]):  # every azimuth is that of a corner
+        azimuth = -np.arctan2(points[:, 1], points[:, 0])
+        assert np.abs(np.sin(azimuth[:, None] - corners)).min(1).max() < 1e-5
+    assert np.linalg.norm(both[0], axis=1).min() > 1 and 53 < np.linalg.norm(both[0], axis=1).max() < 56.0001
+    small = Sensor("small", 64, 1.0, 90.0, rows=8, fov_up=5.0, fov_down=-20.0)
+    assert len(PROTOCOLS["town"].cloud(random_scan(small), False)) <= 64 * 8
+
+
+def test_extractors_add_frechet_distances_over_all_batches() -> None:
+    seen = []
+
+    def mean_and_spread(some: list[Scan]) -> np.ndarray:
+        seen.append(len(some))
+        return np.stack([np.r_[s.points.mean(0), s.points.std(0)] for s in some])
+
+    real, fake = scans(5, 0), scans(4, 1)
+    scores = evaluate(real, fake, "town", {"moments": mean_and_spread}, batch=3, progress=False)
+    assert seen == [3, 2, 3, 1]
+    by_name = {s.metric: s.value for s in scores}
+    a, b = mean_and_spread(real), mean_and_spread(fake)
+    assert by_name["Frechet distance of moments"] == frechet_distance(a, b)
+    assert by_name["squared maximum mean discrepancy of moments"] == squared_mmd(a, b)
+
+
+def test_r2flow_takes_a_fixed_choice_of_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    limited = PROTOCOLS["r2flow"]._replace(limit=3)
+    monkeypatch.setitem(protocols_module.PROTOCOLS, "r2flow", limited)
+    asked = []
+
+    class Recorded(list):
+        def __getitem__(self, index: int) -> Scan:
+            asked.append(index)
+            return super().__getitem__(index)
+
+    score = evaluate(Recorded(scans(6, 0)), scans(4, 1), "r2flow", progress=False)[0]
+    assert asked == [4, 2, 1]  # random.Random(0).shuffle of 6 numbers, the first 3
+    assert (score.real, score.generated) == (3, 4)
+
+
+def test_bad_input() -> None:
+    good = scans(2, 0)
+    with pytest.raises(ConfigError, match="protocol 'jsd'; expected one of r2flow, lidm, town"):
+        evaluate(good, good, "jsd")
+    with pytest.raises(DataError, match="no generated scans; expected at least one"):
+        evaluate(good, [], "lidm", progress=False)
+    empty = Scan(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), SENSOR, id="blank")
+    for name, area in (("r2flow", "3 m to 70 m"), ("lidm", r"\+-50 m"), ("town", "3 m to 70 m")):
+        with pytest.raises(DataError, match=f"generated scan 'blank': a cloud of 0 points with none .*{area}"):
+            evaluate(good, [good[0], empty], name, progress=False)
+    features = np.ones((3, 4))
+    for a, b in ((features, features[:1]), (features, features[:, :3]), (features[0], features)):
+        with pytest.raises(DataError, match=r"features of shape .*; expected \(N, D\) and \(M, D\)"):
+            frechet_distance(a, b)
+    with pytest.raises(DataError, match="features that are not finite"):
+        squared_mmd(features, np.full((3, 4), np.nan))
+    for p, q in (([0, 0], [1, 1]), ([1, -1], [1, 1]), ([1, 1], [1, 1, 1]), ([np.nan, 1], [1, 1])):
+        with pytest.raises(DataError, match="two non-negative histograms of one shape"):
+            jensen_shannon_distance(np.array(p), np.array(q))
+
+
+def test_a_score_reads_well() -> None:
+    score = Score("BEV Jensen-Shannon distance", 0.0251234, "r2flow", 10000, 10000)
+    assert str(score) == "BEV Jensen-Shannon distance = 0.0251234 (r2flow protocol, 10000 real, 10000 generated)"
