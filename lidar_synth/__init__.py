@@ -16,6 +16,7 @@ _HOME = {
     "Sensor": "sensor",
     "Source": "scan",
     "load_sensor": "sensor",
+    "open_scans": "formats",
     "project": "projection",
     "unfold": "projection",
     "unproject": "projection",
@@ -25,6 +26,7 @@ __all__ = ["__version__", *_HOME]
 
 if TYPE_CHECKING:
     from lidar_synth.errors import LidarSynthError as LidarSynthError
+    from lidar_synth.formats import open_scans as open_scans
     from lidar_synth.projection import project as project
     from lidar_synth.projection import unfold as unfold
     from lidar_synth.projection import unproject as unproject

@@ -5,29 +5,38 @@ Exit status 0 = done, 1 = the run failed with one clear message, 2 = the call wa
 
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated
 
 import typer
 
+from lidar_synth import __version__
 from lidar_synth.errors import ConfigError, LidarSynthError
+
+COMMANDS: dict[str, Callable[..., None]] = {}
+"""Commands by name, in the order of the help."""
 
 app = typer.Typer(
     name="lidar-synth",
     help="Synthetic LiDAR scans for perception training: generate, mix, bake, convert, look.",
     no_args_is_help=True,
+    invoke_without_command=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 
 
-def _register() -> None:
-    commands: dict[str, Callable[..., Any]] = {}
-    for name, command in commands.items():
-        app.command(name)(command)
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
+) -> None:
+    if version:
+        print(f"lidar-synth {__version__}")
+        raise typer.Exit
 
 
-_register()
+for _name, _command in COMMANDS.items():
+    app.command(_name)(_command)
 
 
 def main() -> None:

@@ -1,0 +1,88 @@
+"""A small range-view segmenter: per-cell classes of a range image, and features to compare sets of scans by.
+
+A U-Net whose columns wrap, as those of a full turn do. It is there to judge scans (do generated labels agree
+with what a segmenter trained on other scans sees?) and as the reference trainer's network, not to win a benchmark.
+"""
+
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lidar_synth.classes import NAMES
+
+ROW_BANDS = 4
+"""Bands of rows over which the features are averaged: what is high and what is low stays apart."""
+
+
+class CircularConv(nn.Module):
+    """3x3 convolution, norm and ReLU; columns wrap, rows are padded with zeros."""
+
+    def __init__(self, inputs: int, outputs: int, stride: tuple[int, int] = (1, 1)) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, 3, stride, padding=(1, 0), bias=False)
+        self.norm = nn.BatchNorm2d(outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, H, W) to (B, outputs, H / stride, W / stride)."""
+        out: Tensor = F.relu(self.norm(self.conv(F.pad(x, (1, 1, 0, 0), mode="circular"))))
+        return out
+
+
+class RangeSegmenter(nn.Module):
+    """Classes of every cell of a range image.
+
+    Args:
+        in_channels: of the input; ``segmenter_input`` makes 4.
+        classes: how many to tell apart.
+        widths: channels per level; every level after the first halves the columns, from the third on the rows too.
+    """
+
+    def __init__(
+        self, in_channels: int = 4, classes: int = len(NAMES), widths: tuple[int, ...] = (16, 32, 64, 96)
+    ) -> None:
+        super().__init__()
+        widths = tuple(widths)
+        self.strides = [(1, 2)] + [(2, 2)] * (len(widths) - 2)
+        self.stem = CircularConv(in_channels, widths[0])
+        self.down = nn.ModuleList(
+            nn.Sequential(CircularConv(a, b, s), CircularConv(b, b))
+            for (a, b), s in zip(pairwise(widths), self.strides, strict=True)
+        )
+        self.up = nn.ModuleList(CircularConv(a + b, a) for a, b in pairwise(widths))
+        self.head = nn.Conv2d(widths[0], classes, 1)
+
+    def decode(self, x: Tensor) -> Tensor:
+        """(B, in_channels, H, W) to the last map of the decoder (B, widths[0], H, W)."""
+        skips = [self.stem(x)]
+        for level in self.down:
+            skips.append(level(skips[-1]))
+        x = skips.pop()
+        for level, skip in zip(reversed(self.up), reversed(skips), strict=True):
+            x = level(torch.cat([skip, F.interpolate(x, size=skip.shape[2:])], 1))
+        return x
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, in_channels, H, W) to logits (B, classes, H, W)."""
+        logits: Tensor = self.head(self.decode(x))
+        return logits
+
+    def features(self, x: Tensor) -> Tensor:
+        """(B, in_channels, H, W) to (B, ROW_BANDS * widths[0]) means of the decoder's last map over bands of rows."""
+        return F.adaptive_avg_pool2d(self.decode(x), (ROW_BANDS, 1)).flatten(1)
+
+
+def segmenter_input(distance: Tensor, reflectance: Tensor, height: Tensor) -> Tensor:
+    """What the segmenter sees of a batch of range images, each channel of order one.
+
+    Args:
+        distance: (B, H, W) metres, 0 = no return.
+        reflectance: (B, H, W) in [0, 1].
+        height: (H, W) sine of each cell's elevation, z of the sensor's rays.
+
+    Returns:
+        (B, 4, H, W): log2(1 + d) / 6, z / 2, reflectance, and 1 where there is a return.
+    """
+    seen = (distance > 0).to(distance.dtype)
+    return torch.stack([torch.log2(1 + distance) / 6, distance * height / 2, reflectance * seen, seen], 1)
