@@ -21,6 +21,7 @@ def imported(path: Path) -> set[str]:
         if isinstance(node, ast.ImportFrom) and node.module:
             assert node.level == 0, f"{path}: relative import"
             names = [f"{node.module}.{a.name}" for a in node.names] if node.module == "lidar_synth" else [node.module]
+            names = [n for n in names if n != "lidar_synth.__version__"]
         elif isinstance(node, ast.Import):
             names = [a.name for a in node.names]
         else:

@@ -1,0 +1,174 @@
+"""Sheets: every view of one scan, or many scans side by side, composed by matplotlib.
+
+Figures are made without pyplot, so nothing global changes and no screen is needed.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from tqdm import tqdm
+
+from lidar_synth.classes import NAMES
+from lidar_synth.errors import ConfigError
+from lidar_synth.scan import RangeImage, Scan
+from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, scales
+from lidar_synth.viz.images import View, picture, views
+from lidar_synth.viz.render import Camera, bird, render
+
+_BACK, _INK, _DIM = tuple(EMPTY / 255), "#e8eaf0", "#9aa0ad"
+_DPI = 100
+
+
+def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: float = 50.0) -> Figure:
+    """All views of one scan: in perspective, from above, and its range image by every channel it has.
+
+    Args:
+        given: a scan, or a range image, whose points are then shown.
+        camera: of the view in perspective.
+        extent: metres to either side that the view from above shows.
+
+    Returns:
+        A figure; ``figure.savefig`` or ``write_sheet`` makes a file of it.
+    """
+    [view] = views([given])
+    colours = scales([view.scan])
+    by = "label" if view.scan.label is not None else "height"
+    legend = 0.5 if by == "label" else 0.1
+    heights = [6.2, *[1.45] * len(view.channels), legend]
+    figure = _figure(17.0, sum(heights) + 0.7)
+    grid = figure.add_gridspec(
+        len(heights), 2, width_ratios=[2, 1], height_ratios=heights, hspace=0.34, wspace=0.1,
+        left=0.045, right=0.945, bottom=0.01, top=1 - 0.75 / (sum(heights) + 0.7),
+    )  # fmt: skip
+    figure.text(0.045, 1 - 0.28 / figure.get_figheight(), caption(view.scan), color=_INK, fontsize=15, va="center")
+    _perspective(figure.add_subplot(grid[0, 0]), view, by, colours[by], camera)
+    _from_above(figure.add_subplot(grid[0, 1]), view, colours["height"], extent)
+    for row, channel in enumerate(view.channels, 1):
+        _image(figure.add_subplot(grid[row, :]), view, channel, colours[channel])
+    if by == "label":
+        _legend(figure, [view], colours[by].table)
+    return figure
+
+
+def contact_sheet(
+    given: Sequence[Scan | RangeImage], *, columns: int | None = None, by: str | None = None, title: str = ""
+) -> Figure:
+    """Many scans side by side, each in perspective above its range image.
+
+    Args:
+        given: scans or range images.
+        columns: tiles in a row; about a square without it.
+        by: what colours the points, one of ``colour.VALUES``; labels if all have them, else heights.
+        title: a line above.
+
+    Raises:
+        ConfigError: when nothing is given, or a scan does not know the quantity.
+    """
+    if not given:
+        raise ConfigError("a sheet of no scans", "at least one")
+    all_views = views(given)
+    colours = scales([view.scan for view in all_views])
+    by = by or ("label" if all(view.scan.label is not None for view in all_views) else "height")
+    columns = columns or int(np.ceil(np.sqrt(len(given))))
+    rows = -(-len(given) // columns)
+    width = 4.6 * columns
+    legend = 0.25 + 0.22 * -(-(len(NAMES) + 1) // _per_row(width)) if by == "label" else 0.1
+    height = 3.8 * rows + 0.5 + legend
+    figure = _figure(width, height)
+    grid = figure.add_gridspec(
+        rows, columns, hspace=0.11, wspace=0.03, left=0.01, right=0.99, bottom=legend / height, top=1 - 0.72 / height
+    )
+    figure.text(0.01, 1 - 0.25 / height, title, color=_INK, fontsize=15, va="center")
+    for place, view in enumerate(tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)):
+        tile = grid[place].subgridspec(2, 1, height_ratios=[5, 1], hspace=0.02)
+        above, below = figure.add_subplot(tile[0]), figure.add_subplot(tile[1])
+        _bare(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
+        _bare(below, picture(view.image, "range", colours["range"]))
+        above.set_title(caption(view.scan, short=True), color=_DIM, fontsize=9, loc="left", pad=3)
+    if by == "label":
+        _legend(figure, all_views, colours[by].table)
+    return figure
+
+
+def caption(scan: Scan, short: bool = False) -> str:
+    """One line about a scan: id, sensor, domain, number of points."""
+    domain = list(DOMAINS)[scan.domain]
+    if short:
+        return f"{scan.id or 'scan'}  ·  {domain}"
+    return f"{scan.id or 'scan'}   ·   {scan.sensor.name}   ·   {domain}   ·   {len(scan):,} points"
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor=_BACK)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _bare(axes: Any, pixels: Any) -> None:
+    axes.imshow(pixels, aspect="auto", interpolation="antialiased")
+    axes.set_axis_off()
+
+
+def _dress(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
+    axes.set_title(title, color=_INK, fontsize=11, loc="left")
+    axes.set_xlabel(xlabel, color=_DIM, fontsize=9)
+    axes.set_ylabel(ylabel, color=_DIM, fontsize=9)
+    axes.tick_params(colors=_DIM, labelsize=8, length=3)
+    for spine in axes.spines.values():
+        spine.set_color("#3a3f4b")
+
+
+def _bar(axes: Any, scale: Scale) -> None:
+    """A colour bar at the right edge of the axes."""
+    values = ScalarMappable(PowerNorm(scale.gamma, scale.low, scale.high), ListedColormap(scale.table / 255))
+    bar = axes.figure.colorbar(values, cax=axes.inset_axes((1.008, 0, 0.011, 1), transform=axes.transAxes))
+    bar.ax.tick_params(colors=_DIM, labelsize=8, length=2)
+    bar.outline.set_edgecolor("#3a3f4b")
+
+
+def _perspective(axes: Any, view: View, by: str, scale: Scale, camera: Camera | None) -> None:
+    _bare(axes, render(view.scan, by, camera=camera, size=(1020, 620), scale=scale))
+    axes.set_title(f"3-D, coloured by {scale.title}; circles every 10 m", color=_INK, fontsize=11, loc="left")
+
+
+def _from_above(axes: Any, view: View, scale: Scale, extent: float) -> None:
+    pixels = render(view.scan, "height", camera=bird(extent), size=(600, 600), scale=scale)
+    axes.imshow(pixels, extent=(extent, -extent, -extent, extent), interpolation="antialiased")
+    _dress(axes, f"from above, coloured by {scale.title}", "y, to the left (m)", "x, ahead (m)")
+    _bar(axes, scale)
+
+
+def _image(axes: Any, view: View, channel: str, scale: Scale) -> None:
+    sensor = view.image.sensor
+    axes.imshow(
+        picture(view.image, channel, scale), aspect="auto", interpolation="nearest",
+        extent=(-180, 180, sensor.shape[0], 0),
+    )  # fmt: skip
+    _dress(axes, scale.title, "", "row")
+    names = ["behind", "-135°", "left", "-45°", "ahead", "45°", "right", "135°", "behind"]
+    axes.set_xticks(range(-180, 181, 45), names)
+    if not scale.classes:
+        _bar(axes, scale)
+
+
+def _legend(figure: Figure, all_views: Sequence[View], table: Rgb) -> None:
+    """Colour and share of each class that the scans have, below everything."""
+    counts = np.sum([view.classes for view in all_views], axis=0)
+    entries = [
+        Patch(color=tuple((table[i] / 255).tolist()), label=f"{name} {count / counts.sum():.1%}")
+        for i, (name, count) in enumerate(zip((*NAMES, "unlabelled"), counts, strict=True))
+        if count
+    ]
+    columns = min(max(1, len(entries)), _per_row(figure.get_figwidth()))
+    figure.legend(handles=entries, loc="lower center", ncols=columns, frameon=False, labelcolor=_INK, fontsize=9)
+
+
+def _per_row(width: float) -> int:
+    """How many classes a legend of that many inches has in a row."""
+    return max(1, min(10, int(width / 1.65)))

@@ -1,0 +1,116 @@
+"""A window by open3d, for where there is a screen."""
+
+import ctypes
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.errors import LibraryError
+from lidar_synth.formats.pcd import import_open3d
+from lidar_synth.scan import Scan
+from lidar_synth.viz.colour import EMPTY, Scale, point_values, scales
+from lidar_synth.viz.render import Orbit, box_segments
+
+_LEFT, _RIGHT = 263, 262  # GLFW's key codes
+
+
+def has_screen() -> bool:
+    """Whether a window would be seen: on a Unix a display server has to answer.
+
+    A set DISPLAY is not enough: where nothing answers, open3d draws off screen and waits for ever.
+    """
+    if sys.platform in ("win32", "darwin"):
+        return True
+    if _answers("libX11.so.6", "XOpenDisplay", "XCloseDisplay"):
+        return True
+    wayland = "XDG_RUNTIME_DIR" in os.environ  # without it the library complains on the terminal
+    return wayland and _answers("libwayland-client.so.0", "wl_display_connect", "wl_display_disconnect")
+
+
+def _answers(library: str, connect: str, disconnect: str) -> bool:
+    """Whether a display server lets a client of this library connect."""
+    try:
+        client = ctypes.CDLL(library)
+    except OSError:
+        return False
+    client[connect].restype = ctypes.c_void_p
+    display = client[connect](None)
+    if display:
+        client[disconnect](ctypes.c_void_p(display))
+    return bool(display)
+
+
+def show(scans: Sequence[Scan], title: str = "lidar-synth") -> bool:
+    """Opens a window and returns when it is closed; left and right arrows change the scan.
+
+    Args:
+        scans: at least one.
+        title: the window's.
+
+    Returns:
+        False where no window can open: no screen, no open3d (or none of its system libraries), no OpenGL.
+    """
+    if not has_screen():
+        return False
+    try:
+        open3d = import_open3d()
+    except LibraryError:
+        return False
+    window = open3d.visualization.VisualizerWithKeyCallback()
+    if not window.create_window(window_name=title, width=1280, height=720):
+        return False
+    colours = scales(scans)
+    shown = 0
+
+    def turn(step: int) -> Any:
+        def change(window: Any) -> bool:
+            nonlocal shown
+            shown = (shown + step) % len(scans)
+            window.clear_geometries()
+            for geometry in geometries(scans[shown], colours):
+                window.add_geometry(geometry, reset_bounding_box=False)
+            return False
+
+        return change
+
+    for geometry in geometries(scans[0], colours):
+        window.add_geometry(geometry)
+    window.register_key_callback(_LEFT, turn(-1))
+    window.register_key_callback(_RIGHT, turn(1))
+    options, view = window.get_render_option(), window.get_view_control()
+    options.background_color, options.point_size = EMPTY / 255, 2.0
+    camera = Orbit().camera()
+    view.set_lookat(camera.target)
+    view.set_front(np.subtract(camera.eye, camera.target))
+    view.set_up(camera.up)
+    view.set_zoom(0.25)
+    window.run()
+    window.destroy_window()
+    return True
+
+
+def geometries(scan: Scan, colours: dict[str, Scale]) -> list[Any]:
+    """What open3d draws of a scan: its points, by label where it has some or else by height, and its boxes.
+
+    Args:
+        scan: N points.
+        colours: as ``scales`` makes them.
+
+    Raises:
+        LibraryError: without open3d.
+    """
+    open3d = import_open3d()
+    vectors = open3d.utility.Vector3dVector
+    by = "label" if scan.label is not None else "height"
+    cloud = open3d.geometry.PointCloud(vectors(scan.points.astype(np.float64)))
+    cloud.colors = vectors(colours[by](point_values(scan, by)) / 255)
+    if scan.boxes is None or not len(scan.boxes):
+        return [cloud]
+    ends = box_segments(scan.boxes).reshape(-1, 3).astype(np.float64)
+    pairs = open3d.utility.Vector2iVector(np.arange(len(ends), dtype=np.int32).reshape(-1, 2))
+    lines = open3d.geometry.LineSet(points=vectors(ends), lines=pairs)
+    lines.paint_uniform_color((1.0, 1.0, 1.0))
+    return [cloud, lines]

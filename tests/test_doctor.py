@@ -1,0 +1,183 @@
+"""The doctor finds what is missing and names the line that mends it."""
+
+import importlib
+import json
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+import typer
+from typer.testing import CliRunner
+
+from lidar_synth import doctor
+from lidar_synth.cli.doctor import doctor as command
+from lidar_synth.doctor import DATA_ROOTS, SHARED_OBJECTS, Finding, examine, report, works
+
+app = typer.Typer(add_completion=False)
+app.command()(command)
+
+
+def named(findings: list[Finding], name: str) -> Finding:
+    [found] = [finding for finding in findings if finding.name == name]
+    return found
+
+
+@pytest.fixture
+def importing(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Makes the import of one module raise, or give another module."""
+    real = importlib.import_module
+
+    def change(name: str, outcome: Exception | ModuleType) -> None:
+        def fake(wanted: str, package: str | None = None) -> ModuleType:
+            if wanted != name:
+                return real(wanted, package)
+            if isinstance(outcome, Exception):
+                raise outcome
+            return outcome
+
+        monkeypatch.setattr(doctor.importlib, "import_module", fake)  # type: ignore[attr-defined]
+
+    return change
+
+
+def test_this_machine_works() -> None:
+    findings = examine()
+    assert works(findings)
+    assert named(findings, "torch").found == torch.__version__
+    assert named(findings, "projection").state == "ok"
+    assert re.search(r"\d+ cores", named(findings, "CPU").found)
+
+
+def test_every_dependency_is_looked_at() -> None:
+    """The list is the installed package's own."""
+    project = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
+    names = {re.split(r"[>=<; ]", line)[0] for line in project["dependencies"]}
+    assert names <= {finding.name for finding in examine()}
+    assert set(doctor.OPTIONAL) <= names
+    assert set(doctor.MODULES) <= names
+
+
+def test_a_required_library_that_is_missing_breaks_the_package(importing: Callable[..., None]) -> None:
+    importing("h5py", ModuleNotFoundError("No module named 'h5py'"))
+    findings = examine()
+    lost = named(findings, "h5py")
+    assert (lost.state, lost.found) == ("broken", "not installed")
+    assert re.fullmatch(r"pip install 'h5py>=[\d.]+'", lost.fix)
+    assert not works(findings)
+    assert "The package does not work" in report(findings)
+
+
+def test_an_old_library_is_told_by_its_version(importing: Callable[..., None]) -> None:
+    old = ModuleType("numba")
+    old.__version__ = "0.9.1"  # type: ignore[attr-defined]
+    importing("numba", old)
+    found = named(examine(), "numba")
+    assert found.state == "broken"
+    assert re.match(r"0\.9\.1, older than 0\.\d\d", found.found), "numbers, not text, are compared"
+
+
+def test_open3d_without_its_system_libraries(importing: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the packages whose libraries are missing are named, and the package works without."""
+    importing("open3d", OSError("libusb-1.0.so.0: cannot open shared object file"))
+    monkeypatch.setattr(doctor.sys, "platform", "linux")  # type: ignore[attr-defined]
+    monkeypatch.setattr(doctor, "_loads", lambda library: library not in ("libusb-1.0.so.0", "libEGL.so.1"))
+    findings = list(doctor._libraries())
+    found = named(findings, "open3d")
+    assert (found.state, found.found) == ("absent", "lacks system libraries")
+    assert found.fix.endswith("apt-get install -y --no-install-recommends libusb-1.0-0 libegl1")
+    assert works(findings)
+    assert found.fix in report(findings)
+    assert "PCD" in report(findings)
+
+
+def test_open3d_that_fails_for_another_reason_shows_it(
+    importing: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    importing("open3d", ImportError("numpy.core.multiarray failed"))
+    monkeypatch.setattr(doctor, "_loads", lambda library: True)
+    found = named(list(doctor._libraries()), "open3d")
+    assert found.state == "check"
+    assert "numpy.core.multiarray failed" in found.found
+
+
+def test_which_libraries_load_is_asked_of_the_system() -> None:
+    assert not doctor._loads("libdoes-not-exist.so.1")
+    assert set(doctor.missing_packages()) <= set(SHARED_OBJECTS.values())
+
+
+def test_a_projection_that_goes_wrong_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    import lidar_synth.projection
+
+    def shifted(scan: Any) -> SimpleNamespace:
+        return SimpleNamespace(range=lidar_synth.projection.spherical.project(scan).range * 1.001)
+
+    monkeypatch.setattr(lidar_synth.projection, "project", shifted)
+    assert doctor._geometry().state == "broken"
+
+
+def test_the_cards_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    card = SimpleNamespace(name="NVIDIA H200", total_memory=139 * 2**30, major=9, minor=0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda number: card)
+    [found] = doctor._cuda()
+    assert (found.name, found.state) == ("cuda:0", "ok")
+    assert found.found.startswith("NVIDIA H200, 139 GiB, compute 9.0")
+
+
+@pytest.mark.parametrize(
+    ("driver", "build", "state", "found"),
+    [(None, None, "absent", "no NVIDIA driver"), ("/usr/bin/nvidia-smi", None, "check", "built for the CPU"),
+     ("/usr/bin/nvidia-smi", "13.0", "check", "finds no card")],
+)  # fmt: skip
+def test_why_there_is_no_card(
+    monkeypatch: pytest.MonkeyPatch, driver: str | None, build: str | None, state: str, found: str
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    monkeypatch.setattr(torch.version, "cuda", build)
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: driver)  # type: ignore[attr-defined]
+    [finding] = doctor._cuda()
+    assert finding.state == state
+    assert found in finding.found
+
+
+@pytest.mark.parametrize("variable", sorted(DATA_ROOTS))
+def test_data_roots_are_checked(variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(variable, raising=False)
+    assert named(list(doctor._data()), variable).found == "not set"
+    monkeypatch.setenv(variable, str(tmp_path / "nowhere"))
+    assert "is not a folder" in named(list(doctor._data()), variable).found
+    monkeypatch.setenv(variable, str(tmp_path))
+    empty = named(list(doctor._data()), variable)
+    pattern, companions = DATA_ROOTS[variable]
+    assert (empty.state, pattern in empty.found) == ("check", True)
+    file = tmp_path / pattern.replace("*", "0")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(b"")
+    right = named(list(doctor._data()), variable)
+    assert right.state == "ok"
+    assert all(name in right.found for name in companions)
+    for name in companions:
+        (tmp_path / name).mkdir(parents=True)
+    assert named(list(doctor._data()), variable).found == str(tmp_path)
+
+
+def test_the_command_tells_the_same_to_people_and_to_scripts() -> None:
+    people, scripts = CliRunner().invoke(app), CliRunner().invoke(app, ["--json"])
+    assert (people.exit_code, scripts.exit_code) == (0, 0)
+    told = json.loads(scripts.stdout)
+    assert told["works"] is True
+    for finding in told["findings"]:
+        assert f"{finding['state']:<7} {finding['name']}" in people.stdout
+    assert people.stdout.strip().endswith("The package works.")
+
+
+def test_the_command_fails_where_the_package_does(importing: Callable[..., None]) -> None:
+    importing("safetensors", ImportError("no version information"))
+    result = CliRunner().invoke(app, ["--json"])
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["works"] is False
