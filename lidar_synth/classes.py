@@ -56,7 +56,7 @@ class Taxonomy:
 
     @cached_property
     def _table(self) -> NDArray[np.int16]:
-        table = np.full(max(self.to_train) + 1, -1, np.int16)
+        table = np.full(1 << 16, -1, np.int16)
         table[list(self.to_train)] = list(self.to_train.values())
         return table
 
@@ -73,10 +73,13 @@ class Taxonomy:
         Raises:
             DataError: on an id that the dataset does not define.
         """
-        ids = np.asarray(ids).astype(np.int64, copy=False)
-        inside = (ids >= 0) & (ids < len(self._table))
-        train = self._table[np.where(inside, ids, 0)]
-        unknown = ~inside | (train < 0)
+        ids = np.asarray(ids)
+        if ids.dtype != np.uint16:
+            inside = (ids >= 0) & (ids < len(self._table))
+            train = np.where(inside, self._table[np.where(inside, ids, 0)], np.int16(-1))
+        else:
+            train = self._table[ids]
+        unknown = train < 0
         if unknown.any():
             raise DataError(
                 f"{where}: unknown class ids {np.unique(ids[unknown])[:8].tolist()}",

@@ -30,6 +30,7 @@ class Boxes:
         occlusion: (M,) int8, KITTI's 0 visible, 1 partly, 2 largely, 3 unknown; -1 = not known.
         image_box: (M, 4) float32 left, top, right, bottom in pixels; -1 = not known.
         instance: (M,) int32, the id that a track keeps over frames; -1 = not known.
+        alpha: (M,) float32 radians, the angle under which KITTI's file says the object is seen; -10 = not known.
         dont_care: (K, 4) float32 image rectangles of KITTI's ``DontCare`` regions, which have no box.
 
     Raises:
@@ -42,20 +43,22 @@ class Boxes:
     occlusion: NDArray[np.int8] = None  # type: ignore[assignment]
     image_box: NDArray[np.float32] = None  # type: ignore[assignment]
     instance: NDArray[np.int32] = None  # type: ignore[assignment]
+    alpha: NDArray[np.float32] = None  # type: ignore[assignment]
     dont_care: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 4), np.float32))
 
     def __post_init__(self) -> None:
         self.values = np.asarray(self.values, np.float32).reshape(-1, 7)
         self.names = tuple(self.names)
         count = len(self.values)
-        for name, shape, dtype in (
-            ("truncation", (count,), np.float32),
-            ("occlusion", (count,), np.int8),
-            ("image_box", (count, 4), np.float32),
-            ("instance", (count,), np.int32),
+        for name, shape, dtype, unknown in (
+            ("truncation", (count,), np.float32, -1),
+            ("occlusion", (count,), np.int8, -1),
+            ("image_box", (count, 4), np.float32, -1),
+            ("instance", (count,), np.int32, -1),
+            ("alpha", (count,), np.float32, -10),
         ):
             given = getattr(self, name)
-            setattr(self, name, np.full(shape, -1, dtype) if given is None else np.asarray(given, dtype))
+            setattr(self, name, np.full(shape, unknown, dtype) if given is None else np.asarray(given, dtype))
             if getattr(self, name).shape != shape:
                 raise DataError(f"boxes: {name} has shape {getattr(self, name).shape}", f"{shape}")
         if len(self.names) != count:

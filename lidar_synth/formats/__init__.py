@@ -1,0 +1,147 @@
+"""Datasets and file formats: scans in, scans out.
+
+A reader is an indexable source of ``Scan`` (source.py), a writer puts scans into one output folder (writer.py). One
+file per dataset or format holds both. To add a format: write that file, and put its class into ``READERS``,
+``WRITERS`` or both; ``open_scans``, the command line and the parametrised tests then know it.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.folder import SUFFIXES, Folder, KITTIWriter, NPZWriter, PCDWriter, PLYWriter
+from lidar_synth.formats.kitti360 import KITTI360, KITTI360Writer
+from lidar_synth.formats.kitti_object import KITTIObject, KITTIObjectWriter
+from lidar_synth.formats.kitti_raw import DRIVES, KITTIRaw
+from lidar_synth.formats.npz import read_arrays
+from lidar_synth.formats.nuscenes import SUFFIX, NuScenes
+from lidar_synth.formats.png import PNGWriter, RangePNG
+from lidar_synth.formats.range_images import RangeImages, RangeWriter
+from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
+from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.writer import Writer
+from lidar_synth.sensor import Sensor
+
+__all__ = [
+    "KITTI360",
+    "READERS",
+    "WRITERS",
+    "Calibration",
+    "Folder",
+    "KITTIObject",
+    "KITTIRaw",
+    "NuScenes",
+    "OnBad",
+    "RangeImages",
+    "RangePNG",
+    "ScanFiles",
+    "SemanticKITTI",
+    "Writer",
+    "layout_of",
+    "open_scans",
+]
+
+READERS: dict[str, type[ScanFiles]] = {
+    "kitti360": KITTI360,
+    "semantic_kitti": SemanticKITTI,
+    "kitti_object": KITTIObject,
+    "kitti_raw": KITTIRaw,
+    "nuscenes": NuScenes,
+    "range": RangeImages,
+    "png": RangePNG,
+    "folder": Folder,
+}
+"""Reader by layout."""
+
+WRITERS: dict[str, type[Writer]] = {
+    "kitti": KITTIWriter,
+    "semantic_kitti": SemanticKITTIWriter,
+    "kitti_object": KITTIObjectWriter,
+    "kitti360": KITTI360Writer,
+    "range": RangeWriter,
+    "pcd": PCDWriter,
+    "ply": PLYWriter,
+    "npz": NPZWriter,
+    "png": PNGWriter,
+}
+"""Writer by format."""
+
+SIGNS: dict[str, Callable[[Path], bool]] = {
+    "kitti360": lambda root: (root / "data_3d_raw").is_dir(),
+    "semantic_kitti": lambda root: any(root.glob("sequences/*/velodyne")),
+    "kitti_object": lambda root: any(root.glob("t[er]*ing/velodyne*")),
+    "nuscenes": lambda root: (
+        root.name.endswith(SUFFIX) or any(any(root.glob(p)) for p in (f"*{SUFFIX}", f"samples/LIDAR_TOP/*{SUFFIX}"))
+    ),
+    "kitti_raw": lambda root: any(any(root.glob(p)) for p in ("velodyne_points/data", DRIVES, f"*/{DRIVES}")),
+    "png": lambda root: root.suffix == ".png" or any(root.glob("range/*.png")),
+    "range": lambda root: _holds_range_images(root),
+    "folder": lambda root: root.suffix in SUFFIXES or any(p.suffix in SUFFIXES for p in root.rglob("*")),
+}
+"""How a layout is recognised, in this order."""
+
+
+def open_scans(
+    path: str | Path,
+    *,
+    sensor: str | Path | Sensor | None = None,
+    layout: str | None = None,
+    split: str | None = None,
+    on_bad: OnBad = "error",
+) -> ScanFiles:
+    """A source of the scans at a path: a dataset's root, a folder of scans, or one file.
+
+    Args:
+        path: where they are.
+        sensor: which sensor took them, where it is not the layout's own.
+        layout: one of ``READERS``; by default recognised by what is there.
+        split: a split's name, for the layouts that have splits.
+        on_bad: ``"error"``, or ``"skip"`` to count and name what cannot be read.
+
+    Raises:
+        FileError: where there is no such path.
+        DataError: where no layout is recognised, or it holds no scan.
+        ConfigError: on an unknown layout or split, or a split for a layout that has none.
+    """
+    path = Path(path)
+    name = layout_of(path) if layout is None else layout
+    reader = choose("layout", name, READERS)
+    options = {"sensor": sensor, "split": split}
+    if split is not None and reader not in (KITTI360, SemanticKITTI, KITTIObject):
+        raise ConfigError(f"split {split!r} of {path}", f"no split: layout {name!r} has none")
+    return reader(path, on_bad=on_bad, **{k: v for k, v in options.items() if v is not None})  # type: ignore[arg-type]
+
+
+def layout_of(path: Path) -> str:
+    """The layout of what is at a path.
+
+    Raises:
+        FileError: where there is nothing.
+        DataError: where it is none that a reader reads.
+    """
+    if not path.exists():
+        raise FileError(f"{path} does not exist", "a dataset's root, a folder of scans, or one file")
+    found = next((name for name, sign in SIGNS.items() if sign(path)), None)
+    if found is None:
+        raise DataError(
+            f"{path} holds no scan in a layout that is known",
+            f"one of {', '.join(READERS)}, or {', '.join(SUFFIXES)} files",
+            "Give the dataset's root, the folder that holds data_3d_raw, sequences, training or samples for instance.",
+        )
+    return found
+
+
+def _holds_range_images(root: Path) -> bool:
+    """Whether the first array file is an image and not a list of points."""
+    paths = [root] if root.is_file() else sorted(p for p in root.rglob("*") if p.suffix in (".npz", ".npy"))
+    if not paths or paths[0].suffix not in (".npz", ".npy"):
+        return False
+    try:
+        arrays = read_arrays(paths[0])
+    except DataError:
+        return False
+    if "array" in arrays:
+        shape = arrays["array"].shape
+        return len(shape) == 3 or (len(shape) == 2 and shape[1] > 8)
+    return "range" in arrays or "image" in arrays

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from timing import print_table, time_in_turns
 
-from lidar_synth.formats.files import read_points
+from lidar_synth.formats.points import read_points
 from lidar_synth.projection import locate, project, project_batch, unfold, unproject
 from lidar_synth.scan import Scan
 from lidar_synth.sensor import Sensor, load_sensor

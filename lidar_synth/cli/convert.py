@@ -1,0 +1,44 @@
+"""``lidar-synth convert``: scans from any format to any other."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="A file, a folder of scans or a dataset's root.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
+    to: Annotated[
+        str, typer.Option(help="kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | png")
+    ],
+    sensor: Annotated[str | None, typer.Option(help="Sensor of the input: a preset or a YAML file.")] = None,
+    layout: Annotated[str | None, typer.Option(help="Layout of the input, if it is not to be recognised.")] = None,
+    split: Annotated[str | None, typer.Option(help="Split of the input, r2flow/train for instance.")] = None,
+    as_sensor: Annotated[str | None, typer.Option(help="Re-project to this sensor: a preset or a YAML file.")] = None,
+    on_bad: Annotated[str, typer.Option(help="error | skip: what to do with a scan that cannot be read.")] = "error",
+    jobs: Annotated[int, typer.Option(help="Worker processes.")] = 1,
+) -> None:
+    """Convert scans from one format to another. Run it again to go on where it stopped.
+
+    Examples:
+
+      lidar-synth convert KITTI-360 out --to semantic_kitti --split r2flow/test --jobs 4
+
+      lidar-synth convert scans out --to pcd --on-bad skip
+
+      lidar-synth convert SemanticKITTI out --to range --as-sensor os1_128
+    """
+    from lidar_synth.convert import convert as run
+    from lidar_synth.formats import WRITERS, open_scans
+    from lidar_synth.formats.source import choose
+    from lidar_synth.sensor import load_sensor
+
+    writer = choose("format", to, WRITERS)(out)
+    scans = open_scans(source, sensor=sensor, layout=layout, split=split, on_bad=on_bad)  # type: ignore[arg-type]
+    target = None if as_sensor is None else load_sensor(as_sensor)
+    report = run(scans, writer, jobs=jobs, on_bad=on_bad, as_sensor=target)  # type: ignore[arg-type]
+    print(f"{out}: {report.written} scans written, {report.kept} were there already, {len(report.skipped)} skipped")
+    for name, reason in report.skipped.items():
+        print(f"  skipped {name}: {reason}", file=sys.stderr)

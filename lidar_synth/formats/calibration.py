@@ -1,0 +1,90 @@
+"""A camera beside the sensor: how points of the sensor frame fall into its image."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """One rectified camera. Its frame is x right, y down, z forward, metres.
+
+    Args:
+        projection: (3, 4) float64, the camera's P: pixels of points in the rectified camera frame.
+        camera_from_sensor: (4, 4) float64 rigid transform from the sensor frame to the camera frame.
+        image_size: (width, height) in pixels; None where no file tells it.
+        matrices: the matrices of the dataset's own calibration files by their names there, so that writing
+            them back loses nothing.
+
+    Raises:
+        DataError: on another shape.
+    """
+
+    projection: Matrix
+    camera_from_sensor: Matrix
+    image_size: tuple[int, int] | None = None
+    matrices: Mapping[str, Matrix] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, shape in (("projection", (3, 4)), ("camera_from_sensor", (4, 4))):
+            value = np.asarray(getattr(self, name), np.float64)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise DataError(f"calibration: {name} of shape {value.shape}", f"{shape}, all values finite")
+            object.__setattr__(self, name, value)
+
+    @property
+    def image_from_sensor(self) -> Matrix:
+        """(3, 4) the whole way: homogeneous pixels of homogeneous points in the sensor frame."""
+        return self.projection @ self.camera_from_sensor
+
+    @property
+    def sensor_from_camera(self) -> Matrix:
+        """(4, 4) rigid transform from the camera frame to the sensor frame."""
+        return np.asarray(np.linalg.inv(self.camera_from_sensor), np.float64)
+
+    def pixels(self, points: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
+        """Where points fall in the image.
+
+        Args:
+            points: (N, 3) metres, sensor frame.
+
+        Returns:
+            (N, 2) column and row in pixels, NaN for points in or behind the camera's plane, and (N,) depth in
+            metres along the optical axis. A point is in the picture where its pixel is within ``image_size``.
+        """
+        matrix = self.image_from_sensor
+        homogeneous = np.asarray(points, np.float64) @ matrix[:, :3].T + matrix[:, 3]
+        depth = homogeneous[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = np.where(depth[:, None] > 0, homogeneous[:, :2] / depth[:, None], np.nan)
+        return pixels, depth
+
+
+def homogeneous(matrix: Matrix) -> Matrix:
+    """(4, 4) of 9 values (a rotation) or 12 (rotation and translation, row by row)."""
+    result = np.eye(4)
+    matrix = np.asarray(matrix, np.float64).reshape(3, -1)
+    result[:3, : matrix.shape[1]] = matrix
+    return result
+
+
+AXES_CAMERA_FROM_SENSOR: Matrix = np.array([(0, -1, 0, 0), (0, 0, -1, 0), (1, 0, 0, 0), (0, 0, 0, 1)], np.float64)
+"""(4, 4) the turn from x forward, y left, z up to a camera's x right, y down, z forward."""
+
+
+def ideal_camera(focal: float, image_size: tuple[int, int]) -> Calibration:
+    """A pinhole camera that stands in the sensor's origin and looks straight ahead.
+
+    Args:
+        focal: focal length in pixels.
+        image_size: (width, height) in pixels; the optical axis meets the middle.
+    """
+    width, height = image_size
+    projection = np.array([(focal, 0, width / 2, 0), (0, focal, height / 2, 0), (0, 0, 1, 0)])
+    return Calibration(projection, AXES_CAMERA_FROM_SENSOR, image_size)

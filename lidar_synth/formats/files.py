@@ -1,0 +1,164 @@
+"""How bytes come off the disk and onto it: whole files, the numbers in text files, and clear errors.
+
+A file is written beside its place and renamed, so that a reader never meets half of one.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError, FileError
+
+SKIP_HINT = "Copy the file again, or leave it out with on_bad='skip'."
+
+
+def write_file(path: Path, content: bytes | Callable[[BinaryIO], object]) -> None:
+    """Write beside ``path``, then rename; a failure leaves what was there before.
+
+    Args:
+        path: where the file will stand; its folder is made.
+        content: the bytes, or a function that writes them to an open binary file.
+
+    Raises:
+        FileError: where the target cannot be written or the disk is full.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            if callable(content):
+                content(file)
+            else:
+                file.write(content)
+        part.replace(path)
+    except OSError as error:
+        raise FileError(
+            f"{path} cannot be written ({error.strerror or error})",
+            "a folder that may be written to, on a disk with room",
+            "Choose another output folder or free some space, then run the same again: what is whole is kept.",
+        ) from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        FileError: where it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def unreadable(path: Path, error: OSError) -> FileError:
+    """The error for a path that cannot be read."""
+    return FileError(f"{path} cannot be read ({error.strerror or error})", "a file of the dataset")
+
+
+def list_files(folder: Path, *suffixes: str) -> list[Path]:
+    """The files of a folder with one of the suffixes, by name; hidden ones (half-written) are left out.
+
+    Raises:
+        FileError: where the folder cannot be read.
+    """
+    try:
+        names = sorted(e.name for e in os.scandir(folder) if e.name.endswith(suffixes) and e.name[0] != ".")
+    except OSError as error:
+        raise FileError(f"{folder} cannot be read ({error.strerror})", "a folder with scans") from error
+    return [folder / name for name in names]
+
+
+def read_values(path: Path, dtype: str) -> NDArray[Any]:
+    """(N,) values of one type from a raw file.
+
+    Raises:
+        FileError: where the file cannot be read.
+        DataError: where its size is not a whole number of values.
+    """
+    content = read_file(path)
+    width = np.dtype(dtype).itemsize
+    if len(content) % width:
+        raise DataError(f"{path} is {len(content)} bytes long", f"a multiple of {width} ({dtype})", SKIP_HINT)
+    return np.frombuffer(content, dtype)
+
+
+def read_text(path: Path) -> str:
+    """The text of a file.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where it is no text.
+    """
+    try:
+        return read_file(path).decode()
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path} is not a text file ({error.reason})", "UTF-8 text") from error
+
+
+def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
+    """(N, columns) numbers of a text file, one row per line.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: on a line with something else.
+    """
+    rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
+    try:
+        return np.array(rows, np.float64).reshape(-1, columns)
+    except ValueError as error:
+        raise DataError(f"{path} does not hold rows of {columns} numbers", f"{columns} numbers per line") from error
+
+
+def read_named_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
+    """{name: (N,) values} of KITTI's calibration files: ``name: number number ...`` per line.
+
+    Lines whose values are not all numbers (dates) are left out.
+
+    Raises:
+        FileError: where it cannot be read.
+    """
+    matrices = {}
+    for line in read_text(path).splitlines():
+        name, colon, values = line.partition(":")
+        if not colon:
+            continue
+        with suppress(ValueError):
+            matrices[name.strip()] = np.array(values.split(), np.float64)
+    return matrices
+
+
+def write_named_matrices(path: Path, matrices: Mapping[str, NDArray[np.float64]]) -> None:
+    """The inverse of ``read_named_matrices``, with KITTI's 12 decimals.
+
+    Raises:
+        FileError: where it cannot be written.
+    """
+    lines = [f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(m))}\n" for name, m in matrices.items()]
+    write_file(path, "".join(lines).encode())
+
+
+def png_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) of a PNG, from its header; None where there is no such file."""
+    try:
+        with path.open("rb") as file:
+            header = file.read(24)
+    except OSError:
+        return None
+    if header[:8] != b"\x89PNG\r\n\x1a\n":
+        return None
+    width, height = np.frombuffer(header[16:], ">u4").tolist()
+    return width, height
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Values of a text file so that reading them gives the same float64."""
+    return " ".join(repr(float(v)) for v in values)

@@ -1,0 +1,240 @@
+"""KITTI-360: drives of a HDL-64E with poses, calibration, boxes and, where somebody made them, labels per scan.
+
+Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
+
+    data_3d_raw/DRIVE/velodyne_points/data/FFFFFFFFFF.bin       float32 x, y, z, reflectance; sensor frame
+    data_2d_raw/DRIVE/image_00/data_rect/FFFFFFFFFF.png         rectified left camera
+    data_poses/DRIVE/poses.txt                                  F and 12 numbers: the car's IMU at frame F to world
+    data_3d_bboxes/train/DRIVE.xml                              boxes, see kitti360_boxes.py
+    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label        labels per scan, see below
+    calibration/perspective.txt                                 P_rect_00, R_rect_00
+    calibration/calib_cam_to_velo.txt, calib_cam_to_pose.txt    camera 0 to velodyne; each camera to the IMU
+
+The dataset publishes labels of accumulated clouds only. Labels per scan are recovered from them by nearest neighbours
+(github.com/JulesSanchez/recoverKITTI360label writes DRIVE/labels/FFFFFFFFFF.bin: int16 per point, KITTI-360's
+semantic id, -1 = none found). The reader takes, under data_3d_semantics_scan, files named ``.label`` or ``.bin`` and
+tells the two encodings apart by their size: two bytes per point are that tool's, four are SemanticKITTI's packing
+(KITTI-360's semantic id in the lower 16 bits, instance above), which the writer writes. Only the frames of annotated
+windows can have labels; others are read without.
+
+The pose of a ``Scan`` is velodyne to world: pose calib_cam_to_pose[image_00] calib_cam_to_velo^-1.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import KITTI360 as CLASSES
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.files import (
+    list_files,
+    read_file,
+)
+from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES, WorldBoxes, read_boxes, write_boxes
+from lidar_synth.formats.kitti360_poses import CAMERA, read_calibration, read_poses, write_calibration, write_poses
+from lidar_synth.formats.point_labels import decode_labels, encode_labels, mismatch, write_labels
+from lidar_synth.formats.points import read_points, write_points
+from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
+from lidar_synth.scan import Boxes, Scan
+from lidar_synth.sensor import Sensor
+
+
+def _drives(*drives: int) -> tuple[str, ...]:
+    return tuple(f"2013_05_28_drive_{n:04d}_sync" for n in drives)
+
+
+SPLITS: dict[str, tuple[str, ...] | None] = {
+    "r2flow/train": _drives(3, 4, 5, 6, 7, 9, 10),
+    "r2flow/test": _drives(0, 2),
+    "lidm/train": _drives(0, 2, 4, 5, 6, 7, 8, 9, 10),
+    "lidm/val": _drives(3),
+    "lidm-camera/train": _drives(0, 4, 5, 6, 7, 8, 9, 10),
+    "lidm-camera/val": _drives(3),
+    "all": None,
+}
+"""Drives of each split, by the work that introduced it; None = all that are there. They leak into each other: what
+R2Flow tests on, LiDM trains on."""
+
+
+class KITTI360(ScanFiles):
+    """KITTI-360's drives: <root>/data_3d_raw/DRIVE/velodyne_points/data/*.bin with poses, boxes, calibration, images.
+
+    Boxes and labels are there only where their files are; a scan has boxes only where its pose is known.
+
+    Args:
+        root: the folder that holds ``data_3d_raw``.
+        split: a split by its full name, ``r2flow/train`` for instance, or ``all``.
+        sensor: a preset's name, a YAML file or a ``Sensor``.
+        on_bad: see ``ScanFiles``.
+
+    Raises:
+        ConfigError: on a name that is no split; a bare ``train`` is none, because works split the drives differently.
+        DataError: where none of the split's drives is there.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str = "all",
+        *,
+        sensor: str | Path | Sensor = "hdl64e_kitti360",
+        on_bad: OnBad = "error",
+    ) -> None:
+        root = Path(root)
+        wanted = choose("KITTI-360 split", split, SPLITS, "Works split the drives differently, so say whose split.")
+        there = sorted(p.parent.parent.name for p in (root / "data_3d_raw").glob("*/velodyne_points/data"))
+        drives = [d for d in there if wanted is None or d in wanted]
+        if not drives:
+            raise DataError(
+                f"{root} has no drive of split {split!r} (it has {', '.join(there) or 'none at all'})",
+                "data_3d_raw/2013_05_28_drive_NNNN_sync/velodyne_points/data/*.bin",
+            )
+        ids = [f"{d}/{path.stem}" for d in drives for path in list_files(scans_folder(root, d), ".bin")]
+        super().__init__(root, ids, sensor, on_bad)
+        self._camera = read_calibration(root)
+        self._poses = {d: read_poses(root, d, self._camera) for d in drives}
+        self._boxes: dict[str, WorldBoxes | None] = {}
+
+    def read(self, index: int) -> Scan:
+        drive, frame = self.ids[index].split("/")
+        path = scans_folder(self.root, drive) / f"{frame}.bin"
+        points = read_points(path)
+        pose = self._poses[drive].get(int(frame)) if frame.isdigit() else None
+        image = image_path(self.root, drive, frame)
+        return Scan(
+            points[:, :3],
+            points[:, 3],
+            self.sensor,
+            **read_scan_labels(self.root, drive, frame, path, len(points)),
+            boxes=self._scan_boxes(drive, int(frame), pose) if pose is not None else None,
+            pose=pose,
+            image_path=image if image.is_file() else None,
+            id=self.ids[index],
+        )
+
+    def calibration(self, index: int) -> Calibration | None:
+        return self._camera
+
+    def _scan_boxes(self, drive: str, frame: int, pose: NDArray[np.float64]) -> Boxes | None:
+        if drive not in self._boxes:
+            paths = sorted((self.root / "data_3d_bboxes").glob(f"*/{drive}.xml"))
+            self._boxes[drive] = read_boxes(paths[0]) if paths else None
+        boxes = self._boxes[drive]
+        return None if boxes is None else boxes.at(frame, pose, self.sensor.range_max)
+
+
+class KITTI360Writer(Writer):
+    """Writes KITTI-360's layout: scans, poses, calibration, boxes, images and labels per scan.
+
+    Drive and frame of an id ``DRIVE/FFFFFFFFFF`` are kept, and those of SemanticKITTI's sequences (sequence 03 is
+    drive 0003); other scans go into ``drive``, numbered by index. Boxes are written for each frame with their
+    timestamp, as the dataset does for what moves. A scan with boxes and no pose gets the identity for its pose: its
+    world is its sensor's frame.
+
+    Args:
+        root: output folder.
+        drive: where scans without a drive of their own go.
+        calibration: see ``Writer``.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        drive: str = "2013_05_28_drive_0000_sync",
+        calibration: Calibration | None = None,
+    ) -> None:
+        super().__init__(root, calibration=calibration)
+        if not drive or "/" in drive:
+            raise ConfigError(f"drive {drive!r}", "a folder's name, 2013_05_28_drive_0000_sync for instance")
+        self.drive = drive
+
+    def path(self, index: int, name: str | None = None) -> Path:
+        match = re.fullmatch(r"(?:2013_05_28_drive_00)?(\d\d)(?:_sync)?/(\d+)", name or "")
+        drive, frame = (_drives(int(match[1]))[0], int(match[2])) if match else (self.drive, index)
+        return scans_folder(self.root, drive) / f"{frame:010d}.bin"
+
+    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        drive, frame = path.parents[2].name, path.stem
+        if not (self.root / "calibration" / "perspective.txt").is_file():
+            write_calibration(self.root, camera or CAMERA)
+        write_note(self.root / "data_poses" / drive, int(frame), _facts(scan))
+        if picture is not None:
+            write_image(image_path(self.root, drive, frame), picture)
+        if scan.label is not None:
+            labels = self.root / "data_3d_semantics_scan" / drive / "labels" / f"{frame}.label"
+            write_labels(labels, _with_global_instances(encode_labels(scan, CLASSES), scan))
+        write_points(path, scan)
+
+    def finish(self) -> None:
+        for folder in sorted((self.root / "data_poses").glob("*")):
+            notes = read_notes(folder)
+            poses = read_poses(self.root, folder.name, read_calibration(self.root))
+            poses |= {f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None}
+            write_poses(self.root, folder.name, poses)
+            boxes = {
+                f: (Boxes(note["boxes"], note["names"], instance=note["instance"]), poses[f])
+                for f, note in notes.items()
+                if note["boxes"] is not None
+            }
+            if boxes:
+                write_boxes(self.root / "data_3d_bboxes" / "train" / f"{folder.name}.xml", boxes)
+            clear_notes(folder)
+
+
+def _with_global_instances(labels: NDArray[np.uint32], scan: Scan) -> NDArray[np.uint32]:
+    """KITTI-360 numbers instances as id * 1000 + n, in labels as for its boxes; numbers below 1000 become such."""
+    if labels is scan.raw_label:
+        return labels
+    ids, instances = labels & 0xFFFF, labels >> 16
+    local = (instances > 0) & (instances < MAX_INSTANCES)
+    return np.where(local, ids | ((ids * MAX_INSTANCES + instances) << 16), labels).astype(np.uint32)
+
+
+def _facts(scan: Scan) -> dict[str, Any]:
+    boxes, pose = scan.boxes, scan.pose
+    if boxes is not None and pose is None:
+        pose = np.eye(4)
+    return {
+        "pose": None if pose is None else pose.tolist(),
+        "boxes": None if boxes is None else boxes.values.tolist(),
+        "names": [] if boxes is None else boxes.names,
+        "instance": [] if boxes is None else boxes.instance.tolist(),
+    }
+
+
+def scans_folder(root: Path, drive: str) -> Path:
+    """Where a drive keeps its scans."""
+    return root / "data_3d_raw" / drive / "velodyne_points" / "data"
+
+
+def image_path(root: Path, drive: str, frame: str) -> Path:
+    """The rectified image of camera 0 at a frame."""
+    return root / "data_2d_raw" / drive / "image_00" / "data_rect" / f"{frame}.png"
+
+
+def read_scan_labels(root: Path, drive: str, frame: str, points: Path, count: int) -> dict[str, Any]:
+    """``label``, ``raw_label`` and ``instance`` of a scan; empty where nobody has made its labels.
+
+    Raises:
+        FileError: where its label file cannot be read.
+        DataError: on another number of labels than points, or an id that KITTI-360 does not define.
+    """
+    folder = root / "data_3d_semantics_scan" / drive / "labels"
+    path = next((p for p in (folder / f"{frame}.label", folder / f"{frame}.bin") if p.is_file()), None)
+    if path is None:
+        return {}
+    content = read_file(path)
+    if len(content) == 2 * count:
+        ids = np.frombuffer(content, "<i2")
+        raw = np.where(ids < 0, 0, ids).astype(np.uint32)
+    elif len(content) == 4 * count:
+        raw = np.frombuffer(content, "<u4")
+    else:
+        raise mismatch(path, len(content) // 4, points, count)
+    return decode_labels(raw, CLASSES, f"{path} (labels of {points})")

@@ -1,0 +1,202 @@
+"""KITTI-360's boxes: one XML per drive, in the world frame.
+
+Each object (https://www.cvlibs.net/datasets/kitti-360/documentation.php, data_3d_bboxes) is a unit cube, ``vertices``,
+that ``transform`` turns, stretches and moves into the world: its columns are the box's axes, as long as the box. What
+moves has one object per frame, whose ``timestamp`` is the frame. What stands still has one with timestamp -1, and
+``start_frame`` and ``end_frame`` bound the *window* of the drive, some 200 m, in which it was annotated; the file does
+not say from which frames it can be seen.
+
+The reader therefore lists an object that stands still in every frame whose sensor is within range of it, if its window
+is at most ``MARGIN`` frames away (so that the next window's cars do not appear only when it begins, and those that
+parked there at another time do not appear at all). A ``Boxes`` knows no tilt, so a box that leans against the sensor
+keeps its yaw only.
+
+``semanticId`` is not the id of the label images, but an older numbering (``OBJECTS``); drive 0004 has labels only.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.formats.files import numbers, unreadable, write_file
+from lidar_synth.scan import Boxes
+
+MARGIN = 100
+"""Frames (about 80 m) that the window of an object may be away for it to be listed."""
+
+OBJECTS = {
+    13: ("car", 26, "Car"), 14: ("truck", 27, "Truck"), 15: ("trailer", 30, "Misc"), 16: ("caravan", 29, "Misc"),
+    17: ("motorcycle", 32, "Misc"), 18: ("bicycle", 33, "Misc"), 19: ("pedestrian", 24, "Pedestrian"),
+    20: ("rider", 25, "Cyclist"), 33: ("train", 31, "Tram"), 34: ("bus", 28, "Misc"),
+    36: ("unknownVehicle", 43, "Misc"),
+}  # fmt: skip
+"""{semanticId: (label, id in the label images, KITTI's name)} of what a detector knows; others are left out. Lossy: a
+rider's box is without the bicycle, which has its own."""
+
+BY_LABEL = {label: semantic for semantic, (label, _, _) in OBJECTS.items()}
+
+BY_NAME = {
+    "Car": 13, "Van": 13, "Truck": 14, "Pedestrian": 19, "Person_sitting": 19, "Cyclist": 20, "Tram": 33, "Misc": 36,
+}  # fmt: skip
+"""semanticId to write for KITTI's names. Lossy: vans are cars there, and sitting people are people."""
+
+MAX_INSTANCES = 1000
+"""A ``Boxes``' instance is id * 1000 + instanceId, as in the dataset's label images and tools."""
+
+CUBE = np.array(
+    [(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, -1), (-1, 1, 1), (-1, -1, -1), (-1, -1, 1)], np.float64
+)
+"""(8, 3) twice the vertices of the unit cube, in the order of the dataset."""
+
+FACES = "0 2 1 2 3 1 4 6 5 6 7 5 4 5 1 5 0 1 7 6 2 6 3 2 5 7 0 7 2 0 1 3 4 3 6 4"
+
+
+@dataclass(frozen=True)
+class WorldBoxes:
+    """The objects of a drive.
+
+    Args:
+        transforms: (M, 4, 4) float64 from the unit cube to the world.
+        names: (M,) KITTI's names.
+        instances: (M,) int32.
+        windows: (M, 2) int64 first and last frame in which an object may be listed; what moves has its frame twice.
+    """
+
+    transforms: NDArray[np.float64]
+    names: NDArray[np.str_]
+    instances: NDArray[np.int32]
+    windows: NDArray[np.int64]
+
+    def at(self, frame: int, pose: NDArray[np.float64], range_max: float) -> Boxes:
+        """The boxes around one scan, in its sensor frame.
+
+        Args:
+            frame: its number.
+            pose: (4, 4) sensor to world.
+            range_max: metres; objects whose centre is farther are left out.
+        """
+        now = (self.windows[:, 0] <= frame) & (frame <= self.windows[:, 1])
+        now &= np.linalg.norm(self.transforms[:, :3, 3] - pose[:3, 3], axis=1) <= range_max
+        local = np.linalg.inv(pose) @ self.transforms[now]
+        size = np.linalg.norm(local[:, :3, :3], axis=1)
+        yaw = np.arctan2(local[:, 1, 0], local[:, 0, 0])
+        return Boxes(
+            np.column_stack([local[:, :3, 3], size, yaw]),
+            tuple(self.names[now].tolist()),
+            instance=self.instances[now],
+        )
+
+
+def read_boxes(path: Path) -> WorldBoxes:
+    """The objects of a drive's XML that a detector knows.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where it is not KITTI-360's, or an object's vertices are no box.
+    """
+    transforms, names, instances, windows = [], [], [], []
+    try:
+        for _, node in ElementTree.iterparse(path):
+            if node.find("transform") is None:
+                continue
+            semantic = int(node.findtext("semanticId") or BY_LABEL.get(node.findtext("label", ""), -1))
+            if semantic in OBJECTS:
+                _, image_id, name = OBJECTS[semantic]
+                transforms.append(_matrix(node, "transform", (4, 4)) @ _unit_cube(_matrix(node, "vertices", (-1, 3))))
+                names.append(name)
+                instances.append(image_id * MAX_INSTANCES + int(node.findtext("instanceId") or 0))
+                frame, first, last = (int(node.findtext(t) or -1) for t in ("timestamp", "start_frame", "end_frame"))
+                windows.append((frame, frame) if frame >= 0 else (first - MARGIN, last + MARGIN))
+            node.clear()
+    except OSError as error:
+        raise unreadable(path, error) from error
+    except (ElementTree.ParseError, ValueError) as error:
+        raise DataError(f"{path}: {error}", "KITTI-360's data_3d_bboxes") from error
+    return WorldBoxes(
+        np.array(transforms).reshape(-1, 4, 4),
+        np.array(names, np.str_),
+        np.array(instances, np.int32),
+        np.array(windows, np.int64).reshape(-1, 2),
+    )
+
+
+def _matrix(node: ElementTree.Element, tag: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    return np.array(node.findtext(f"{tag}/data", "").split(), np.float64).reshape(shape)
+
+
+def _unit_cube(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) from the cube of side 1 around the origin to the box of the vertices: as a rule that cube itself."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    matrix = np.diag([*(high - low), 1.0])
+    matrix[:3, 3] = (low + high) / 2
+    return matrix
+
+
+def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64]]]) -> None:
+    """Write the boxes of frames, or add them to those of other frames that stand in the file already.
+
+    Args:
+        path: the drive's XML.
+        frames: {frame: (boxes in the sensor frame, (4, 4) sensor to world)}.
+
+    Raises:
+        FileError: where it cannot be read or written.
+        DataError: where what stands there already is no XML.
+    """
+    root = ElementTree.Element("opencv_storage")
+    if path.is_file():
+        try:
+            root = ElementTree.parse(path).getroot()
+        except OSError as error:
+            raise unreadable(path, error) from error
+        except ElementTree.ParseError as error:
+            raise DataError(f"{path}: {error}", "KITTI-360's data_3d_bboxes", "Remove it to write it anew.") from error
+    kept = [node for node in root if int(node.findtext("timestamp") or -1) not in frames]
+    objects = [node for frame, (boxes, pose) in sorted(frames.items()) for node in _objects(frame, boxes, pose)]
+    root[:] = [*kept, *objects]
+    for index, node in enumerate(root):
+        node.tag = f"object{index}"
+        _child(node, "index").text = str(index)
+    ElementTree.indent(root, " ")
+    write_file(path, lambda file: ElementTree.ElementTree(root).write(file, "utf-8", xml_declaration=True))
+
+
+def _objects(frame: int, boxes: Boxes, pose: NDArray[np.float64]) -> list[ElementTree.Element]:
+    nodes = []
+    for i, (x, y, z, length, width, height, yaw) in enumerate(boxes.values.astype(np.float64)):
+        semantic = BY_NAME.get(boxes.names[i], BY_NAME["Misc"])
+        label, image_id, _ = OBJECTS[semantic]
+        c, s = np.cos(yaw), np.sin(yaw)
+        local = np.eye(4)
+        local[:3, :3] = np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)]) * (length, width, height)
+        local[:3, 3] = x, y, z
+        instance = int(boxes.instance[i]) if boxes.instance[i] >= 0 else i + 1
+        instance -= image_id * MAX_INSTANCES if instance // MAX_INSTANCES == image_id else 0
+        node = ElementTree.Element("object")
+        _child(node, "label").text = label
+        for tag in ("start_frame", "end_frame", "timestamp"):
+            _child(node, tag).text = str(frame)
+        _child(node, "dynamic").text = "1"
+        _child(node, "semanticId").text = str(semantic)
+        _child(node, "instanceId").text = str(instance)
+        _opencv(node, "transform", (4, 4), "d", numbers((pose @ local).ravel()))
+        _opencv(node, "vertices", (8, 3), "f", numbers((CUBE / 2).ravel()))
+        _opencv(node, "faces", (12, 3), "u", FACES)
+        nodes.append(node)
+    return nodes
+
+
+def _child(node: ElementTree.Element, tag: str) -> ElementTree.Element:
+    found = node.find(tag)
+    return ElementTree.SubElement(node, tag) if found is None else found
+
+
+def _opencv(node: ElementTree.Element, tag: str, shape: tuple[int, int], kind: str, data: str) -> None:
+    matrix = ElementTree.SubElement(node, tag, type_id="opencv-matrix")
+    for name, text in (("rows", str(shape[0])), ("cols", str(shape[1])), ("dt", kind), ("data", data)):
+        ElementTree.SubElement(matrix, name).text = text

@@ -1,0 +1,101 @@
+"""KITTI-360's calibration and poses: where camera 0 and the IMU sit beside the velodyne, and where that drove.
+
+Files (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
+
+    calibration/perspective.txt          P_rect_00, R_rect_00, S_rect_00
+    calibration/calib_cam_to_velo.txt    12 numbers: camera 0, unrectified, to velodyne
+    calibration/calib_cam_to_pose.txt    image_00: camera 0, unrectified, to IMU
+    data_poses/DRIVE/poses.txt           a frame and 12 numbers per line: IMU to world
+    data_poses/DRIVE/cam0_to_world.txt   a frame and 16 numbers per line: rectified camera 0 to world
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
+from lidar_synth.formats.files import numbers, read_matrix, read_named_matrices, write_file, write_named_matrices
+
+CAMERA = ideal_camera(552.554261, (1408, 376))
+"""What ``calibration`` describes where no camera is known: image_00's size and focal length, at the sensor."""
+
+IMU_FROM_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
+"""The IMU has x forward, y right, z down; where nothing else is known it stands in the sensor."""
+
+
+def read_calibration(root: Path) -> Calibration | None:
+    """Camera 0, rectified; None where the dataset's ``calibration`` is not there.
+
+    Raises:
+        DataError: where a file of it is there, but not what it has to hold.
+    """
+    folder = root / "calibration"
+    paths = [folder / name for name in ("perspective.txt", "calib_cam_to_velo.txt", "calib_cam_to_pose.txt")]
+    if not all(path.is_file() for path in paths):
+        return None
+    named = read_named_matrices(paths[0]) | read_named_matrices(paths[2])
+    try:
+        matrices = {n: named[n] for n in ("P_rect_00", "R_rect_00", "S_rect_00", "image_00")}
+        matrices["cam_to_velo"] = read_matrix(paths[1], 12)[0]
+        camera_from_sensor = homogeneous(matrices["R_rect_00"]) @ np.linalg.inv(homogeneous(matrices["cam_to_velo"]))
+        width, height = matrices["S_rect_00"].astype(int).tolist()
+        return Calibration(matrices["P_rect_00"].reshape(3, 4), camera_from_sensor, (width, height), matrices)
+    except (KeyError, ValueError, IndexError) as error:
+        raise DataError(f"{folder}: {error!r}", "P_rect_00, R_rect_00, S_rect_00, image_00 and 12 numbers") from error
+
+
+def write_calibration(root: Path, camera: Calibration) -> None:
+    """The inverse of ``read_calibration``: KITTI-360's own matrices as they were, another camera unrectified."""
+    matrices = camera.matrices
+    if not {"P_rect_00", "R_rect_00", "S_rect_00", "image_00", "cam_to_velo"} <= set(matrices):
+        matrices = {
+            "P_rect_00": camera.projection,
+            "R_rect_00": np.eye(3),
+            "S_rect_00": np.array(camera.image_size or CAMERA.image_size, np.float64),
+            "image_00": (IMU_FROM_SENSOR @ camera.sensor_from_camera)[:3],
+            "cam_to_velo": camera.sensor_from_camera[:3],
+        }
+    folder = root / "calibration"
+    write_file(folder / "calib_cam_to_velo.txt", f"{numbers(matrices['cam_to_velo'].ravel())}\n".encode())
+    write_named_matrices(folder / "calib_cam_to_pose.txt", {"image_00": matrices["image_00"]})
+    # Last, because its presence says that the calibration is whole.
+    write_named_matrices(folder / "perspective.txt", {n: matrices[n] for n in ("S_rect_00", "R_rect_00", "P_rect_00")})
+
+
+def imu_from_sensor(camera: Calibration | None) -> NDArray[np.float64]:
+    """(4, 4) from the velodyne to the IMU, whose poses ``poses.txt`` holds."""
+    if camera is None or not {"image_00", "cam_to_velo"} <= set(camera.matrices):
+        return IMU_FROM_SENSOR
+    cam_to_velo = homogeneous(camera.matrices["cam_to_velo"])
+    return homogeneous(camera.matrices["image_00"]) @ np.linalg.inv(cam_to_velo)
+
+
+def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, NDArray[np.float64]]:
+    """{frame: (4, 4) velodyne to world}; empty without ``poses.txt`` or calibration. Not every frame has one."""
+    path = root / "data_poses" / drive / "poses.txt"
+    if camera is None or not path.is_file():
+        return {}
+    lines = read_matrix(path, 13)
+    matrices = np.tile(np.eye(4), (len(lines), 1, 1))
+    matrices[:, :3] = lines[:, 1:].reshape(-1, 3, 4)
+    return dict(zip(lines[:, 0].astype(int).tolist(), matrices @ imu_from_sensor(camera), strict=True))
+
+
+def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -> None:
+    """The inverse of ``read_poses``, for the calibration that stands in ``root``; nothing where there are none.
+
+    ``cam0_to_world.txt``, which the dataset has too, is written beside it.
+    """
+    camera = read_calibration(root)
+    if not poses or camera is None:
+        return
+    sensor_from_imu = np.linalg.inv(imu_from_sensor(camera))
+    imu, cam0 = [], []
+    for frame, pose in sorted(poses.items()):
+        imu.append(f"{frame} {numbers((pose @ sensor_from_imu)[:3].ravel())}\n")
+        cam0.append(f"{frame} {numbers((pose @ camera.sensor_from_camera).ravel())}\n")
+    folder = root / "data_poses" / drive
+    write_file(folder / "poses.txt", "".join(imu).encode())
+    write_file(folder / "cam0_to_world.txt", "".join(cam0).encode())

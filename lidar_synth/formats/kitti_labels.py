@@ -1,0 +1,129 @@
+"""KITTI's ``label_2`` files: boxes in the rectified camera frame, one object per line of text.
+
+A line (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme) is ``name truncation occlusion alpha
+left top right bottom h w l x y z rotation_y``, with x, y, z the middle of the box's *floor*. A ``Boxes`` holds the
+centre of gravity in the sensor frame and the yaw about its z; the camera leans about a degree against it, so that the
+ends of a long box move by some centimetres, and back.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.files import read_text, write_file
+from lidar_synth.scan import Boxes
+
+
+def read_label_2(path: Path, camera: Calibration) -> Boxes:
+    """The boxes of a label file in the sensor frame.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: on a line without 15 fields (16 with a score), or a value that is no number.
+    """
+    rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
+    bad = [row for row in rows if len(row) not in (15, 16)]
+    if bad:
+        raise DataError(f"{path}: a line with {len(bad[0])} fields", "15 fields: a name and 14 numbers")
+    try:
+        values = np.array([row[1:15] for row in rows], np.float64).reshape(-1, 14)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}", "15 fields: a name and 14 numbers") from error
+    ignored = np.array([row[0] == "DontCare" for row in rows], bool)
+    truncation, occlusion, alpha, image_box, size, floor, turn = np.split(values, [1, 2, 3, 7, 10, 13], axis=1)
+    keep = ~ignored
+    return Boxes(
+        boxes_from_camera(floor[keep], size[keep], turn[keep, 0], camera),
+        tuple(row[0] for row, k in zip(rows, keep, strict=True) if k),
+        truncation=truncation[keep, 0].astype(np.float32),
+        occlusion=occlusion[keep, 0].astype(np.int8),
+        image_box=image_box[keep].astype(np.float32),
+        alpha=alpha[keep, 0].astype(np.float32),
+        dont_care=image_box[ignored].astype(np.float32),
+    )
+
+
+def boxes_from_camera(
+    floor: NDArray[np.float64], size: NDArray[np.float64], rotation_y: NDArray[np.float64], camera: Calibration
+) -> NDArray[np.float32]:
+    """(M, 7) boxes in the sensor frame; the inverse of ``boxes_to_camera``.
+
+    Args:
+        floor: (M, 3) middle of the box's floor in the rectified camera frame, metres.
+        size: (M, 3) height, width, length, metres.
+        rotation_y: (M,) turn about the camera's y axis, radians.
+        camera: where the camera stands.
+    """
+    height, width, length = size.T
+    centre = floor - np.stack([0 * height, height / 2, 0 * height], -1)
+    back = camera.sensor_from_camera
+    ahead = np.stack([np.cos(rotation_y), 0 * rotation_y, -np.sin(rotation_y)], -1) @ back[:3, :3].T
+    yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
+    return np.column_stack([centre @ back[:3, :3].T + back[:3, 3], length, width, height, yaw]).astype(np.float32)
+
+
+def boxes_to_camera(
+    values: NDArray[np.float32], camera: Calibration
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """``floor``, ``size`` and ``rotation_y`` of ``boxes_from_camera`` for (M, 7) boxes in the sensor frame."""
+    values = values.astype(np.float64)
+    length, width, height, yaw = values[:, 3:].T
+    to = camera.camera_from_sensor
+    centre = values[:, :3] @ to[:3, :3].T + to[:3, 3]
+    ahead = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], -1) @ to[:3, :3].T
+    floor = centre + np.stack([0 * height, height / 2, 0 * height], -1)
+    return floor, np.stack([height, width, length], -1), np.arctan2(-ahead[:, 2], ahead[:, 0])
+
+
+def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
+    """The inverse of ``read_label_2`` to KITTI's two decimals; see ``KITTIObjectWriter`` for what is listed.
+
+    An alpha that is not known is worked out: rotation_y less the direction in which the *sensor* sees the box. (The
+    devkit speaks of the camera; KITTI's own files agree with the sensor, to the rounding.)
+
+    Raises:
+        FileError: where it cannot be written.
+    """
+    image_box, truncation = _in_image(boxes, camera)
+    floor, size, rotation_y = boxes_to_camera(boxes.values, camera)
+    seen = floor - camera.camera_from_sensor[:3, 3]
+    alpha = np.where(boxes.alpha > -10, boxes.alpha, _wrap(rotation_y - np.arctan2(seen[:, 0], seen[:, 2])))
+    lines = []
+    for i in np.flatnonzero((image_box >= 0).all(axis=1)):
+        occlusion = boxes.occlusion[i] if boxes.occlusion[i] >= 0 else 3
+        row = (alpha[i], *image_box[i], *size[i], *floor[i], rotation_y[i])
+        lines.append(f"{boxes.names[i]} {_two(truncation[i])} {occlusion} {' '.join(map(_two, row))}")
+    for rectangle in boxes.dont_care:
+        lines.append(f"DontCare -1 -1 -10 {' '.join(map(_two, rectangle))} -1 -1 -1 -1000 -1000 -1000 -10")
+    write_file(path, "".join(line + "\n" for line in lines).encode())
+
+
+def _in_image(boxes: Boxes, camera: Calibration) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(M, 4) image boxes and (M,) truncations, worked out from the corners where a box brings none."""
+    image_box, truncation = boxes.image_box.astype(np.float64), boxes.truncation.astype(np.float64)
+    unknown = np.flatnonzero((boxes.image_box < 0).any(axis=1))
+    if camera.image_size is None:
+        return image_box, truncation
+    edge = np.array(camera.image_size, np.float64) - 1
+    for i in unknown:
+        pixels, depth = camera.pixels(boxes[[i]].corners()[0])
+        if depth.min() <= 0:
+            continue
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        seen_low, seen_high = np.clip(low, 0, edge), np.clip(high, 0, edge)
+        if (seen_high > seen_low).all():
+            image_box[i] = *seen_low, *seen_high
+            truncation[i] = 1 - np.prod(seen_high - seen_low) / np.prod(high - low)
+    return image_box, truncation
+
+
+def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _two(value: float) -> str:
+    # + 0.0 turns the -0.0 of a small negative value into 0.0.
+    return f"{round(float(value), 2) + 0.0:.2f}"

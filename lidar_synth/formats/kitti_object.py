@@ -1,0 +1,187 @@
+"""KITTI 3D object detection: scans with boxes in the camera's view.
+
+Layout (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme)::
+
+    training/velodyne/FFFFFF.bin         float32 x, y, z, reflectance; sensor frame
+    training/velodyne_reduced/           the same, only what camera 2 sees
+    training/label_2/FFFFFF.txt          one object per line, rectified camera frame
+    training/calib/FFFFFF.txt            P0..P3, R0_rect, Tr_velo_to_cam, Tr_imu_to_velo
+    training/image_2/FFFFFF.png          left colour camera
+    testing/                             the same without label_2
+    ImageSets/train.txt, val.txt ...     frame numbers of each split
+"""
+
+import re
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
+from lidar_synth.formats.files import (
+    list_files,
+    png_size,
+    read_named_matrices,
+    read_text,
+    write_file,
+    write_named_matrices,
+)
+from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
+from lidar_synth.formats.points import read_points, write_points
+from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.writer import Picture, Writer, write_image
+from lidar_synth.scan import Boxes, Scan
+from lidar_synth.sensor import Sensor
+
+Part = Literal["training", "testing"]
+
+SPLITS: dict[str, tuple[Part, ...]] = {
+    "train": ("training",),
+    "val": ("training",),
+    "trainval": ("training",),
+    "test": ("testing",),
+    "all": ("training", "testing"),
+}
+"""The folders of each split; ``ImageSets`` says which of their frames."""
+
+OBJECT_CAMERA = ideal_camera(721.5377, (1242, 375))
+"""What ``calib`` describes where no camera is known: the size and focal length of KITTI's, at the sensor."""
+
+
+class KITTIObject(ScanFiles):
+    """KITTI's object set: <root>/training and testing with velodyne, label_2, calib, image_2, and ImageSets.
+
+    Args:
+        root: the folder that holds ``training`` and ``testing``.
+        split: ``train``, ``val``, ``trainval``, ``test`` (by ``ImageSets/<split>.txt``) or ``all``. Where there is no
+            ``ImageSets``, ``trainval`` is all of ``training`` and ``test`` all of ``testing``.
+        reduced: read ``velodyne_reduced``, the points that camera 2 sees.
+        sensor: a preset's name, a YAML file or a ``Sensor``.
+        on_bad: see ``ScanFiles``.
+
+    Raises:
+        ConfigError: on a split that KITTI does not have, or one that only ``ImageSets`` could tell.
+        DataError: where none of its scans is there.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str = "all",
+        *,
+        reduced: bool = False,
+        sensor: str | Path | Sensor = "hdl64e_kitti",
+        on_bad: OnBad = "error",
+    ) -> None:
+        root = Path(root)
+        self._velodyne = "velodyne_reduced" if reduced else "velodyne"
+        parts = choose("KITTI object split", split, SPLITS)
+        image_set = root / "ImageSets" / f"{split}.txt"
+        if split != "all" and image_set.is_file():
+            ids = [f"{parts[0]}/{frame}" for frame in read_text(image_set).split()]
+        elif split in ("train", "val"):
+            raise ConfigError(
+                f"split {split!r}, but there is no {image_set}",
+                "the list of its frames",
+                "Put KITTI's ImageSets there, or take split='trainval', all of training.",
+            )
+        else:
+            folders = [(p, root / p / self._velodyne) for p in parts if (root / p / self._velodyne).is_dir()]
+            ids = [f"{part}/{path.stem}" for part, folder in folders for path in list_files(folder, ".bin")]
+        super().__init__(root, ids, sensor, on_bad)
+
+    def read(self, index: int) -> Scan:
+        part, frame = self.ids[index].split("/")
+        folder = self.root / part
+        points = read_points(folder / self._velodyne / f"{frame}.bin")
+        labels, image = folder / "label_2" / f"{frame}.txt", folder / "image_2" / f"{frame}.png"
+        boxes = None
+        if labels.is_file():
+            boxes = read_label_2(labels, read_calibration(folder / "calib" / f"{frame}.txt"))
+        return Scan(
+            points[:, :3],
+            points[:, 3],
+            self.sensor,
+            boxes=boxes,
+            image_path=image if image.is_file() else None,
+            id=self.ids[index],
+        )
+
+    def calibration(self, index: int) -> Calibration | None:
+        part, frame = self.ids[index].split("/")
+        path = self.root / part / "calib" / f"{frame}.txt"
+        if not path.is_file():
+            return None
+        return read_calibration(path, png_size(self.root / part / "image_2" / f"{frame}.png"))
+
+
+class KITTIObjectWriter(Writer):
+    """Writes the object set's folders: velodyne, label_2, calib, image_2 and, at the end, ImageSets.
+
+    ``label_2`` lists what the camera sees, as KITTI's does: boxes whose ``image_box`` is known, and others whose
+    corners fall into the image (``image_box`` and truncation are worked out then); boxes elsewhere around the sensor
+    are left out. Trainers take the image's size from ``image_2``, so a scan without an image gets a black one.
+
+    An id ``training/FFFFFF`` or ``testing/FFFFFF`` is kept; other scans go into ``part``, numbered by index.
+
+    Args:
+        root: output folder.
+        part: ``training`` or ``testing``.
+        calibration: see ``Writer``.
+    """
+
+    def __init__(self, root: str | Path, *, part: Part = "training", calibration: Calibration | None = None) -> None:
+        super().__init__(root, calibration=calibration)
+        self.part = part
+
+    def path(self, index: int, name: str | None = None) -> Path:
+        match = re.fullmatch(r"(training|testing)/(\d+)", name or "")
+        part, frame = (match[1], int(match[2])) if match else (self.part, index)
+        return self.root / part / "velodyne" / f"{frame:06d}.bin"
+
+    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        folder, frame = path.parents[1], path.stem
+        camera = camera or OBJECT_CAMERA
+        if picture is None:
+            width, height = camera.image_size or (1242, 375)
+            picture = np.zeros((height, width, 3), np.uint8)
+        write_image(folder / "image_2" / f"{frame}.png", picture)
+        write_calibration(folder / "calib" / f"{frame}.txt", camera)
+        if folder.name == "training":
+            boxes = Boxes(np.zeros((0, 7), np.float32), ()) if scan.boxes is None else scan.boxes
+            write_label_2(folder / "label_2" / f"{frame}.txt", boxes, camera)
+        write_points(path, scan)
+
+    def finish(self) -> None:
+        for split, (part, *_) in SPLITS.items():
+            folder = self.root / part / "velodyne"
+            if split in ("train", "trainval", "test") and folder.is_dir():
+                frames = [p.stem for p in list_files(folder, ".bin")]
+                write_file(self.root / "ImageSets" / f"{split}.txt", "".join(f"{f}\n" for f in frames).encode())
+
+
+def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> Calibration:
+    """Camera 2 of a ``calib`` file.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where P2, R0_rect or Tr_velo_to_cam is missing.
+    """
+    matrices = read_named_matrices(path)
+    sizes = {name: matrices.get(name, np.zeros(0)).size for name in ("P2", "R0_rect", "Tr_velo_to_cam")}
+    if sizes != {"P2": 12, "R0_rect": 9, "Tr_velo_to_cam": 12}:
+        raise DataError(f"{path} has {sizes} values", "P2 with 12, R0_rect with 9 and Tr_velo_to_cam with 12")
+    camera_from_sensor = homogeneous(matrices["R0_rect"]) @ homogeneous(matrices["Tr_velo_to_cam"])
+    return Calibration(matrices["P2"].reshape(3, 4), camera_from_sensor, image_size, matrices)
+
+
+def write_calibration(path: Path, camera: Calibration) -> None:
+    """The inverse of ``read_calibration``: KITTI's own matrices as they were, another camera as all four."""
+    own = {"P0", "P1", "P2", "P3", "R0_rect", "Tr_velo_to_cam"} <= set(camera.matrices)
+    lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | {
+        "R0_rect": np.eye(3),
+        "Tr_velo_to_cam": camera.camera_from_sensor[:3],
+        "Tr_imu_to_velo": np.eye(4)[:3],
+    }
+    write_named_matrices(path, camera.matrices if own else lines)

@@ -1,0 +1,138 @@
+"""KITTI raw: whole drives, with boxes where somebody annotated tracklets.
+
+Layout (https://www.cvlibs.net/datasets/kitti/raw_data.php)::
+
+    DATE/DATE_drive_NNNN_sync/velodyne_points/data/FFFFFFFFFF.bin     float32 x, y, z, reflectance
+    DATE/DATE_drive_NNNN_sync/tracklet_labels.xml                     boxes of the whole drive, velodyne frame
+    DATE/DATE_drive_NNNN_sync/image_02/data/FFFFFFFFFF.png            left colour camera
+    DATE/calib_velo_to_cam.txt, DATE/calib_cam_to_cam.txt
+
+A tracklet is one object: its size, and from ``first_frame`` on one pose per frame, with x, y, z the middle of the
+box's *floor* and rz the yaw. The package reads this layout and does not write it.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from lidar_synth.errors import DataError
+from lidar_synth.formats.calibration import Calibration, homogeneous
+from lidar_synth.formats.files import list_files, png_size, read_file, read_named_matrices
+from lidar_synth.formats.points import read_points
+from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.scan import Boxes, Scan
+from lidar_synth.sensor import Sensor
+
+DRIVES = "*_drive_*/velodyne_points/data"
+"""Where a drive keeps its scans, seen from the folder of its date."""
+
+
+class KITTIRaw(ScanFiles):
+    """KITTI's raw drives: <root>/[DATE/]DATE_drive_NNNN_sync/velodyne_points/data/*.bin, tracklet_labels.xml.
+
+    A scan of a drive without tracklets has no boxes; one of a drive with tracklets has those of its frame, maybe none.
+
+    Args:
+        root: the folder with the dates, one date's folder, or one drive's.
+        sensor: a preset's name, a YAML file or a ``Sensor``.
+        on_bad: see ``ScanFiles``.
+
+    Raises:
+        DataError: where there is no drive.
+    """
+
+    def __init__(
+        self, root: str | Path, *, sensor: str | Path | Sensor = "hdl64e_kitti", on_bad: OnBad = "error"
+    ) -> None:
+        root = Path(root)
+        own = [root] if (root / "velodyne_points" / "data").is_dir() else []
+        found = own or [p.parent.parent for pattern in (DRIVES, f"*/{DRIVES}") for p in sorted(root.glob(pattern))]
+        self._drives = {drive.resolve().name: drive for drive in found}
+        ids = [
+            f"{name}/{path.stem}"
+            for name, drive in self._drives.items()
+            for path in list_files(drive / "velodyne_points" / "data", ".bin")
+        ]
+        super().__init__(root, ids, sensor, on_bad)
+        self._boxes: dict[str, dict[int, Boxes] | None] = {}
+
+    def read(self, index: int) -> Scan:
+        name, frame = self.ids[index].split("/")
+        drive = self._drives[name]
+        points = read_points(drive / "velodyne_points" / "data" / f"{frame}.bin")
+        image = drive / "image_02" / "data" / f"{frame}.png"
+        if name not in self._boxes:
+            path = drive / "tracklet_labels.xml"
+            self._boxes[name] = read_tracklets(path) if path.is_file() else None
+        boxes = self._boxes[name]
+        return Scan(
+            points[:, :3],
+            points[:, 3],
+            self.sensor,
+            boxes=None if boxes is None else boxes.get(int(frame), Boxes(np.zeros((0, 7), np.float32), ())),
+            image_path=image if image.is_file() else None,
+            id=self.ids[index],
+        )
+
+    def calibration(self, index: int) -> Calibration | None:
+        name, frame = self.ids[index].split("/")
+        drive = self._drives[name]
+        return read_calibration(drive.resolve().parent, png_size(drive / "image_02" / "data" / f"{frame}.png"))
+
+
+def read_calibration(folder: Path, image_size: tuple[int, int] | None = None) -> Calibration | None:
+    """Camera 2 of a day's calibration; None where its two files are not there.
+
+    Raises:
+        DataError: where a matrix is missing in them.
+    """
+    paths = folder / "calib_velo_to_cam.txt", folder / "calib_cam_to_cam.txt"
+    if not all(path.is_file() for path in paths):
+        return None
+    velo, cam = map(read_named_matrices, paths)
+    try:
+        to_cam_0 = homogeneous(np.column_stack([velo["R"].reshape(3, 3), velo["T"].reshape(3, 1)]))
+        rectify, projection = homogeneous(cam["R_rect_00"]), cam["P_rect_02"].reshape(3, 4)
+        size = image_size or (int(cam["S_rect_02"][0]), int(cam["S_rect_02"][1]))
+    except (KeyError, ValueError, IndexError) as error:
+        raise DataError(f"{paths[0]} and {paths[1]}: {error}", "R and T; R_rect_00, P_rect_02 and S_rect_02") from error
+    return Calibration(projection, rectify @ to_cam_0, size)
+
+
+def read_tracklets(path: Path) -> dict[int, Boxes]:
+    """{frame: boxes} of a drive, in the sensor frame; a box's instance is the tracklet's number in the file.
+
+    Truncation is known (0) only where the tracklet says that the object is wholly in the image.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where it is not a tracklet file.
+    """
+    rows: dict[int, list[tuple[tuple[float, ...], str, int, int, int]]] = defaultdict(list)
+    try:
+        tracklets = ElementTree.fromstring(read_file(path)).findall("tracklets/item")
+        for instance, tracklet in enumerate(tracklets):
+            name = tracklet.findtext("objectType", "").replace(" ", "_").replace("(", "").replace(")", "")
+            height, width, length = (float(tracklet.findtext(tag, "")) for tag in "hwl")
+            for k, pose in enumerate(tracklet.findall("poses/item")):
+                x, y, floor, yaw = (float(pose.findtext(tag, "")) for tag in ("tx", "ty", "tz", "rz"))
+                box = (x, y, floor + height / 2, length, width, height, (yaw + np.pi) % (2 * np.pi) - np.pi)
+                hidden = int(pose.findtext("occlusion", "-1"))
+                whole = pose.findtext("truncation") == "0"
+                frame = int(tracklet.findtext("first_frame", "")) + k
+                rows[frame].append((box, name, hidden if 0 <= hidden <= 2 else -1, 0 if whole else -1, instance))
+    except (ElementTree.ParseError, ValueError) as error:
+        raise DataError(f"{path}: {error}", "KITTI's tracklet_labels.xml") from error
+    boxes = {}
+    for frame, found in sorted(rows.items()):
+        values, names, occlusion, truncation, instances = zip(*found, strict=True)
+        boxes[frame] = Boxes(
+            np.array(values, np.float32),
+            names,
+            truncation=np.array(truncation, np.float32),
+            occlusion=np.array(occlusion, np.int8),
+            instance=np.array(instances, np.int32),
+        )
+    return boxes

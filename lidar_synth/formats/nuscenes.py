@@ -1,0 +1,111 @@
+"""nuScenes: sweeps of its 32-beam LiDAR, with lidarseg's labels where they are there.
+
+Layout (https://www.nuscenes.org/nuscenes#data-format, https://www.nuscenes.org/nuscenes#lidarseg)::
+
+    samples/LIDAR_TOP/NAME.pcd.bin       float32 x, y, z, intensity 0..255, ring 0..31 (0 = lowest)
+    lidarseg/VERSION/TOKEN_lidarseg.bin  uint8 class per point
+    VERSION/lidarseg.json                which labels belong to which sweep
+
+nuScenes has x right and y forward; both are turned into the package's x forward, y left. Intensity is divided by 255
+and rings are counted from the top. Points nearer than one metre are the recording car and, in full sweeps, firings
+without a return (they stand at the origin): they are dropped, with their labels, as nuScenes' own tools and its users
+do. The package reads this layout and does not write it.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import NUSCENES
+from lidar_synth.errors import DataError
+from lidar_synth.formats.files import SKIP_HINT, list_files, read_text, read_values
+from lidar_synth.formats.point_labels import mismatch
+from lidar_synth.formats.points import read_points
+from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor
+
+SUFFIX = ".pcd.bin"
+INTENSITY_MAX = 255.0
+RINGS = 32
+NEAREST = 1.0
+"""Metres: what is nearer is the car that carries the sensor, or no return at all."""
+
+
+class NuScenes(ScanFiles):
+    """nuScenes' key frames: <root>/samples/LIDAR_TOP/*.pcd.bin, or one such file, with lidarseg's labels.
+
+    Args:
+        root: the dataset's folder, a folder of ``.pcd.bin`` files, or one file.
+        sensor: a preset's name, a YAML file or a ``Sensor``.
+        on_bad: see ``ScanFiles``.
+
+    Raises:
+        DataError: where there is no sweep.
+    """
+
+    def __init__(
+        self, root: str | Path, *, sensor: str | Path | Sensor = "hdl32e_nuscenes", on_bad: OnBad = "error"
+    ) -> None:
+        root = Path(root)
+        folder = root / "samples" / "LIDAR_TOP"
+        paths = [root] if root.is_file() else list_files(folder if folder.is_dir() else root, SUFFIX)
+        super().__init__(root, [path.name.removesuffix(SUFFIX) for path in paths], sensor, on_bad)
+        self._folder = paths[0].parent
+        self._labels = {} if root.is_file() else lidarseg_files(root)
+
+    def read(self, index: int) -> Scan:
+        path = self._folder / f"{self.ids[index]}{SUFFIX}"
+        points = read_points(path, fields=5, reflectance_max=INTENSITY_MAX)
+        rings = points[:, 4]
+        if not ((rings >= 0) & (rings < RINGS) & (rings == np.floor(rings))).all():
+            raise DataError(
+                f"{path}: the fifth field of its points is no ring ({rings.min():g} to {rings.max():g})",
+                f"whole numbers 0..{RINGS - 1}",
+                f"It may hold four floats per point (KITTI), or be damaged. {SKIP_HINT}",
+            )
+        labels: dict[str, Any] = {}
+        if path.name in self._labels:
+            raw = read_values(self._labels[path.name], "u1")
+            if len(raw) != len(points):
+                raise mismatch(self._labels[path.name], len(raw), path, len(points))
+            label = NUSCENES.decode(raw, f"{self._labels[path.name]} (labels of {path})")
+            labels = {"label": label, "raw_label": raw.astype(np.uint32)}
+        scan = Scan(
+            ahead(points[:, :3]),
+            points[:, 3] / np.float32(INTENSITY_MAX),
+            self.sensor,
+            ring=(RINGS - 1 - rings).astype(np.int16),
+            id=self.ids[index],
+            **labels,
+        )
+        kept = np.einsum("ij,ij->i", scan.points, scan.points) >= NEAREST**2
+        if not kept.any():
+            raise DataError(f"{path}: all {len(scan)} points are nearer than {NEAREST:g} m", "a sweep", SKIP_HINT)
+        return scan[kept]
+
+
+def ahead(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 3) from nuScenes' x right, y forward to x forward, y left; exact."""
+    return np.column_stack([points[:, 1], -points[:, 0], points[:, 2]])
+
+
+def lidarseg_files(root: Path) -> Mapping[str, Path]:
+    """{name of a sweep: its label file} by the tables of every version under a dataset's root.
+
+    Raises:
+        DataError: where a table is no JSON or lacks a field.
+    """
+    files = {}
+    for table in sorted(root.glob("*/lidarseg.json")):
+        try:
+            names = {row["token"]: row["filename"] for row in json.loads(read_text(table.parent / "sample_data.json"))}
+            for row in json.loads(read_text(table)):
+                files[Path(names[row["sample_data_token"]]).name] = root / row["filename"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{table}: {error!r}", "nuScenes' tables lidarseg.json and sample_data.json") from error
+    return files

@@ -1,0 +1,156 @@
+"""Range images as PNG files: to look at, and to exchange with what reads pictures.
+
+Layout::
+
+    range/NAME.png          16 bit grey: range in steps of ``scale`` metres, 0 = no return
+    reflectance/NAME.png    16 bit grey: reflectance * 65535
+    label/NAME.png          8 bit palette in SemanticKITTI's colours: train id, 255 = ignore; only with labels
+
+``range`` carries a text chunk ``lidar_synth``: JSON with ``scale``, ``sensor`` (the keys of sensors.yaml), ``id`` and
+``domain``. What is lost: range is rounded to half a step, 0.61 mm at a range of 80 m, reflectance to 8e-6; instances,
+the file's own labels, confidence, boxes and pose have no place. Labels are exact.
+"""
+
+import json
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import COLOURS, IGNORE
+from lidar_synth.errors import DataError
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.files import SKIP_HINT, list_files, read_file, write_file
+from lidar_synth.formats.points import check_scan
+from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.formats.writer import Picture, Writer
+from lidar_synth.projection import project, unproject
+from lidar_synth.scan import RangeImage, Scan
+from lidar_synth.sensor import Sensor
+
+STEPS = 65535
+"""The largest 16-bit value: ``range_max`` in range, 1 in reflectance."""
+
+TEXT = "lidar_synth"
+
+CHANNELS = ("range", "reflectance", "label")
+"""The folders."""
+
+
+class RangePNG(ScanFiles):
+    """Range images as PNG: <root>/range/*.png with reflectance and label beside it, or one file of range.
+
+    Args:
+        root: the folder that holds ``range``, or one PNG in it.
+        sensor: whose grid the images are on; the files tell it.
+        on_bad: see ``ScanFiles``.
+
+    Raises:
+        FileError: where there is no such folder.
+        DataError: where it holds none.
+    """
+
+    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
+        root = Path(root)
+        paths = [root] if root.is_file() else list_files(root / "range", ".png")
+        base = root.absolute().parents[1] if root.is_file() else root
+        super().__init__(base, [path.stem for path in paths], sensor or "hdl64e_kitti360", on_bad)
+        self._given = None if sensor is None else self.sensor
+
+    def image(self, index: int) -> RangeImage:
+        """The range image at ``index``.
+
+        Raises:
+            DataError, FileError: where it cannot be read.
+        """
+        return self._decode(index)[0]
+
+    def read(self, index: int) -> Scan:
+        image, facts = self._decode(index)
+        scan = unproject(image)
+        scan.id, scan.domain = self.ids[index], int(facts["domain"])
+        check_scan(scan, str(channel_path(self.root, "range", self.ids[index])))
+        return scan
+
+    def _decode(self, index: int) -> tuple[RangeImage, dict[str, Any]]:
+        path, reflectance, label = (channel_path(self.root, name, self.ids[index]) for name in CHANNELS)
+        steps, text = read_png(path)
+        try:
+            facts = json.loads(text.get(TEXT, ""))
+            sensor, scale = Sensor.from_dict(facts["sensor"]), np.float32(facts["scale"])
+            if self._given is not None and sensor.shape != self._given.shape:
+                raise ValueError(f"it was made for sensor {sensor.name!r}, not for {self._given.name!r}")
+            channels = {"reflectance": (read_png(reflectance)[0] / np.float32(STEPS)).astype(np.float32)}
+            if label.is_file():
+                channels["label"] = read_png(label)[0]
+            return RangeImage(steps * scale, sensor, channels), facts
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{path}: {error}", "a range image written by this package") from error
+
+
+class PNGWriter(Writer):
+    """Writes the scan, projected onto its sensor's grid, as ``range``, ``reflectance`` and ``label`` PNG files."""
+
+    def path(self, index: int, name: str | None = None) -> Path:
+        # One flat folder per channel, so that others find the pictures of a channel side by side.
+        return channel_path(self.root, "range", (name or f"{index:06d}").replace("/", "_"))
+
+    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        image = project(scan)
+        scale = image.sensor.range_max / STEPS
+        facts = {"scale": scale, "sensor": image.sensor.to_dict(), "id": scan.id, "domain": scan.domain}
+        if image.label is not None:
+            write_png(channel_path(self.root, "label", path.stem), image.label, palette=True)
+        reflectance = image.channels["reflectance"] * STEPS
+        write_png(channel_path(self.root, "reflectance", path.stem), np.rint(reflectance).astype(np.uint16))
+        steps = np.where(image.mask, np.clip(np.rint(image.range / scale), 1, STEPS), 0)
+        write_png(path, steps.astype(np.uint16), text=json.dumps(facts))
+
+
+def channel_path(root: Path, channel: str, name: str) -> Path:
+    """Where a channel of an image stands."""
+    return root / channel / f"{name}.png"
+
+
+def read_png(path: Path) -> tuple[NDArray[Any], dict[str, str]]:
+    """The values of a PNG, (H, W), and its text chunks.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where it is no picture.
+    """
+    from PIL import Image
+
+    content = BytesIO(read_file(path))
+    try:
+        with Image.open(content) as opened:
+            return np.array(opened), dict(getattr(opened, "text", {}))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path}: {error}", "a PNG file", SKIP_HINT) from error
+
+
+def write_png(path: Path, values: NDArray[Any], text: str = "", palette: bool = False) -> None:
+    """The inverse of ``read_png``.
+
+    Args:
+        path: where to.
+        values: (H, W) uint16, or uint8 with a palette.
+        text: the text chunk ``lidar_synth``.
+        palette: colour train ids as SemanticKITTI does.
+
+    Raises:
+        FileError: where it cannot be written.
+    """
+    from PIL import Image, PngImagePlugin
+
+    picture = Image.fromarray(values)
+    if palette:
+        colours = np.zeros((IGNORE + 1, 3), np.uint8)
+        colours[: len(COLOURS)] = COLOURS
+        picture.putpalette(colours.tobytes())
+    chunk = PngImagePlugin.PngInfo()
+    if text:
+        chunk.add_text(TEXT, text)
+    write_file(path, lambda file: picture.save(file, "PNG", pnginfo=chunk))

@@ -1,0 +1,100 @@
+"""Labels of points on disk: one unsigned 32-bit value per point, class below and instance above.
+
+The layout is SemanticKITTI's (http://www.semantic-kitti.org/dataset.html): the lower 16 bits are the dataset's
+class id, the upper 16 the instance. Other datasets of the package use the same packing with their own class ids.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import IGNORE, Taxonomy
+from lidar_synth.errors import DataError
+from lidar_synth.formats.files import read_values, write_file
+from lidar_synth.scan import Scan
+
+
+def read_labels(path: Path, points: Path, count: int, taxonomy: Taxonomy) -> dict[str, Any]:
+    """The fields ``label``, ``raw_label`` and ``instance`` of a scan from its label file.
+
+    Args:
+        path: the ``.label`` file.
+        points: the file of the points, named in errors.
+        count: points in the scan.
+        taxonomy: whose class ids the file holds.
+
+    Raises:
+        FileError: where the file cannot be read.
+        DataError: on another number of labels than points, or a class id that the dataset does not define.
+    """
+    raw = read_values(path, "<u4")
+    if len(raw) != count:
+        raise mismatch(path, len(raw), points, count)
+    return decode_labels(raw, taxonomy, f"{path} (labels of {points})")
+
+
+def mismatch(path: Path, labels: int, points: Path, count: int) -> DataError:
+    """The error for a label file of another length than its scan."""
+    return DataError(
+        f"{path} has {labels} labels, {points} has {count} points",
+        "one label per point",
+        "One of the two belongs to another scan or has been cut: copy both again, or leave them out with "
+        "on_bad='skip'.",
+    )
+
+
+def decode_labels(raw: NDArray[np.uint32], taxonomy: Taxonomy, where: str) -> dict[str, Any]:
+    """The same from the values themselves; the inverse of ``encode_labels``.
+
+    Raises:
+        DataError: on a class id that the dataset does not define.
+    """
+    return {
+        "label": taxonomy.decode((raw & 0xFFFF).astype(np.uint16), where),
+        "raw_label": raw,
+        "instance": (raw >> 16).astype(np.int32),
+    }
+
+
+def encode_labels(scan: Scan, taxonomy: Taxonomy) -> NDArray[np.uint32]:
+    """(N,) values to write for a scan's labels.
+
+    ``raw_label`` goes out as it is, bit for bit, where it means ``label`` in this taxonomy. Where it does not (another
+    dataset's ids, or a label that was changed since) or is missing: the taxonomy's static class of ``label``, with
+    ``instance`` above. A scan without labels gets 0, unlabelled, for every point.
+
+    Raises:
+        DataError: on a train id or an instance that the file cannot hold.
+    """
+    raw = scan.raw_label
+    label = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
+    if raw is not None and _means(raw, label, taxonomy):
+        return raw
+    classes = taxonomy.encode(label)
+    if scan.instance is None:
+        return classes
+    if len(scan) and not 0 <= scan.instance.min() <= scan.instance.max() <= 0xFFFF:
+        raise DataError(
+            f"scan {scan.id!r}: instances from {scan.instance.min()} to {scan.instance.max()}",
+            "0..65535, which is what a label file can hold",
+            "Number the instances of each scan anew before writing.",
+        )
+    return classes | (scan.instance.astype(np.uint32) << np.uint32(16))
+
+
+def write_labels(path: Path, values: NDArray[np.uint32]) -> None:
+    """A label file of what ``encode_labels`` gave.
+
+    Raises:
+        FileError: where it cannot be written.
+    """
+    write_file(path, values.astype("<u4").tobytes())
+
+
+def _means(raw: NDArray[np.uint32], label: NDArray[np.uint8], taxonomy: Taxonomy) -> bool:
+    try:
+        return bool((taxonomy.decode((raw & 0xFFFF).astype(np.uint16)) == label).all())
+    except DataError:
+        return False

@@ -1,0 +1,174 @@
+"""Sets of range images: the package's own ``.npz``, and arrays that others' code projected.
+
+- ``.npz`` with ``range`` and ``sensor``: the package's own, see npz.py. Lossless for a scan that fits the grid.
+- ``.npy`` of shape (H, W), range in metres, or (2, H, W), range and reflectance; 0 = no return.
+- ``.npz`` with ``image``, or ``.npy``, of shape (H, W, 6): x, y, z, reflectance, range, class per cell, as several
+  segmentation codes keep them. ``CONVENTIONS`` says in which frame and with which classes.
+
+As a source of scans a set gives one point per return: through the cells' centres, or where the file holds x, y, z
+those. ``image`` gives the range image itself.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.folder import scan_paths
+from lidar_synth.formats.npz import decode_range_image, read_arrays, write_range_image
+from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
+from lidar_synth.formats.points import check_scan
+from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.writer import FileWriter, Picture
+from lidar_synth.projection import project, unproject
+from lidar_synth.scan import RangeImage, Scan
+from lidar_synth.sensor import Sensor, load_sensor
+
+SUFFIXES = (".npz", ".npy")
+
+
+@dataclass(frozen=True)
+class Convention:
+    """What the six values of a cell mean in somebody's (H, W, 6) arrays.
+
+    Args:
+        sensor: the preset whose grid they are on.
+        reflectance_max: the upper end of their reflectance.
+        learning_classes: the class is SemanticKITTI's 0..19 (0 = unlabelled); otherwise it is left out.
+        turned: x right and y forward, with the first column to the left.
+    """
+
+    sensor: str
+    reflectance_max: float = 1.0
+    learning_classes: bool = False
+    turned: bool = False
+
+
+CONVENTIONS = {
+    "kitti": Convention("hdl64e_semantic_kitti", learning_classes=True),
+    "nuscenes": Convention("hdl32e_nuscenes", INTENSITY_MAX, turned=True),
+}
+
+
+class RangeImages(ScanFiles):
+    """A folder of range images as .npz or .npy, or one such file.
+
+    Args:
+        root: the folder or the file.
+        sensor: whose grid the images are on; the package's own files tell it.
+        convention: ``kitti`` or ``nuscenes``: what the values of an (H, W, 6) array mean; by default that of the
+            sensor, or else ``kitti``.
+        on_bad: see ``ScanFiles``.
+
+    Raises:
+        FileError: where there is no such path.
+        ConfigError: on an unknown convention, or where files of several kinds are there.
+        DataError: where there is none.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        sensor: str | Path | Sensor | None = None,
+        convention: str | None = None,
+        on_bad: OnBad = "error",
+    ) -> None:
+        root = Path(root)
+        if convention is None:
+            of_sensor = {c.sensor: name for name, c in CONVENTIONS.items()}
+            convention = "kitti" if sensor is None else of_sensor.get(load_sensor(sensor).name, "kitti")
+        self._convention = choose("convention", convention, CONVENTIONS)
+        self._base, paths = scan_paths(root, SUFFIXES)
+        ids = [path.relative_to(self._base).with_suffix("").as_posix() for path in paths]
+        super().__init__(root, ids, self._convention.sensor if sensor is None else sensor, on_bad)
+        self._suffix = paths[0].suffix
+        self._given = None if sensor is None else load_sensor(sensor)
+
+    def image(self, index: int) -> RangeImage:
+        """The range image at ``index``.
+
+        Raises:
+            DataError, FileError: where it cannot be read.
+        """
+        return self._decode(index)[0]
+
+    def read(self, index: int) -> Scan:
+        image, facts, points = self._decode(index)
+        scan = unproject(image)
+        if points is not None:
+            scan.points = points[image.mask]
+        for name, value in facts.items():
+            setattr(scan, name, value)
+        scan.id = self.ids[index]
+        check_scan(scan, str(self._path(index)))
+        return scan
+
+    def _path(self, index: int) -> Path:
+        return self._base / f"{self.ids[index]}{self._suffix}"
+
+    def _decode(self, index: int) -> tuple[RangeImage, dict[str, Any], NDArray[np.float32] | None]:
+        """The image, what else its file tells of the scan, and (H, W, 3) points where it holds them."""
+        path = self._path(index)
+        arrays = read_arrays(path)
+        if "range" in arrays:
+            return *decode_range_image(arrays, str(path), self._given), None
+        array = arrays.get("image", arrays.get("array"))
+        if array is None or array.ndim not in (2, 3):
+            held = {name: values.shape for name, values in arrays.items()}
+            raise DataError(f"{path} holds arrays {held}", "range and sensor, or image (H, W, 6)")
+        array = array.astype(np.float32)
+        if array.ndim == 3 and array.shape[2] == 6:
+            return decode_stack(array, self._convention, self.sensor, str(path))
+        if array.ndim == 3 and len(array) != 2:
+            raise DataError(f"{path} holds an array of shape {array.shape}", "(H, W), (2, H, W) or (H, W, 6)")
+        channels = {"reflectance": array[1]} if array.ndim == 3 else {}
+        return RangeImage(array[0] if array.ndim == 3 else array, self.sensor, channels), {}, None
+
+
+def decode_stack(
+    stack: NDArray[np.float32], convention: Convention, sensor: Sensor, where: str
+) -> tuple[RangeImage, dict[str, Any], NDArray[np.float32]]:
+    """The range image of an (H, W, 6) array, no further facts, and the (H, W, 3) points of its cells.
+
+    Raises:
+        DataError: where x, y, z and range do not agree, or a value is none of the convention's.
+    """
+    distance = stack[..., 4]
+    error = np.abs(np.linalg.norm(stack[..., :3], axis=-1) - distance).max()
+    if not error < 1e-3:
+        raise DataError(
+            f"{where}: x, y, z and range of a cell differ by {error:g} m", "x, y, z, reflectance, range, class"
+        )
+    if stack[..., 3].max() > convention.reflectance_max:
+        raise DataError(
+            f"{where}: reflectance up to {stack[..., 3].max():g}",
+            f"at most {convention.reflectance_max:g}",
+            f"Another convention may fit: pass sensor='hdl32e_nuscenes', or one of {', '.join(CONVENTIONS)}.",
+        )
+    channels = {"reflectance": stack[..., 3] / np.float32(convention.reflectance_max)}
+    if convention.learning_classes:
+        classes = stack[..., 5]
+        if not np.isin(classes, np.arange(20)).all():
+            raise DataError(f"{where}: classes up to {classes.max():g}", "SemanticKITTI's 0..19, 0 = unlabelled")
+        channels["label"] = (classes.astype(np.int16) - 1).astype(np.uint8)
+    points = stack[..., :3]
+    if convention.turned:
+        quarter = stack.shape[1] // 4
+        points = np.roll(ahead(points.reshape(-1, 3)).reshape(points.shape), quarter, axis=1)
+        distance = np.roll(distance, quarter, axis=1)
+        channels = {name: np.roll(values, quarter, axis=1) for name, values in channels.items()}
+    return RangeImage(distance, sensor, channels), {}, points
+
+
+class RangeWriter(FileWriter):
+    """Writes the package's own ``NAME.npz``: the scan projected onto its sensor's grid, with every field it has."""
+
+    suffix = ".npz"
+
+    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        write_range_image(path, project(scan), scan)

@@ -1,0 +1,198 @@
+"""SemanticKITTI: KITTI's odometry scans with a class and an instance for every point.
+
+Layout (http://www.semantic-kitti.org/dataset.html)::
+
+    sequences/NN/velodyne/FFFFFF.bin     float32 x, y, z, reflectance; sensor frame
+    sequences/NN/labels/FFFFFF.label     uint32 per point: class below, instance in the upper 16 bits
+    sequences/NN/image_2/FFFFFF.png      left colour camera
+    sequences/NN/calib.txt               P0..P3 and Tr: rectified camera 0 from velodyne
+    sequences/NN/poses.txt               line F: camera 0 at frame F to world, 12 numbers
+    sequences/NN/times.txt               line F: seconds
+
+The pose of a ``Scan`` is sensor to world: Tr^-1 pose Tr.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import SEMANTIC_KITTI
+from lidar_synth.errors import DataError
+from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
+from lidar_synth.formats.files import (
+    list_files,
+    numbers,
+    png_size,
+    read_matrix,
+    read_named_matrices,
+    write_file,
+    write_named_matrices,
+)
+from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
+from lidar_synth.formats.points import read_points, write_points
+from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor
+
+SPLITS: dict[str, tuple[str, ...] | None] = {
+    "train": tuple(f"{i:02d}" for i in (0, 1, 2, 3, 4, 5, 6, 7, 9, 10)),
+    "val": ("08",),
+    "test": tuple(f"{i:02d}" for i in range(11, 22)),
+    "all": None,
+}
+"""Sequences of each split, as the benchmark has them; None = all that are there."""
+
+KITTI_CAMERA = ideal_camera(718.856, (1241, 376))
+"""What ``calib.txt`` describes where no camera is known: the odometry camera's picture, at the sensor."""
+
+PERIOD = 0.1
+"""Seconds between two scans."""
+
+
+class SemanticKITTI(ScanFiles):
+    """SemanticKITTI's sequences: <root>/sequences/NN/velodyne/*.bin with labels, calib.txt, poses.txt, image_2.
+
+    ``raw_label`` keeps the file's uint32, moving classes and instances included. Sequences without a ``labels``
+    folder (the test set) give scans without labels.
+
+    Args:
+        root: the folder that holds ``sequences``.
+        split: ``train``, ``val``, ``test`` or ``all``.
+        sensor: a preset's name, a YAML file or a ``Sensor``.
+        on_bad: see ``ScanFiles``.
+
+    Raises:
+        ConfigError: on a split that SemanticKITTI does not have.
+        DataError: where none of its sequences is there.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str = "all",
+        *,
+        sensor: str | Path | Sensor = "hdl64e_semantic_kitti",
+        on_bad: OnBad = "error",
+    ) -> None:
+        root = Path(root)
+        wanted = choose("SemanticKITTI split", split, SPLITS)
+        there = sorted(p.parent.name for p in (root / "sequences").glob("*/velodyne"))
+        sequences = [s for s in there if wanted is None or s in wanted]
+        if not sequences:
+            raise DataError(
+                f"{root} has no sequence of split {split!r} (it has {', '.join(there) or 'none at all'})",
+                "sequences/NN/velodyne/*.bin",
+            )
+        ids = [f"{s}/{p.stem}" for s in sequences for p in list_files(root / "sequences" / s / "velodyne", ".bin")]
+        super().__init__(root, ids, sensor, on_bad)
+        self._labelled = {s for s in sequences if (root / "sequences" / s / "labels").is_dir()}
+        self._cameras = {s: read_calibration(root / "sequences" / s) for s in sequences}
+        self._poses = {s: read_poses(root / "sequences" / s, self._cameras[s]) for s in sequences}
+
+    def read(self, index: int) -> Scan:
+        sequence, frame = self.ids[index].split("/")
+        folder = self.root / "sequences" / sequence
+        path = folder / "velodyne" / f"{frame}.bin"
+        points = read_points(path)
+        labels = {}
+        if sequence in self._labelled:
+            labels = read_labels(folder / "labels" / f"{frame}.label", path, len(points), SEMANTIC_KITTI)
+        image = folder / "image_2" / f"{frame}.png"
+        return Scan(
+            points[:, :3],
+            points[:, 3],
+            self.sensor,
+            **labels,
+            pose=self._poses[sequence].get(int(frame)) if frame.isdigit() else None,
+            image_path=image if image.is_file() else None,
+            id=self.ids[index],
+        )
+
+    def calibration(self, index: int) -> Calibration | None:
+        return self._cameras[self.ids[index].split("/")[0]]
+
+
+class SemanticKITTIWriter(Writer):
+    """Writes SemanticKITTI's folders; labels always, unlabelled points and ignored classes as 0.
+
+    Sequence and frame of an id ``NN/FFFFFF`` are kept, and those of KITTI-360's drives (drive 0003 is sequence 03);
+    other scans go into ``sequence``, numbered by index. ``poses.txt`` has one line for every frame up to the last;
+    a frame whose pose is not known has ``nan`` there.
+
+    Args:
+        root: output folder.
+        sequence: where scans without a sequence of their own go.
+        calibration: see ``Writer``.
+    """
+
+    def __init__(self, root: str | Path, *, sequence: str = "00", calibration: Calibration | None = None) -> None:
+        super().__init__(root, calibration=calibration)
+        self.sequence = sequence
+
+    def path(self, index: int, name: str | None = None) -> Path:
+        match = re.fullmatch(r"(?:2013_05_28_drive_00)?(\d\d)(?:_sync)?/(\d+)", name or "")
+        sequence, frame = (match[1], int(match[2])) if match else (self.sequence, index)
+        return self.root / "sequences" / sequence / "velodyne" / f"{frame:06d}.bin"
+
+    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        folder, frame = path.parents[1], path.stem
+        if not (folder / "calib.txt").is_file():
+            write_calibration(folder, camera or KITTI_CAMERA)
+        write_note(folder, int(frame), {"pose": None if scan.pose is None else scan.pose.tolist()})
+        if picture is not None:
+            write_image(folder / "image_2" / f"{frame}.png", picture)
+        write_labels(folder / "labels" / f"{frame}.label", encode_labels(scan, SEMANTIC_KITTI))
+        write_points(path, scan)
+
+    def finish(self) -> None:
+        for folder in sorted((self.root / "sequences").glob("*")):
+            notes = read_notes(folder)
+            camera = read_calibration(folder)
+            poses = read_poses(folder, camera)
+            poses |= {f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None}
+            if notes and camera is not None:
+                write_poses(folder, camera, poses, frames=1 + max([*notes, *poses]))
+            clear_notes(folder)
+
+
+def read_calibration(folder: Path) -> Calibration | None:
+    """Camera 2 of a sequence; None without ``calib.txt`` or its lines ``P2`` and ``Tr``."""
+    if not (folder / "calib.txt").is_file():
+        return None
+    matrices = read_named_matrices(folder / "calib.txt")
+    if any(matrices.get(name, np.zeros(0)).size != 12 for name in ("P2", "Tr")):
+        return None
+    size = next((png_size(p) for p in sorted((folder / "image_2").glob("*.png"))), None)
+    return Calibration(matrices["P2"].reshape(3, 4), homogeneous(matrices["Tr"]), size, matrices)
+
+
+def write_calibration(folder: Path, camera: Calibration) -> None:
+    """The inverse of ``read_calibration``: SemanticKITTI's own matrices as they were, others as all four cameras."""
+    own = {"Tr", "P0", "P1", "P2", "P3"} <= set(camera.matrices)
+    lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | {"Tr": camera.camera_from_sensor[:3]}
+    write_named_matrices(folder / "calib.txt", camera.matrices if own else lines)
+
+
+def read_poses(folder: Path, camera: Calibration | None) -> dict[int, NDArray[np.float64]]:
+    """{frame: (4, 4) sensor to world}; empty without ``poses.txt`` or a calibration."""
+    if camera is None or not (folder / "poses.txt").is_file():
+        return {}
+    lines = read_matrix(folder / "poses.txt", 12)
+    matrices = np.tile(np.eye(4), (len(lines), 1, 1))
+    matrices[:, :3] = lines.reshape(-1, 3, 4)
+    poses = camera.sensor_from_camera @ matrices @ camera.camera_from_sensor
+    return {f: pose for f, pose in enumerate(poses) if np.isfinite(pose).all()}
+
+
+def write_poses(folder: Path, camera: Calibration, poses: dict[int, NDArray[np.float64]], frames: int) -> None:
+    """The inverse of ``read_poses``, with ``times.txt``; nothing where no pose is known."""
+    write_file(folder / "times.txt", "".join(f"{PERIOD * f:e}\n" for f in range(frames)).encode())
+    if not poses:
+        return
+    lines = np.full((frames, 12), np.nan)
+    for frame, pose in poses.items():
+        lines[frame] = (camera.camera_from_sensor @ pose @ camera.sensor_from_camera)[:3].ravel()
+    write_file(folder / "poses.txt", "".join(numbers(line) + "\n" for line in lines).encode())

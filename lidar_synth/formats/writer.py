@@ -1,0 +1,139 @@
+"""What all writers have in common: where a scan goes, whether it is already there, and the files of a whole folder.
+
+A writer is opened on an output folder. ``write`` puts one scan there, its own files only, the one that says that
+it is whole last; so scans can be written in any order, by several processes, and an interrupted run goes on where
+it stopped. What belongs to a whole folder (poses, boxes, lists of frames) is noted beside each scan and gathered
+by ``finish``, which one process calls at the end.
+"""
+
+import json
+import shutil
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.files import list_files, read_file, read_text, write_file
+from lidar_synth.scan import Scan
+
+Image = NDArray[np.uint8]
+Picture = Image | Path
+"""An image by its values, (H, W, 3) RGB, or by its file."""
+
+NOTES = ".lidar_synth"
+"""Folder of the notes that ``finish`` gathers; it is gone afterwards."""
+
+
+class Writer(ABC):
+    """Writes scans into one output folder.
+
+    Args:
+        root: the folder; it is made.
+        calibration: the camera beside the sensor, for the layouts that hold one; without it they describe an ideal
+            camera that stands in the sensor and looks ahead.
+    """
+
+    def __init__(self, root: str | Path, *, calibration: Calibration | None = None) -> None:
+        self.root = Path(root)
+        self.calibration = calibration
+
+    @abstractmethod
+    def path(self, index: int, name: str | None = None) -> Path:
+        """The file whose presence says that a scan is whole.
+
+        Args:
+            index: the scan's number in the source.
+            name: its id there; a layout keeps what it can of it (frame number, drive) and otherwise counts.
+        """
+
+    def write(
+        self,
+        scan: Scan,
+        index: int,
+        *,
+        name: str | None = None,
+        image: Image | None = None,
+        calibration: Calibration | None = None,
+    ) -> None:
+        """Write one scan; it is whole when this returns.
+
+        Args:
+            scan: what to write.
+            index, name: as for ``path``.
+            image: (H, W, 3) uint8 RGB taken with the scan; without it ``scan.image_path`` is copied.
+            calibration: the camera of this scan, where it is not the writer's.
+
+        Raises:
+            FileError: where the folder cannot be written or the disk is full.
+            DataError: on a scan that the layout cannot hold.
+        """
+        picture = scan.image_path if image is None else image
+        self._put(scan, self.path(index, name), picture, calibration or self.calibration)
+
+    @abstractmethod
+    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        """Write the files of a scan, ``path`` last."""
+
+    def complete(self, index: int, name: str | None = None) -> bool:
+        """Whether the scan is already there, whole."""
+        return self.path(index, name).is_file()
+
+    def finish(self) -> None:  # noqa: B027 - a layout of single files has nothing to gather
+        """Write what belongs to the whole folder. Calling it again changes nothing."""
+
+
+class FileWriter(Writer):
+    """A writer of one file per scan, ``<name><suffix>`` under the output folder."""
+
+    suffix: str
+
+    def path(self, index: int, name: str | None = None) -> Path:
+        return self.root / f"{name or f'{index:06d}'}{self.suffix}"
+
+
+def write_image(path: Path, picture: Picture) -> None:
+    """A PNG from (H, W, 3) uint8 values, or from another image file (a PNG is copied as it is).
+
+    Raises:
+        FileError: where it cannot be read or written.
+    """
+    if isinstance(picture, Path) and picture.suffix.lower() == path.suffix:
+        write_file(path, read_file(picture))
+        return
+    from PIL import Image as pillow
+
+    opened = pillow.open(picture) if isinstance(picture, Path) else pillow.fromarray(picture)
+    write_file(path, lambda file: opened.convert("RGB").save(file, "PNG"))
+
+
+def write_note(folder: Path, frame: int, facts: dict[str, Any]) -> None:
+    """Keep what a whole-folder file will need of one frame (plain values; floats stay exact).
+
+    Raises:
+        FileError: where it cannot be written.
+    """
+    write_file(folder / NOTES / f"{frame:010d}.json", json.dumps(facts).encode())
+
+
+def read_notes(folder: Path) -> dict[int, dict[str, Any]]:
+    """{frame: facts} of the notes in a folder, by frame.
+
+    Raises:
+        DataError: on a note that was damaged since.
+    """
+    notes = {}
+    for path in list_files(folder / NOTES, ".json") if (folder / NOTES).is_dir() else []:
+        try:
+            notes[int(path.stem)] = json.loads(read_text(path))
+        except ValueError as error:
+            raise DataError(f"{path} is not a note of this package ({error})", hint=f"Remove {path.parent}.") from error
+    return notes
+
+
+def clear_notes(folder: Path) -> None:
+    """Remove the notes of a folder, once they stand where they belong."""
+    shutil.rmtree(folder / NOTES, ignore_errors=True)

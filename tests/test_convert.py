@@ -1,0 +1,184 @@
+"""Conversion: everything arrives, reruns do what is missing, bad scans are named."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from layouts import MAKERS, WRITTEN_AS, formats, some_scan, write_all
+from typer.testing import CliRunner
+
+from lidar_synth.cli.convert import convert as command
+from lidar_synth.convert import Report, convert, reproject
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.formats import READERS, WRITERS, open_scans
+from lidar_synth.projection import project
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import load_sensor, presets
+
+app = typer.Typer()
+app.command()(command)
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize("to", formats())
+@pytest.mark.parametrize("layout", READERS)
+def test_every_layout_becomes_every_format(tmp_path: Path, layout: str, to: str) -> None:
+    MAKERS[layout](tmp_path / "in")
+    source = open_scans(tmp_path / "in", layout=layout)
+    report = convert(source, WRITERS[to](tmp_path / "out"), progress=False)
+    assert report == Report(written=3)
+    result = open_scans(tmp_path / "out")
+    assert type(result) is READERS[WRITTEN_AS[to]] and len(result) == 3
+    for expected, scan in zip(source, result, strict=True):
+        expected = reproject(expected, scan.sensor) if to in ("range", "png") else expected
+        atol = 1e-3 if to == "png" else 0
+        np.testing.assert_allclose(scan.points, expected.points, atol=atol)
+        np.testing.assert_allclose(scan.reflectance, expected.reflectance, atol=atol)
+
+
+def test_a_rerun_does_only_what_is_missing(tmp_path: Path) -> None:
+    MAKERS["kitti360"](tmp_path / "in")
+    read: list[int] = []
+
+    class Watched(READERS["kitti360"]):  # type: ignore[misc]
+        def read(self, index: int) -> Scan:
+            read.append(index)
+            return super().read(index)
+
+    writer = WRITERS["semantic_kitti"](tmp_path / "out")
+    assert convert(Watched(tmp_path / "in"), writer, progress=False) == Report(written=3)
+    whole = files(tmp_path / "out")
+    assert convert(Watched(tmp_path / "in"), writer, progress=False) == Report(kept=3)
+    assert read == [0, 1, 2] and files(tmp_path / "out") == whole
+    writer.path(1, "00/000001").unlink()
+    assert convert(Watched(tmp_path / "in"), writer, progress=False) == Report(written=1, kept=2)
+    assert read == [0, 1, 2, 1] and files(tmp_path / "out") == whole
+
+
+def test_an_interrupted_run_goes_on_to_the_same_files(tmp_path: Path) -> None:
+    """Interrupted before the folder's own files are written; the next run has to write all frames' poses and boxes."""
+    MAKERS["kitti360"](tmp_path / "in")
+    source = open_scans(tmp_path / "in")
+    convert(source, WRITERS["kitti360"](tmp_path / "once"), progress=False)
+
+    class Interrupted:
+        def __len__(self) -> int:
+            return 3
+
+        def __getitem__(self, index: int) -> Scan:
+            if index == 2:
+                raise KeyboardInterrupt
+            return source[index]
+
+    writer = WRITERS["kitti360"](tmp_path / "twice", calibration=source.calibration(0))
+    with pytest.raises(KeyboardInterrupt):
+        convert(Interrupted(), writer, progress=False)
+    assert not (tmp_path / "twice" / "data_poses" / "2013_05_28_drive_0000_sync" / "poses.txt").exists()
+    assert convert(source, WRITERS["kitti360"](tmp_path / "twice"), progress=False) == Report(written=1, kept=2)
+    assert files(tmp_path / "twice") == files(tmp_path / "once")
+    assert [scan.pose is not None and scan.boxes is not None for scan in open_scans(tmp_path / "twice")] == [True] * 3
+
+
+def test_processes_write_the_same_files(tmp_path: Path) -> None:
+    write_all("semantic_kitti", tmp_path / "in", [some_scan(i, count=80) for i in range(12)])
+    source = open_scans(tmp_path / "in")
+    convert(source, WRITERS["kitti360"](tmp_path / "one"), progress=False)
+    assert convert(source, WRITERS["kitti360"](tmp_path / "two"), jobs=2, progress=False) == Report(written=12)
+    assert files(tmp_path / "one") == files(tmp_path / "two") and len(files(tmp_path / "one")) > 24
+
+
+@pytest.mark.parametrize(("jobs", "policy"), [(1, "error"), (1, "skip"), (2, "skip")])
+def test_bad_scans_stop_the_run_or_are_named(tmp_path: Path, jobs: int, policy: str) -> None:
+    paths = MAKERS["folder"](tmp_path / "in")
+    paths[0].write_bytes(b"cut")
+    writer = WRITERS["npz"](tmp_path / "out")
+    source = open_scans(tmp_path / "in", layout="folder", on_bad=policy)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="000000.bin is 3 bytes long"):
+        convert(source, writer, progress=False)
+    report = convert(source, writer, jobs=jobs, on_bad="skip", progress=False)
+    assert list(report.skipped) == ["000000"] and "is 3 bytes long" in report.skipped["000000"]
+    assert report.written == 2 and not writer.complete(0, "000000")
+
+
+def test_a_scan_that_the_format_cannot_hold_is_skipped(tmp_path: Path) -> None:
+    scans = [some_scan(i) for i in range(2)]
+    scans[0].raw_label, scans[0].instance = None, np.full(len(scans[0]), 1 << 17, np.int32)
+    with pytest.raises(DataError, match="instances from 131072"):
+        convert(scans, WRITERS["kitti"](tmp_path / "out"), progress=False)
+    report = convert(scans, WRITERS["kitti"](tmp_path / "out"), on_bad="skip", progress=False)
+    assert report.written == 1 and list(report.skipped) == ["0"]
+
+
+def test_a_full_target_stops_the_run_whatever_the_policy(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("in the way")
+    with pytest.raises(FileError, match="cannot be written"):
+        convert([some_scan()], WRITERS["npz"](tmp_path / "out"), on_bad="skip", progress=False)
+    with pytest.raises(ConfigError, match="0 jobs; expected at least 1"):
+        convert([some_scan()], WRITERS["npz"](tmp_path / "out"), jobs=0)
+
+
+@pytest.mark.parametrize("name", presets())
+def test_another_sensor_sees_the_same_scan(tmp_path: Path, name: str) -> None:
+    scan, sensor = some_scan(count=5000), load_sensor(name)
+    convert([scan], WRITERS["npz"](tmp_path), as_sensor=sensor, progress=False)
+    read = open_scans(tmp_path)[0]
+    image = project(scan, sensor)
+    assert read.sensor == sensor and len(read) == image.mask.sum() > 0
+    again = project(read)
+    assert np.array_equal(again.mask, image.mask)
+    np.testing.assert_allclose(again.range, image.range, rtol=3e-7)
+    assert all(np.array_equal(again.channels[k], image.channels[k]) for k in image.channels)
+    assert np.array_equal(read.pose, scan.pose) and read.boxes is not None
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Iterator[Path]:
+    MAKERS["kitti360"](tmp_path / "in")
+    yield tmp_path / "in"
+
+
+def test_the_command(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ["--to", "range", "--as-sensor", "os1_128", "--split", "r2flow/test"]
+    result = CliRunner().invoke(app, [str(dataset), str(out), *options])
+    assert result.exit_code == 0, result.output
+    assert "3 scans written, 0 were there already, 0 skipped" in result.output
+    assert open_scans(out)[0].sensor == load_sensor("os1_128")
+    result = CliRunner().invoke(app, [str(dataset), str(out), *options])
+    assert "0 scans written, 3 were there already, 0 skipped" in result.output
+
+
+def test_the_command_prints_what_it_skipped_and_why(dataset: Path, tmp_path: Path) -> None:
+    [*_, path] = sorted(dataset.rglob("*.bin"))
+    path.write_bytes(b"cut")
+    result = CliRunner().invoke(app, [str(dataset), str(tmp_path / "out"), "--to", "kitti", "--on-bad", "skip"])
+    assert result.exit_code == 0 and "2 scans written, 0 were there already, 1 skipped" in result.output
+    assert "skipped 2013_05_28_drive_0000_sync/0000000002: " in result.output and "is 3 bytes long" in result.output
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (["--to", "pdc"], "format 'pdc'; expected one of 'kitti'"),
+        (["--to", "kitti", "--split", "train"], "KITTI-360 split 'train'"),
+        (["--to", "kitti", "--sensor", "hdl64"], "sensor 'hdl64'; expected one of"),
+        (["--to", "kitti", "--on-bad", "ignore"], "on_bad='ignore'"),
+    ],
+)
+def test_a_wrong_call_says_what_is_right(dataset: Path, tmp_path: Path, options: list[str], error: str) -> None:
+    result = CliRunner().invoke(app, [str(dataset), str(tmp_path / "out"), *options])
+    assert isinstance(result.exception, ConfigError) and error in str(result.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_script_in_tools_is_the_command(tmp_path: Path) -> None:
+    script = Path(__file__).parents[1] / "tools" / "convert.py"
+    result = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0 and "--as-sensor" in result.stdout
