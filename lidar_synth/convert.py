@@ -5,23 +5,29 @@ and left out. Each worker process has its own copy of source and writer, and the
 whole folder at the end.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import get_context
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import OnBad, ScanFiles, Writer
+from lidar_synth.formats.writer import claim
 from lidar_synth.projection import project, unproject
 from lidar_synth.scan import Scan, Source
 from lidar_synth.sensor import Sensor
 
 CHUNK = 8
 """Scans that a worker takes at a time."""
+
+
+SETTINGS = ".convert.json"
+"""File in the output folder that says what it was filled with."""
 
 
 @dataclass
@@ -63,16 +69,17 @@ def convert(
         How many scans were written and kept, and what was skipped and why.
 
     Raises:
-        ConfigError: on fewer than one job.
+        ConfigError: on fewer than one job, or an output folder that was filled from something else.
         FileError: where the output cannot be written, whatever ``on_bad`` says.
         DataError: on a bad scan, with ``on_bad="error"``.
     """
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
+    claim(writer.root / SETTINGS, _settings(source, writer, as_sensor))
     missing = [i for i in range(len(source)) if not writer.complete(i, name_of(source, i))]
     report = Report(kept=len(source) - len(missing))
     work = partial(convert_one, source, writer, as_sensor, on_bad)
-    with _results(work, missing, jobs) as results:
+    with in_processes(work, missing, jobs, CHUNK) as results:
         for index, reason in tqdm(results, total=len(missing), unit="scan", disable=not (progress and missing)):
             if reason:
                 report.skipped[name_of(source, index) or str(index)] = reason
@@ -128,32 +135,50 @@ def name_of(source: Source, index: int) -> str | None:
     return source.ids[index] if isinstance(source, ScanFiles) else None
 
 
-Work = Callable[[int], tuple[int, str]]
+def _settings(source: Source, writer: Writer, as_sensor: Sensor | None) -> dict[str, Any]:
+    """What decides which scans are written, as far as the source tells it."""
+    settings: dict[str, Any] = {"scans": len(source), "writer": type(writer).__name__}
+    if isinstance(source, ScanFiles):
+        settings |= {"root": str(source.root.resolve()), "sensor": (as_sensor or source.sensor).to_dict()}
+    return settings
 
-_work: Work | None = None
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_work: Callable[[Any], Any] | None = None
 
 
-def _start(work: Work) -> None:
-    """Give a worker its source and writer once, and not with every scan."""
+def _start(work: Callable[[Any], Any]) -> None:
+    """Give a worker what it works with once, and not with every item."""
     global _work
     _work = work
 
 
-def _next(index: int) -> tuple[int, str]:
-    assert _work is not None, "a worker that was not started by convert"
-    return _work(index)
+def _next(item: Any) -> Any:
+    assert _work is not None, "a worker that was not started by in_processes"
+    return _work(item)
 
 
 @contextmanager
-def _results(work: Work, items: list[int], jobs: int) -> Iterator[Iterator[tuple[int, str]]]:
-    """The results of ``work`` in order, by as many processes as there are jobs."""
+def in_processes(
+    work: Callable[[Item], Result], items: Sequence[Item], jobs: int, chunk: int = 1
+) -> Iterator[Iterator[Result]]:
+    """The results of ``work`` on each item, in order, by as many processes as there are jobs.
+
+    Args:
+        work: a function that can be pickled.
+        items: what to work on.
+        jobs: processes; with one, the work is done here.
+        chunk: items that a worker takes at a time.
+    """
     if jobs == 1 or len(items) < 2:
         yield map(work, items)
         return
     # Spawned, not forked: the parent may hold threads (numba, torch) that a fork would break.
     with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
         try:
-            yield pool.map(_next, items, chunksize=CHUNK)
+            yield pool.map(_next, items, chunksize=chunk)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

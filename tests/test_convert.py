@@ -12,7 +12,7 @@ from layouts import MAKERS, WRITTEN_AS, formats, some_scan, write_all
 from typer.testing import CliRunner
 
 from lidar_synth.cli.convert import convert as command
-from lidar_synth.convert import Report, convert, reproject
+from lidar_synth.convert import SETTINGS, Report, convert, reproject
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import READERS, WRITERS, open_scans
 from lidar_synth.projection import project
@@ -24,7 +24,9 @@ app.command()(command)
 
 
 def files(root: Path) -> dict[str, bytes]:
-    return {p.relative_to(root).as_posix(): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+    """All but the note of what a folder was filled from."""
+    paths = (p for p in root.rglob("*") if p.is_file() and p.name != SETTINGS)
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in paths}
 
 
 @pytest.mark.parametrize("to", formats())
@@ -182,3 +184,21 @@ def test_the_script_in_tools_is_the_command(tmp_path: Path) -> None:
     script = Path(__file__).parents[1] / "tools" / "convert.py"
     result = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, timeout=120)
     assert result.returncode == 0 and "--as-sensor" in result.stdout
+
+
+def test_a_folder_filled_from_something_else_is_refused(tmp_path: Path) -> None:
+    """Not: the old scans kept, and passed off as the new ones."""
+    for name in "ab":
+        MAKERS["kitti360"](tmp_path / name)
+    a, b, out = open_scans(tmp_path / "a"), open_scans(tmp_path / "b"), WRITERS["npz"](tmp_path / "out")
+    convert(a, out, progress=False)
+    before = files(out.root)
+    with pytest.raises(ConfigError, match=r"out was filled with .*/a.*expected .*/b.*another folder"):
+        convert(b, out, progress=False)
+    with pytest.raises(ConfigError, match="os1_128"):
+        convert(a, out, as_sensor=load_sensor("os1_128"), progress=False)
+    assert files(out.root) == before
+    assert convert(a, out, progress=False) == Report(kept=3)
+    (out.root / SETTINGS).write_text("{")
+    with pytest.raises(DataError, match="damaged"):
+        convert(a, out, progress=False)

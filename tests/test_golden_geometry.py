@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from lidar_synth.formats.files import read_points
+from lidar_synth.formats.points import read_points
 from lidar_synth.normalize import NORMALISATIONS, Normalisation
 from lidar_synth.projection import project, unfold, unproject, unproject_batch
 from lidar_synth.scan import RangeImage, Scan

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidar_synth.formats.files import read_points
+from lidar_synth.formats.points import read_points
 from lidar_synth.projection import fill_points, locate, project, ring_numbers, unfold, unproject
 from lidar_synth.scan import Scan
 from lidar_synth.sensor import Sensor, load_sensor

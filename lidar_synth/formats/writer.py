@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.files import list_files, read_file, read_text, write_file
 from lidar_synth.scan import Scan
@@ -108,6 +108,37 @@ def write_image(path: Path, picture: Picture) -> None:
 
     opened = pillow.open(picture) if isinstance(picture, Path) else pillow.fromarray(picture)
     write_file(path, lambda file: opened.convert("RGB").save(file, "PNG"))
+
+
+def claim(path: Path, settings: dict[str, Any]) -> None:
+    """Say in a file what an output folder is being filled with; refuse a folder that holds something else.
+
+    Without it, a rerun with other settings would keep the old scans and pass them off as new ones.
+
+    Args:
+        path: the file, in the output folder.
+        settings: plain values that decide what is written.
+
+    Raises:
+        ConfigError: where the folder was filled with other settings.
+        DataError: where the file is damaged.
+        FileError: where it cannot be read or written.
+    """
+    wanted = json.loads(json.dumps(settings))
+    if not path.is_file():
+        write_file(path, json.dumps(wanted, indent=1).encode())
+        return
+    try:
+        there = json.loads(read_text(path))
+    except ValueError as error:
+        raise DataError(f"{path} is damaged ({error})", hint="Choose another output folder.") from error
+    other = {name: there[name] for name, value in wanted.items() if there.get(name, value) != value}
+    if other:
+        raise ConfigError(
+            f"{path.parent} was filled with {other}",
+            f"{ {name: wanted[name] for name in other} }",
+            "Type the same options to go on with it, or choose another folder.",
+        )
 
 
 def write_note(folder: Path, frame: int, facts: dict[str, Any]) -> None:
