@@ -1,0 +1,7 @@
+"""The embedded world: procedural streets, cast with the sensor's rays (no download, no network)."""
+
+from lidar_synth.town.export import LAYOUTS, export_town
+from lidar_synth.town.town import Town
+from lidar_synth.town.world import STRETCH_FRAMES
+
+__all__ = ["LAYOUTS", "STRETCH_FRAMES", "Town", "export_town"]

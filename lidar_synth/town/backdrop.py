@@ -1,0 +1,69 @@
+"""What closes the view: houses where a street ends, rows of houses and trees behind the lots."""
+
+from functools import cache
+
+import numpy as np
+
+from lidar_synth.town import fences
+from lidar_synth.town import furniture as fit
+from lidar_synth.town.buildings import building
+from lidar_synth.town.facades import Plan, finishes
+from lidar_synth.town.furniture import Thing
+from lidar_synth.town.lots import draw_house
+from lidar_synth.town.meshes import Mesh
+from lidar_synth.town.paving import PLAZA_DEPTH
+from lidar_synth.town.scene import Scene
+from lidar_synth.town.street import LEFT, REACH, RIGHT, Street
+from lidar_synth.town.yards import HOUSE
+
+Rng = np.random.Generator
+
+
+def close_ends(street: Street, scene: Scene, rng: Rng) -> None:
+    """Houses, hedges and trees where the street ends at another one."""
+    for end, way in zip(street.ends, (-1, 1), strict=True):
+        if not np.isfinite(end):
+            continue
+        t = -40.0
+        while t < 40:
+            width = rng.uniform(9, 16)
+            plan = draw_house(str(rng.choice(["house", "house", "block"])), width, 9.0, rng)
+            house = Thing(building(plan, rng), finishes(rng), HOUSE)
+            # The front looks back along the street: a building's own front faces -y.
+            at = t if way < 0 else t + width
+            scene.put(house, end + way * rng.uniform(3, 6), at, -way * np.pi / 2)
+            scene.put(fences.hedged(width, rng), end, t, np.pi / 2)
+            t += width + rng.uniform(1, 4)
+
+
+@cache
+def _plain_house(variant: int) -> Mesh:
+    """A house that is only seen from afar."""
+    rng = np.random.Generator(np.random.Philox(key=variant))
+    roof = ("gable", "cross", "hip")[variant % 3]
+    return building(Plan(rng.uniform(9, 16), rng.uniform(8, 11), 1 + variant % 4, roof=roof, detail=False), rng)
+
+
+def second_row(street: Street, scene: Scene, rng: Rng) -> None:
+    """Houses and trees beyond the lots, and the far ends of the street, seen from afar only."""
+    low, high = -REACH - 70, street.length + REACH + 70
+    for side in (RIGHT, LEFT):
+        sign = 2 * side - 1
+        open_land = street.kind == "edge" and rng.random() < 0.6
+        for depth in (36.0, 62.0, 105.0):
+            for s in np.arange(low, high, 9.0 + depth / 8):
+                far = not -REACH <= s <= street.length + REACH
+                t = street.front(side) + (12 if far and depth < 40 else depth) + rng.uniform(-4, 4)
+                crossed = any(side in c.sides and abs(s + 5 - c.s) < c.half + c.pavement + 7 for c in street.crossings)
+                if crossed or (street.plaza == side and t < street.front(side) + PLAZA_DEPTH + 20):
+                    continue
+                if not open_land and rng.random() < 0.55:
+                    turn = float(rng.choice([0.0, np.pi / 2])) if depth > 40 else 0.0
+                    house = Thing(_plain_house(int(rng.integers(12))), finishes(rng), HOUSE)
+                    scene.put(house, s, sign * t, turn + (np.pi if side == RIGHT else 0))
+                elif rng.random() < (0.5 if open_land else 0.8):
+                    scene.put(
+                        fit.grown(str(rng.choice(["round", "birch", "spruce", "poplar"])), rng, 1.2, near=False),
+                        s,
+                        sign * t,
+                    )

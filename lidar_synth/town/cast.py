@@ -1,0 +1,174 @@
+"""Rays into a scene: Embree finds the first triangle of the static world and of every mover.
+
+The static world is one Embree scene per stretch. Each mover's prototype is another, built once per process;
+per frame the few rays that can meet a mover are carried into its own frame, so that nothing is rebuilt.
+"""
+
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import LibraryError
+from lidar_synth.town.meshes import Mesh
+from lidar_synth.town.scene import Placed
+from lidar_synth.town.world import World
+
+Floats = NDArray[np.float32]
+MISS = -1
+"""Surface of a ray that hits nothing."""
+
+
+class Hits(NamedTuple):
+    """Where rays end.
+
+    Args:
+        distance: (N,) float32 metres from each ray's origin; inf where it ends nowhere.
+        surface: (N,) int32 surface number, or ``MISS``.
+        normal: (N, 3) float32 unit normal in the world, turned either way.
+    """
+
+    distance: Floats
+    surface: NDArray[np.int32]
+    normal: Floats
+
+
+def _embree() -> tuple[Any, Any]:
+    try:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+    except ImportError as error:
+        raise LibraryError(
+            f"the town needs embreex, which does not import here ({error})",
+            "embreex 2.17 or later; there is no wheel for Linux on aarch64",
+            "Type 'pip install embreex', or read a dataset that was made elsewhere: everything but the town works.",
+        ) from error
+    return EmbreeScene, TriangleMesh
+
+
+class Solid:
+    """Triangles that rays can hit.
+
+    Args:
+        triangles: (F, 3, 3) float32 metres.
+
+    Raises:
+        LibraryError: where embreex is missing.
+    """
+
+    def __init__(self, triangles: Floats) -> None:
+        scene, mesh = _embree()
+        self._scene = scene()
+        self._mesh = mesh(self._scene, np.ascontiguousarray(triangles, np.float32))
+
+    def first(self, origins: Floats, directions: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
+        """Distance (inf = none), triangle (-1 = none) and normal (not unit) of the first hit of each ray."""
+        out = self._scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1)
+        face: NDArray[np.int32] = out["primID"]
+        distance: Floats = out["tfar"]
+        distance[face < 0] = np.inf
+        return distance, face, out["Ng"]
+
+
+class _Shape(NamedTuple):
+    """A prototype made ready for rays: kept with its mesh, so that the key by identity stays true."""
+
+    mesh: Mesh
+    solid: Solid
+    middle: Floats
+    radius: float
+
+
+_SHAPES: dict[int, _Shape] = {}
+
+
+def _shape(mesh: Mesh) -> _Shape:
+    known = _SHAPES.get(id(mesh))
+    if known is None:
+        low, high = mesh.bounds
+        radius = float(np.linalg.norm(high - low)) / 2
+        known = _SHAPES[id(mesh)] = _Shape(
+            mesh, Solid(mesh.triangles), np.asarray((low + high) / 2, np.float32), radius
+        )
+    return known
+
+
+class Stage:
+    """A stretch at one moment: its static world and its movers where they are.
+
+    Args:
+        world: the stretch.
+        movers: those of the moment.
+    """
+
+    def __init__(self, world: World, movers: list[Placed]) -> None:
+        self._solid, self._faces = _static(world), world.faces
+        self.movers = movers
+        shapes = [_shape(m.prototype.mesh) for m in movers]
+        middles = [m.pose[:3, :3] @ (m.scale * s.middle) + m.pose[:3, 3] for m, s in zip(movers, shapes, strict=True)]
+        self._middles = np.array(middles, np.float32).reshape(-1, 3)
+        self._radii = np.array([m.scale * s.radius for m, s in zip(movers, shapes, strict=True)], np.float32)
+
+    def cast(self, origins: Floats, directions: Floats, eye: Floats | None = None) -> Hits:
+        """The first hits of rays.
+
+        Args:
+            origins: (N, 3) world, metres.
+            directions: (N, 3) unit vectors.
+            eye: (3,) a point that every ray's line passes within 0.3 m, e.g. the sensor: it tells cheaply which rays
+                can meet which mover.
+        """
+        distance, face, normal = self._solid.first(origins, directions)
+        surface = np.where(face >= 0, self._faces[face], MISS)
+        near = self._far_reach(origins, directions) if eye is None else self._reach(directions, eye)
+        for mover, rays in zip(self.movers, near, strict=True):
+            picked = np.flatnonzero(rays)
+            if len(picked):
+                found, slot, local = trace(mover, origins[picked], directions[picked])
+                nearer = found < distance[picked]
+                hit = picked[nearer]
+                distance[hit], surface[hit], normal[hit] = found[nearer], slot[nearer], local[nearer]
+        length = np.sqrt(np.einsum("ij,ij->i", normal, normal))
+        normal /= np.maximum(length, 1e-12)[:, None]
+        return Hits(distance, surface, normal)
+
+    def _reach(self, directions: Floats, eye: Floats) -> NDArray[np.bool_]:
+        """(M, N) which rays from near an eye can meet each mover, and a few more."""
+        way = self._middles - eye
+        far = np.linalg.norm(way, axis=1, keepdims=True)
+        sine = np.minimum((self._radii[:, None] + 0.3) / np.maximum(far, 1e-3), 1)
+        least = np.where(sine < 0.95, np.sqrt(1 - sine * sine), -2).astype(np.float32)
+        return np.asarray((way / np.maximum(far, 1e-3)) @ directions.T > least)
+
+    def _far_reach(self, origins: Floats, directions: Floats) -> Iterator[NDArray[np.bool_]]:
+        """The same for any rays, one mover after the other."""
+        for middle, radius in zip(self._middles, self._radii, strict=True):
+            way = middle - origins
+            along = np.einsum("ij,ij->i", way, directions)
+            yield (np.einsum("ij,ij->i", way, way) - along * along < radius**2) & (along > -radius)
+
+
+def trace(placed: Placed, origins: Floats, directions: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
+    """Distance (inf = none), surface number and world normal (not unit) where rays meet one object alone."""
+    shape = _shape(placed.prototype.mesh)
+    turn = placed.pose[:3, :3].astype(np.float32)
+    start = ((origins - placed.pose[:3, 3].astype(np.float32)) @ turn) / np.float32(placed.scale)
+    found, face, normal = shape.solid.first(start, directions @ turn)
+    return found * np.float32(placed.scale), placed.surfaces[shape.mesh.slot[face]], normal @ turn.T
+
+
+@cache
+def _static_cache() -> dict[int, tuple[World, Solid]]:
+    return {}
+
+
+def _static(world: World) -> Solid:
+    """The Embree scene of a stretch; the last two are kept."""
+    kept = _static_cache()
+    if id(world) not in kept:
+        while len(kept) > 1:
+            kept.pop(next(iter(kept)))
+        kept[id(world)] = (world, Solid(world.triangles))
+    return kept[id(world)][1]

@@ -1,0 +1,68 @@
+"""Where street coordinates lie in the world: a bent centre line, and the hills that it runs over.
+
+Street coordinates are (s, t): metres along the centre line and to its left.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+class Course:
+    """The bent centre line: where street coordinates lie in the world.
+
+    Args:
+        start, end: metres along the street that bend; beyond, it runs straight.
+        bend: largest curvature, 1/m.
+        rng: draws the bends.
+    """
+
+    def __init__(self, start: float, end: float, bend: float, rng: np.random.Generator) -> None:
+        self._s = np.arange(start, end + 1.0)
+        waves = sum(
+            rng.normal() * np.sin(2 * np.pi * self._s / rng.uniform(90, 260) + rng.uniform(0, 6.3)) for _ in range(3)
+        )
+        curvature = bend * np.tanh(waves)
+        self._yaw = np.cumsum(curvature) - curvature.sum() / 2
+        self._xy = np.cumsum(np.stack([np.cos(self._yaw), np.sin(self._yaw)]), 1)
+
+    def heading(self, s: ArrayLike) -> Array:
+        """Radians, counter-clockwise from the world's +x, of the centre line at s."""
+        return np.asarray(np.interp(np.asarray(s, float), self._s, self._yaw))
+
+    def points(self, s: ArrayLike, t: ArrayLike) -> Array:
+        """(..., 2) world x, y of street coordinates, metres."""
+        s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
+        yaw = self.heading(s)
+        beyond = s - np.clip(s, self._s[0], self._s[-1])
+        x = np.interp(s, self._s, self._xy[0]) + beyond * np.cos(yaw) - t * np.sin(yaw)
+        y = np.interp(s, self._s, self._xy[1]) + beyond * np.sin(yaw) + t * np.cos(yaw)
+        return np.stack([x, y], -1)
+
+
+class Relief:
+    """Gentle hills, a slope across the street, and high ground far off.
+
+    Args:
+        grade: standard deviation of the slopes, e.g. 0.012.
+        rng: draws them.
+    """
+
+    def __init__(self, grade: float, rng: np.random.Generator) -> None:
+        self._length = rng.uniform(70, 240, 4)
+        self._phase = rng.uniform(0, 2 * np.pi, 4)
+        self._way = rng.uniform(-0.6, 0.6, 4)
+        self._height = grade * rng.normal(0, 0.6, 4) * self._length / (2 * np.pi)
+        self._slope = grade * rng.normal()
+        self._banks = np.clip(rng.normal(0, 2.5 * grade, 2), -0.06, 0.10)
+        self._far = rng.uniform(1, 9, 2)
+
+    def __call__(self, s: ArrayLike, t: ArrayLike) -> Array:
+        """Height at street coordinates, metres."""
+        s, t = np.asarray(s, float), np.asarray(t, float)
+        along = (s[..., None] * np.cos(self._way) + t[..., None] * np.sin(self._way)) / self._length
+        hills = (self._height * np.sin(2 * np.pi * along + self._phase)).sum(-1)
+        bank = np.where(t > 0, self._banks[0], self._banks[1]) * np.clip(np.abs(t) - 9, 0, 40)
+        far = np.where(t > 0, self._far[0], self._far[1]) * np.clip((np.abs(t) - 90) / 100, 0, 1) ** 2
+        return np.asarray(hills + self._slope * s + bank + far)

@@ -1,0 +1,164 @@
+"""The town as a dataset on disk: KITTI-360's, SemanticKITTI's or KITTI's own folders, in parallel, resumable.
+
+The unit of work is a stretch of road, or a part of one, because its world has to be built once per process.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+from tqdm import tqdm
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.formats.files import read_text, write_file
+from lidar_synth.formats.kitti360 import KITTI360Writer
+from lidar_synth.formats.kitti_object import KITTIObjectWriter
+from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
+from lidar_synth.formats.writer import Writer
+from lidar_synth.town.town import Town
+from lidar_synth.town.world import STRETCH_FRAMES
+
+LAYOUTS: dict[str, type[Writer]] = {
+    "kitti360": KITTI360Writer,
+    "semantic_kitti": SemanticKITTIWriter,
+    "kitti": KITTIObjectWriter,
+}
+"""Writer by the name of a layout."""
+
+SEQUENCES = {"kitti360": 4, "semantic_kitti": 0}
+"""Where scans go by default: a drive or sequence that every split trains on."""
+
+SETTINGS = "town.json"
+_README = """# Synthetic street scans
+
+These scans are **synthetic**: rays cast into a procedural town by `lidar-synth town` (package lidar_synth). They are
+not KITTI-360, SemanticKITTI or KITTI, and contain nothing of them; only the layout of the files is theirs, so that
+the same readers and trainers take them.
+
+- layout: {layout}; sensor: {sensor}; seed: {seed}; {interval} s between neighbouring scans
+- {frames} neighbouring scans share a stretch of road; instance numbers count within a stretch, and stretches lie
+  1 km apart in the poses
+- `{settings}` holds the settings; `lidar-synth town` with the same ones goes on where it stopped
+"""
+
+
+def export_town(
+    town: Town,
+    out: str | Path,
+    layout: str,
+    *,
+    sequence: int | None = None,
+    camera: bool = True,
+    jobs: int = 1,
+    progress: bool = True,
+) -> tuple[int, int]:
+    """Write a town's scans; rerun to go on where it stopped.
+
+    Args:
+        town: whose scans.
+        out: folder to write to.
+        layout: one of ``LAYOUTS``.
+        sequence: number of the drive or sequence that takes the scans (``SEQUENCES`` by default).
+        camera: whether each scan's picture is rendered and written.
+        jobs: worker processes.
+        progress: show a bar.
+
+    Returns:
+        How many scans were written now and how many were there already.
+
+    Raises:
+        ConfigError: on an unknown layout, no job, or a folder that holds another town.
+        FileError: where the output cannot be written.
+    """
+    if layout not in LAYOUTS or jobs < 1:
+        raise ConfigError(f"layout {layout!r}, {jobs} jobs", f"one of {', '.join(LAYOUTS)}, and at least 1 job")
+    number = SEQUENCES.get(layout, 0) if sequence is None else sequence
+    if not 0 <= number < 100:
+        raise ConfigError(f"sequence {number}", "0 to 99")
+    _claim(Path(out), town, layout, number, camera)
+    writer = LAYOUTS[layout](out, calibration=town.calibration)
+    names = [f"{number:02d}/{i:06d}" if layout in SEQUENCES else None for i in range(len(town))]
+    missing = [i for i, name in enumerate(names) if not writer.complete(i, name)]
+    work = partial(_write_some, town, writer, names, camera)
+    with (
+        tqdm(total=len(missing), unit="scan", disable=not progress) as bar,
+        _pool(work, _parts(missing, jobs), jobs) as done,
+    ):
+        for count in done:
+            bar.update(count)
+    writer.finish()
+    if layout == "semantic_kitti" and len(town):
+        times = "".join(f"{town.interval * i:e}\n" for i in range(len(town)))
+        write_file(Path(out) / "sequences" / f"{number:02d}" / "times.txt", times.encode())
+    return len(missing), len(town) - len(missing)
+
+
+def _claim(out: Path, town: Town, layout: str, sequence: int, camera: bool) -> None:
+    """Say in the folder what it holds; refuse one that holds something else."""
+    settings = {"layout": layout, "sequence": sequence, "seed": town.seed, "sensor": town.sensor.to_dict(),
+                "interval": town.interval, "camera": camera}  # fmt: skip
+    path = out / SETTINGS
+    if path.is_file():
+        there = json.loads(read_text(path))
+        other = {k: there.get(k) for k, v in settings.items() if there.get(k) != json.loads(json.dumps(v))}
+        if other:
+            raise ConfigError(f"{out} holds a town with {other}", f"{ {k: settings[k] for k in other} }",
+                              "Type the same options to go on with it, or another folder.")  # fmt: skip
+    else:
+        text = _README.format(layout=layout, sensor=town.sensor.name, seed=town.seed, interval=town.interval,
+                              frames=STRETCH_FRAMES, settings=SETTINGS)  # fmt: skip
+        write_file(out / "README.md", text.encode())
+        write_file(path, json.dumps(settings, indent=1).encode())
+
+
+def _parts(indices: list[int], jobs: int) -> list[list[int]]:
+    """The indices by stretch, in pieces small enough that every job has some."""
+    most = max(1, min(STRETCH_FRAMES, -(-len(indices) // jobs)))
+    parts: list[list[int]] = []
+    for i in indices:
+        if parts and len(parts[-1]) < most and parts[-1][-1] // STRETCH_FRAMES == i // STRETCH_FRAMES:
+            parts[-1].append(i)
+        else:
+            parts.append([i])
+    return parts
+
+
+def _write_some(town: Town, writer: Writer, names: list[str | None], camera: bool, indices: list[int]) -> int:
+    for i in indices:
+        writer.write(town[i], i, name=names[i], image=town.image(i) if camera else None)
+    return len(indices)
+
+
+_work: partial[int] | None = None
+
+
+def _start(work: "partial[int]") -> None:
+    """Give a worker its town once, and not with every part."""
+    global _work
+    _work = work
+
+
+def _next(indices: list[int]) -> int:
+    assert _work is not None, "a worker that was not started by export_town"
+    return _work(indices)
+
+
+@contextmanager
+def _pool(work: "partial[int]", parts: list[list[int]], jobs: int) -> Iterator[Iterator[int]]:
+    """The sizes of the parts as they are done."""
+    if jobs == 1 or len(parts) < 2:
+        yield map(work, parts)
+        return
+    # One process per core does the work: threads inside numpy would only fight for the cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
+        try:
+            yield pool.map(_next, parts)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise

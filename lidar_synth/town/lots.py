@@ -1,0 +1,158 @@
+"""Lots along a street: which house stands where, its driveway, what bounds its front.
+
+Lots are drawn before the ground is laid, because driveways and yards are painted on it; ``yards`` builds them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidar_synth.town.facades import Plan
+from lidar_synth.town.paving import PLAZA_DEPTH, Paint
+from lidar_synth.town.street import LEFT, RIGHT, Street
+
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True)
+class Lot:
+    """A piece of ground beside the street.
+
+    Args:
+        start, end: its s, start < end.
+        side: RIGHT or LEFT.
+        front: |t| of its front boundary.
+        setback: metres from there to the house.
+        plan: its house, or None.
+        at: metres from ``start`` to the house's corner of lower s.
+        driveway: (start, end) in s of a paved strip, or None.
+        boundary: what bounds its front: hedge, wall, bars, boards, wire, wallhedge or nothing.
+        garden: how green it is, 0..1.
+    """
+
+    start: float
+    end: float
+    side: int
+    front: float
+    setback: float
+    plan: Plan | None
+    at: float
+    driveway: tuple[float, float] | None
+    boundary: str
+    garden: float
+
+    @property
+    def sign(self) -> int:
+        """Of t on this side."""
+        return 2 * self.side - 1
+
+
+_BOUNDARIES = ("hedge", "hedge", "wall", "bars", "boards", "wire", "wallhedge", "wallhedge", "wallbars", "none")
+
+
+def draw_house(style: str, width: float, depth: float, rng: Rng) -> Plan:
+    match style:
+        case "house":
+            roof = str(rng.choice(["gable", "cross", "hip"], p=[0.6, 0.25, 0.15]))
+            floors = int(rng.choice([1, 2, 3], p=[0.3, 0.55, 0.15]))
+            return Plan(width, depth, floors, rng.uniform(2.6, 2.9), rng.uniform(0.2, 1.1), roof, rng.random() < 0.15)
+        case "row":
+            return Plan(width, depth, int(rng.integers(2, 4)), rng.uniform(2.7, 3.0), rng.uniform(0.2, 0.8))
+        case "block":
+            roof = str(rng.choice(["gable", "hip", "flat"]))
+            return Plan(width, depth, int(rng.integers(3, 6)), 2.8, rng.uniform(0.5, 1.2), roof, rng.random() < 0.6)
+        case "shop":
+            roof = str(rng.choice(["gable", "hip", "flat"]))
+            return Plan(width, depth, int(rng.integers(2, 5)), 3.1, 0.15, roof, rng.random() < 0.2, shop=True)
+    return Plan(width, depth, 1, rng.uniform(4, 7), 0.2, "flat")
+
+
+_SIZES = {"house": (8.5, 13.5), "row": (6.0, 8.5), "block": (15.0, 26.0), "shop": (10.0, 18.0), "hall": (18.0, 34.0)}
+
+
+def _style(street: Street, side: int, rng: Rng) -> str:
+    if street.kind == "residential":
+        return str(rng.choice(["house", "row", "block"], p=[0.74, 0.14, 0.12]))
+    if street.kind == "edge":
+        return str(rng.choice(["house", "hall"], p=[0.6, 0.4]))
+    if street.plaza == side:
+        return "shop"
+    return str(rng.choice(["house", "row", "block", "shop", "hall"], p=[0.25, 0.12, 0.28, 0.27, 0.08]))
+
+
+def draw_lots(street: Street, rng: Rng) -> list[Lot]:
+    """The lots of both sides, from one end of the stretch to the other."""
+    lots = []
+    for side in (RIGHT, LEFT):
+        front = street.front(side)
+        boundary = str(rng.choice(_BOUNDARIES))
+        setback = rng.uniform(2.0, 8.0) if street.kind in ("residential", "edge") else rng.uniform(0.0, 6.0)
+        for low, high in street.gaps(side, 1.0):
+            s = low
+            while high - s > 7:
+                on_plaza = street.plaza == side and s + 9 > -12 and s < street.length + 12
+                lot = _draw_lot(
+                    street, side, s, high, front + (PLAZA_DEPTH if on_plaza else 0.0), setback, boundary, rng
+                )
+                lots.append(lot)
+                s = lot.end
+    return lots
+
+
+def _draw_lot(
+    street: Street, side: int, s: float, high: float, front: float, setback: float, boundary: str, rng: Rng
+) -> Lot:
+    style = _style(street, side, rng)
+    low, top = _SIZES[style]
+    if rng.random() < (0.72 if street.kind == "edge" else 0.07) or high - s < low + 2:
+        return Lot(
+            s,
+            min(high, s + rng.uniform(10, 26)),
+            side,
+            front,
+            setback,
+            None,
+            0.0,
+            None,
+            boundary,
+            rng.uniform(0.4, 1.0),
+        )
+    width = min(rng.uniform(low, top), high - s - 1.5)
+    between = 0.0 if style in ("row", "shop") and rng.random() < 0.8 else rng.uniform(3.2, 9.0)
+    end = min(high, s + width + between)
+    back = 0.3 if style == "shop" else max(0.3, setback + rng.uniform(-1.5, 1.5))
+    first = bool(rng.random() < 0.5)
+    at = between * 0.85 if first and between else 0.15 * between
+    room = (s, s + at) if first else (s + at + width, end)
+    driveway = None
+    if room[1] - room[0] > 3.0 and rng.random() < 0.7:
+        middle = (room[0] + room[1]) / 2
+        driveway = (middle - 1.4, middle + 1.4)
+    if rng.random() < 0.25 and style not in ("shop", "row"):
+        boundary = str(rng.choice(_BOUNDARIES))
+    plan = draw_house(style, width, rng.uniform(8, 12), rng)
+    return Lot(
+        s,
+        end,
+        side,
+        front,
+        back,
+        plan,
+        min(at, end - s - width),
+        driveway,
+        "none" if back < 1.2 else boundary,
+        rng.uniform(0, 1),
+    )
+
+
+def paint_lots(lots: list[Lot], paint: Paint, rng: Rng) -> None:
+    """Driveways, yards and flower beds."""
+    for lot in lots:
+        if lot.plan is not None and lot.garden < 0.25:
+            paint((lot.start, lot.end), (lot.sign * lot.front, lot.sign * (lot.front + lot.setback)), "yard")
+        elif lot.plan is not None and rng.random() < 0.3:
+            paint(
+                (lot.start + 1, lot.end - 1), (lot.sign * lot.front, lot.sign * (lot.front + 0.4 * lot.setback)), "soil"
+            )
+        if lot.driveway:
+            paint(lot.driveway, (lot.sign * lot.front, lot.sign * (lot.front + lot.setback + 9)), "driveway")

@@ -1,0 +1,88 @@
+"""How things move: the ego vehicle, and movers that walk steadily along a line of the street."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.town.prototype import Prototype
+from lidar_synth.town.scene import Placed, Pose, Scene
+from lidar_synth.town.street import Street
+
+
+@dataclass(frozen=True)
+class Mover:
+    """Something on its way.
+
+    Args:
+        shapes: its prototypes by phase of the stride; one for what does not change.
+        stride: metres of way per turn of the phases.
+        along: True if it runs along s, False along t.
+        at: the other coordinate, metres.
+        start: its coordinate at time 0, metres.
+        way: +1 or -1, where it faces along its line.
+        speed: m/s, 0 waits.
+        instance: its number.
+        surfaces: of its slots.
+        scale: of its prototype.
+    """
+
+    shapes: tuple[Prototype, ...]
+    stride: float
+    along: bool
+    at: float
+    start: float
+    way: int
+    speed: float
+    instance: int
+    surfaces: NDArray[np.int32]
+    scale: float
+
+    def place(self, time: float) -> tuple[float, float, float]:
+        """Its s, t (metres) and yaw from the street's heading (radians) at a time in seconds."""
+        on = self.start + self.way * self.speed * time
+        yaw = (0.0 if self.along else np.pi / 2) + (np.pi if self.way < 0 else 0.0)
+        return (on, self.at, yaw) if self.along else (self.at, on, yaw)
+
+    def shape(self, time: float) -> Prototype:
+        """Its prototype at a time in seconds."""
+        return self.shapes[
+            int((abs(self.start) + self.speed * time) / self.stride * len(self.shapes)) % len(self.shapes)
+        ]
+
+
+def stand(movers: list[Mover], scene: Scene, time: float, about: tuple[float, float], reach: float) -> list[Placed]:
+    """The movers as objects in the world at a time in seconds, those within ``reach`` metres of street coordinates."""
+    places = np.array([m.place(time) for m in movers]).reshape(-1, 3)
+    near = np.flatnonzero(np.hypot(places[:, 0] - about[0], places[:, 1] - about[1]) < reach)
+    lengths = [2.0 if len(movers[i].shapes) == 1 else 0.5 for i in near]
+    s, t, yaw = places[near].T
+    poses = scene.poses(s, t, yaw, lengths)
+    return [
+        Placed(m.shape(time), pose, m.instance, m.surfaces, m.scale)
+        for m, pose in zip((movers[i] for i in near), poses, strict=True)
+    ]
+
+
+def ego_place(street: Street, time: float) -> tuple[float, float]:
+    """Street coordinates of the ego vehicle at a time in seconds; it keeps its lane only nearly."""
+    s = street.speed * time
+    return s, float(street.lanes[0].t + 0.15 * np.sin(0.11 * s))
+
+
+def ego_pose(street: Street, scene: Scene, time: float, height: float, sway: NDArray[np.float64]) -> Pose:
+    """(4, 4) sensor to world at a time in seconds.
+
+    Args:
+        street, scene: where it drives.
+        time: seconds from s = 0.
+        height: metres of the sensor above the ground.
+        sway: (roll, pitch) of the body on its springs, radians.
+    """
+    pose = scene.poses(*ego_place(street, time), 0.0, 4.0)
+    roll, pitch = sway
+    rolled = np.array([(1, 0, 0), (0, np.cos(roll), -np.sin(roll)), (0, np.sin(roll), np.cos(roll))])
+    pitched = np.array([(np.cos(pitch), 0, np.sin(pitch)), (0, 1, 0), (-np.sin(pitch), 0, np.cos(pitch))])
+    pose[:3, :3] = pose[:3, :3] @ pitched @ rolled
+    pose[:3, 3] += height * pose[:3, 2]
+    return pose

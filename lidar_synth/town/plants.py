@@ -1,0 +1,174 @@
+"""Trees, bushes and hedges: trunks and boughs as tubes, foliage as many small triangles.
+
+Rays slip between the leaves as they do in a real crown: some end on the outside, some on a bough, some
+behind the tree. Prototypes are drawn once per process from fixed keys; a scene turns, scales and tints them.
+"""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.town.materials import Finish
+from lidar_synth.town.meshes import Mesh, leaves, loft, merge, tube
+
+LEAF, BARK, TWIG = 0, 1, 2
+TREE_CLASSES = (70, 71, 70)
+"""SemanticKITTI's class by slot: foliage and boughs are vegetation, the stem below them is trunk."""
+VARIANTS = 4
+"""Prototypes of each species."""
+
+SPECIES: dict[str, tuple[Finish, ...]] = {
+    "round": (Finish("leaf", (0.20, 0.36, 0.10)), Finish("bark"), Finish("bark")),
+    "birch": (Finish("leaf", (0.34, 0.46, 0.15)), Finish("bark", (0.72, 0.70, 0.66)), Finish("bark")),
+    "spruce": (Finish("leaf", (0.10, 0.21, 0.11)), Finish("bark"), Finish("bark")),
+    "poplar": (Finish("leaf", (0.24, 0.40, 0.12)), Finish("bark"), Finish("bark")),
+    "fruit": (Finish("leaf", (0.25, 0.38, 0.13)), Finish("bark"), Finish("bark")),
+    "bush": (Finish("leaf", (0.22, 0.35, 0.11)), Finish("bark"), Finish("bark")),
+    "thuja": (Finish("leaf", (0.16, 0.29, 0.12)), Finish("bark"), Finish("bark")),
+}
+"""Finishes of each species; the first is tinted per plant."""
+
+
+def _rng(name: str, variant: int) -> np.random.Generator:
+    return np.random.Generator(np.random.Philox(key=(sorted(SPECIES).index(name), variant)))
+
+
+def _stem(height: float, radius: float, rng: np.random.Generator) -> tuple[Mesh, NDArray[np.float64]]:
+    """A slightly crooked trunk with roots spreading at its foot; also its path."""
+    levels = np.array([-0.2, 0.12, 0.45, 0.5 * height, height])
+    lean = np.cumsum(rng.normal(0, 0.05, (5, 2)), axis=0) * (levels[:, None] > 0.2)
+    path = np.c_[lean, levels]
+    return tube(path, radius * np.array([1.7, 1.25, 1.0, 0.9, 0.75]), 8, BARK), path
+
+
+def _boughs(foot: NDArray[np.float64], ends: NDArray[np.float64], radius: float) -> Mesh:
+    return merge(
+        tube([foot, 0.5 * (foot + e) + (0, 0, 0.1), e], [radius, 0.6 * radius, 0.02], 4, TWIG, caps=False) for e in ends
+    )
+
+
+def _clumps(centres: NDArray[np.float64], spread: NDArray[np.float64] | float, count: int, size: float,
+            rng: np.random.Generator) -> Mesh:  # fmt: skip
+    """Bunches of leaves around each centre."""
+    middle = np.repeat(centres, count, axis=0) + rng.normal(0, 1, (count * len(centres), 3)) * spread
+    return leaves(middle, size * rng.uniform(0.6, 1.3, len(middle)), rng, LEAF)
+
+
+def _shell(
+    count: int, radii: tuple[float, float, float], middle: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Points near the surface of an ellipsoid above the origin."""
+    out = rng.standard_normal((count, 3))
+    out *= rng.uniform(0.55, 1.0, (count, 1)) ** 0.6 / np.linalg.norm(out, axis=1, keepdims=True)
+    points: NDArray[np.float64] = out * radii + (0, 0, middle)
+    return points
+
+
+def _broadleaf(rng: np.random.Generator, height: float, clear: float, width: float, size: float, droop: float) -> Mesh:
+    trunk, path = _stem(clear, rng.uniform(0.13, 0.24), rng)
+    middle, up = (height + clear) / 2, (height - clear) / 2 + 0.3
+    heart = _shell(46, (0.44 * width, 0.44 * width, 0.9 * up), middle, rng)
+    boughs = _boughs(path[-1], heart[rng.permutation(len(heart))[:6]], 0.08)
+    spread = np.array([0.42, 0.42, 0.34 + droop])
+    inside = (0, 0, middle) + 0.7 * (_shell(80, (width / 2, width / 2, up), 0, rng))
+    return merge([trunk, boughs, _clumps(heart - (0, 0, droop), spread, 12, 1.06 * size, rng),
+                  leaves(inside, 0.11 * width, rng, LEAF)])  # fmt: skip
+
+
+def _conifer(rng: np.random.Generator, height: float, clear: float, width: float) -> Mesh:
+    trunk, _ = _stem(0.8 * height, 0.02 + 0.012 * height, rng)
+    level = 1 - rng.uniform(0, 1, 420) ** 0.6
+    reach = width / 2 * (1 - level) * np.sqrt(rng.uniform(0.25, 1, 420)) + 0.06
+    angle = rng.uniform(0, 2 * np.pi, 420)
+    centres = np.c_[reach * np.cos(angle), reach * np.sin(angle), clear + (height - clear) * level - 0.25 * reach]
+    return merge(
+        [trunk, leaves(centres, (0.08 + 0.05 * width) * (1.2 - 0.5 * level), rng, LEAF), _skirt(height, clear, width)]
+    )
+
+
+def _skirt(height: float, clear: float, width: float) -> Mesh:
+    """The dense cone inside a conifer."""
+    angle = np.linspace(0, 2 * np.pi, 9)[:-1]
+    rings = [np.c_[0.33 * width * f * np.cos(angle), 0.33 * width * f * np.sin(angle), np.full(8, z)]
+             for f, z in ((1.0, clear + 0.05 * height), (0.01, 0.95 * height))]  # fmt: skip
+    return loft(rings, LEAF, closed=True)
+
+
+def _bush(rng: np.random.Generator, height: float, width: float) -> Mesh:
+    heart = _shell(14, (0.42 * width, 0.42 * width, 0.42 * height), 0.52 * height, rng)
+    twigs = _boughs(np.zeros(3), heart[:3], 0.025)
+    return merge([twigs, _clumps(heart, 0.18, 12, 0.16, rng), _clumps(heart * 0.5, 0.12, 3, 0.3, rng)])
+
+
+@cache
+def coarse_plant(species: str, variant: int) -> Mesh:
+    """``plant`` for one that is only seen from afar: a quarter of its leaves, each twice as wide."""
+    mesh = plant(species, variant)
+    leaf = mesh.slot == LEAF
+    if species in ("spruce", "thuja"):
+        leaf[-16:] = False
+    some = np.flatnonzero(leaf)[::4]
+    middle = mesh.triangles[some].mean(1, keepdims=True)
+    wide = middle + 1.9 * (mesh.triangles[some] - middle)
+    rest = np.flatnonzero(~leaf & (mesh.slot != TWIG))
+    return Mesh(np.concatenate([wide, mesh.triangles[rest]]), np.concatenate([mesh.slot[some], mesh.slot[rest]]))
+
+
+@cache
+def plant(species: str, variant: int) -> Mesh:
+    """One of the ``VARIANTS`` of a species of ``SPECIES``; slots LEAF, BARK, TWIG."""
+    rng = _rng(species, variant)
+    match species:
+        case "round":
+            return _broadleaf(rng, rng.uniform(7, 11), rng.uniform(2.0, 2.8), rng.uniform(5, 7.5), 0.38, 0.0)
+        case "birch":
+            return _broadleaf(rng, rng.uniform(9, 13), rng.uniform(1.8, 2.6), rng.uniform(4, 5.5), 0.28, 0.35)
+        case "poplar":
+            return _broadleaf(rng, rng.uniform(10, 14), rng.uniform(1.6, 2.2), rng.uniform(3.2, 4.2), 0.32, 0.0)
+        case "fruit":
+            return _broadleaf(rng, rng.uniform(3.6, 5.0), rng.uniform(1.1, 1.6), rng.uniform(2.8, 4.0), 0.22, 0.0)
+        case "spruce":
+            return _conifer(rng, rng.uniform(8, 14), 0.5, rng.uniform(3.6, 5.5))
+        case "thuja":
+            return _conifer(rng, rng.uniform(2.2, 4.5), 0.05, rng.uniform(0.9, 1.5))
+    return _bush(rng, rng.uniform(1.2, 2.8), rng.uniform(1.4, 2.8))
+
+
+def hedge(length: float, height: float, depth: float, rng: np.random.Generator) -> Mesh:
+    """A clipped hedge along +x from the origin, half its depth to either side; leaves are slot 0, its inside slot 1."""
+    steps = max(2, int(length / 0.5) + 1)
+    x = np.linspace(0, length, steps)
+    half, top = 0.36 * depth, height - 0.08
+    outline = np.array(
+        [
+            (-half, -0.1),
+            (-half, 0.55 * height),
+            (-0.8 * half, top),
+            (0.8 * half, top),
+            (half, 0.55 * height),
+            (half, -0.1),
+        ]
+    )
+    core = np.concatenate(
+        [np.broadcast_to(x[:, None, None], (steps, 6, 1)), np.broadcast_to(outline, (steps, 6, 2))], 2
+    )
+    core = core + rng.normal(0, 0.03, core.shape)
+    count = int(length * (2 * height + depth) * 11)
+    face = rng.uniform(0, 2 * height + depth, count)
+    y = np.where(face < height, -depth / 2, np.where(face < 2 * height, depth / 2, face - 2 * height - depth / 2))
+    z = np.where(face < 2 * height, face % height, height)
+    centres = np.c_[rng.uniform(0, length, count), y + rng.normal(0, 0.03, count), z + rng.normal(0, 0.03, count)]
+    ends = [loft([core[i, :3], core[i, 5:2:-1]], 1) for i in (0, -1)]
+    return merge([loft(core, 1), *ends, leaves(centres, rng.uniform(0.07, 0.15, count), rng, LEAF)])
+
+
+def tufts(length: float, depth: float, height: float, per_metre: float, rng: np.random.Generator) -> Mesh:
+    """High grass and weeds along +x: thin upright triangles."""
+    count = int(length * per_metre)
+    foot = np.c_[rng.uniform(0, length, count), rng.uniform(-depth / 2, depth / 2, count), np.zeros(count)]
+    angle = rng.uniform(0, 2 * np.pi, count)
+    half = 0.06 * np.c_[np.cos(angle), np.sin(angle), np.zeros(count)]
+    tip = foot + np.c_[rng.normal(0, 0.08, (count, 2)), height * rng.uniform(0.4, 1.2, count)]
+    triangles = np.stack([foot - half, foot + half, tip], 1).astype(np.float32)
+    return Mesh(triangles, np.full(count, LEAF, np.int32))

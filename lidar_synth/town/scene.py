@@ -1,0 +1,136 @@
+"""A scene under construction: where things are put, and the objects that carry an instance.
+
+Things are given in street coordinates; the scene turns them along the street, sets them on the ground and
+collects their triangles with the surface that each wears.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lidar_synth.town.furniture import Thing
+from lidar_synth.town.ground import Ground
+from lidar_synth.town.materials import RGB, Surfaces
+from lidar_synth.town.meshes import Mesh, merge
+from lidar_synth.town.prototype import Prototype
+
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An object with an instance: a vehicle, a person, a rider.
+
+    Args:
+        prototype: its shape and kind.
+        pose: (4, 4) from its own frame to the world.
+        instance: 1 and up, unique in the stretch.
+        surfaces: the surface number of each slot of its mesh.
+        scale: of the prototype.
+    """
+
+    prototype: Prototype
+    pose: Pose
+    instance: int
+    surfaces: NDArray[np.int32]
+    scale: float = 1.0
+
+
+@dataclass
+class Scene:
+    """What has been put into a stretch so far.
+
+    Args:
+        ground: on what it stands.
+        surfaces: all looks, of static things and of movers.
+    """
+
+    ground: Ground
+    surfaces: Surfaces = field(default_factory=Surfaces)
+    standing: list[tuple[Thing, float, float, float, float]] = field(default_factory=list)
+    meshes: list[Mesh] = field(default_factory=list)
+    placed: list[Placed] = field(default_factory=list)
+    footprints: list[tuple[float, float, float, float]] = field(default_factory=list)
+    instances: int = 0
+
+    def add(self, mesh: Mesh, surfaces: NDArray[np.int32]) -> None:
+        """A mesh that is already in the world, with the surface of each slot."""
+        self.meshes.append(Mesh(mesh.triangles, surfaces[mesh.slot]))
+
+    def put(self, thing: Thing, s: float, t: float, yaw: float = 0.0, lift: float = 0.0, solid: float = 0.0) -> None:
+        """Set a thing on the ground.
+
+        Args:
+            thing: what.
+            s, t: where, street coordinates of its origin.
+            yaw: radians from the street's heading.
+            lift: metres above the ground.
+            solid: metres around its origin that walkers avoid.
+        """
+        self.standing.append((thing, s, t, yaw, lift))
+        if solid:
+            self.footprints.append((s - solid, s + solid, t - solid, t + solid))
+
+    def mesh(self) -> Mesh:
+        """Everything static that was added, put and parked, in the world; a slot is a surface number."""
+        places = np.array([row[1:] for row in self.standing]).reshape(-1, 4)
+        points = self.ground.points(places[:, 0], places[:, 1]) + places[:, 3:] * (0, 0, 1)
+        yaws = self.ground.course.heading(places[:, 0]) + places[:, 2]
+        for (thing, *_), point, yaw in zip(self.standing, points, yaws, strict=True):
+            rows = [self.surfaces.add(f, raw) for f, raw in zip(thing.finishes, thing.raw, strict=True)]
+            self.add(thing.mesh.moved(point, float(yaw)), np.array(rows, np.int32))
+        self.standing.clear()
+        return merge(self.meshes)
+
+    def poses(self, s: ArrayLike, t: ArrayLike, yaw: ArrayLike, length: ArrayLike) -> Pose:
+        """(..., 4, 4) of objects standing on the ground, tilted as the ground under their length.
+
+        Args:
+            s, t: street coordinates, metres.
+            yaw: radians from the street's heading.
+            length: metres.
+        """
+        s, t, yaw, half = np.broadcast_arrays(
+            *(np.asarray(v, float) for v in (s, t, yaw, np.asarray(length, float) / 3))
+        )
+        heading = self.ground.course.heading(s) + yaw
+        c, d = np.cos(yaw), np.sin(yaw)
+        # One kind of ground under all probes: a wheel on the kerb does not tilt the whole car.
+        probes = [(s + a * half, t + b * half) for a, b in ((c, d), (-c, -d), (-d, c), (d, -c))]
+        front, back, left, right = (self.ground.height(*p, 0) for p in probes)
+        ahead = np.stack([np.cos(heading), np.sin(heading), (front - back) / (2 * half)], -1)
+        across = np.stack([-np.sin(heading), np.cos(heading), (left - right) / (2 * half)], -1)
+        up = np.cross(ahead, across)
+        ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+        up /= np.linalg.norm(up, axis=-1, keepdims=True)
+        pose = np.zeros((*s.shape, 4, 4))
+        pose[..., :3, :3] = np.stack([ahead, np.cross(up, ahead), up], -1)
+        pose[..., :3, 3] = self.ground.points(s, t)
+        pose[..., 3, 3] = 1
+        return pose
+
+    def dress(self, prototype: Prototype, colour: RGB, moving: bool) -> tuple[int, NDArray[np.int32]]:
+        """A new instance number and the surfaces of its slots."""
+        self.instances += 1
+        rows = [self.surfaces.add(f, prototype.raw[int(moving)], self.instances) for f in prototype.painted(colour)]
+        return self.instances, np.array(rows, np.int32)
+
+    def park(self, prototype: Prototype, colour: RGB, s: float, t: float, yaw: float, scale: float = 1.0) -> None:
+        """Stand an object with an instance on the ground; it becomes part of the static world."""
+        instance, surfaces = self.dress(prototype, colour, moving=False)
+        low, high = prototype.mesh.bounds
+        pose = self.poses(s, t, yaw, high[0] - low[0])
+        placed = Placed(prototype, pose, instance, surfaces, scale)
+        self.placed.append(placed)
+        self.add(prototype.mesh.moved(scale=scale).posed(pose), surfaces)
+        half = np.abs(np.array([[np.cos(yaw), np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])) @ (high[:2] - low[:2]) / 2
+        self.footprints.append((s - half[0], s + half[0], t - half[1], t + half[1]))
+
+    def free(self, s: float, t: float, half: tuple[float, float]) -> bool:
+        """Whether nothing solid stands within the half extents (along s, along t) around a place."""
+        if not self.footprints:
+            return True
+        f = np.array(self.footprints)
+        hit = (f[:, 0] < s + half[0]) & (f[:, 1] > s - half[0]) & (f[:, 2] < t + half[1]) & (f[:, 3] > t - half[1])
+        return not hit.any()

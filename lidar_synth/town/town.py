@@ -1,0 +1,165 @@
+"""The town as a source of scans: ``Town(seed)[i]`` is scan number i, the same whoever asks and in what order.
+
+Twenty neighbouring scans share a stretch of road: the ego vehicle drives along it, ``interval`` seconds from
+scan to scan, and everything that stands or moves is where it has to be. Stretches lie a kilometre apart in
+the world frame of the poses, so that nothing that accumulates scans by pose mixes two of them.
+"""
+
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import SEMANTIC_KITTI
+from lidar_synth.errors import ConfigError
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.scan import SYNTHETIC, Scan
+from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.town.boxes import boxes_of
+from lidar_synth.town.camera import CAMERA
+from lidar_synth.town.cast import Stage
+from lidar_synth.town.ego import HEIGHT, free_rays, optics
+from lidar_synth.town.materials import SurfaceTable
+from lidar_synth.town.movers import ego_place, ego_pose, stand
+from lidar_synth.town.returns import Noise, laser_gains, measure, see_through
+from lidar_synth.town.scene import Pose
+from lidar_synth.town.shading import draw_light, render
+from lidar_synth.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, generator
+
+APART = 1000.0
+"""Metres between the origins of two stretches in the world of the poses."""
+
+
+class Town:
+    """An indexable source of synthetic scans with labels, boxes and poses.
+
+    Args:
+        seed: of the whole town, 0 and up.
+        sensor: whose rays are cast, as ``load_sensor`` takes it.
+        scans: how many scans it holds.
+        interval: seconds between neighbouring scans of a stretch.
+        noise: how imperfect the sensor is.
+
+    Raises:
+        ConfigError: on a negative seed or number of scans, an interval that is not positive, an unknown sensor.
+        LibraryError: where embreex is missing.
+    """
+
+    def __init__(
+        self,
+        seed: int = 0,
+        sensor: str | Path | Sensor = "town",
+        scans: int = 1000,
+        interval: float = 0.4,
+        noise: Noise | None = None,
+    ) -> None:
+        if seed < 0 or scans < 0 or not 0 < interval < 60:
+            raise ConfigError(
+                f"seed {seed}, {scans} scans, {interval} s apart", "a seed and a number from 0 up, 0 to 60 s"
+            )
+        self.seed, self.sensor, self.interval = seed, load_sensor(sensor), interval
+        self._scans, self._noise = scans, noise or Noise()
+        self._worlds: OrderedDict[int, World] = OrderedDict()
+        elevation, height = optics(self.sensor)
+        columns = self.sensor.columns
+        # As the sensor writes them: ring by ring from the top, counter-clockwise from straight ahead.
+        order = np.r_[columns // 2 - 1 : -1 : -1, columns - 1 : columns // 2 - 1 : -1]
+        self._laser, column = np.nonzero(free_rays(self.sensor)[:, order])
+        azimuth = self.sensor.column_azimuths().astype(float)[order][column]
+        tilt = elevation[self._laser]
+        self._rays = np.stack(
+            [np.cos(azimuth) * np.cos(tilt), -np.sin(azimuth) * np.cos(tilt), np.sin(tilt)], 1
+        ).astype(np.float32)
+        self._heights = height[self._laser].astype(np.float32)
+        self._gains = laser_gains(self.sensor, self._noise)
+
+    def __reduce__(self) -> tuple[type["Town"], tuple[object, ...]]:
+        return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise)
+
+    @property
+    def calibration(self) -> Calibration:
+        """The camera beside the sensor."""
+        return CAMERA
+
+    def __len__(self) -> int:
+        return self._scans
+
+    def world(self, index: int) -> World:
+        """The stretch of road in which a scan is taken; the last two are kept."""
+        stretch = index // STRETCH_FRAMES
+        if stretch not in self._worlds:
+            if len(self._worlds) > 1:
+                self._worlds.popitem(last=False)
+            self._worlds[stretch] = build_world(self.seed, stretch, self.interval)
+        return self._worlds[stretch]
+
+    def moment(self, index: int) -> tuple[Stage, Pose, np.random.Generator]:
+        """The scene of a scan, the sensor's pose in its stretch, and the scan's random numbers."""
+        stretch, frame = divmod(index, STRETCH_FRAMES)
+        rng = generator(SCAN, self.seed, stretch, frame)
+        world, time = self.world(index), frame * self.interval
+        pose = ego_pose(world.street, world.scene, time, HEIGHT, rng.normal(0, 0.003, 2))
+        movers = stand(world.movers, world.scene, time, ego_place(world.street, time), 100.0)
+        return Stage(world, movers), pose, rng
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """(376, 1408, 3) uint8 RGB, the picture taken with scan ``index`` by the camera of ``calibration``.
+
+        Raises:
+            IndexError: outside 0 to ``len - 1``.
+        """
+        stage, pose, _ = self.moment(self._checked(index))
+        stretch, frame = divmod(index, STRETCH_FRAMES)
+        light = draw_light(generator(LIGHT, self.seed, stretch))
+        return render(stage, pose, self.world(index).surfaces, light, generator(IMAGE, self.seed, stretch, frame))
+
+    def _checked(self, index: int) -> int:
+        if not 0 <= index < len(self):
+            raise IndexError(f"scan {index} of a town of {len(self)}")
+        return index
+
+    def __getitem__(self, index: int) -> Scan:
+        """Scan number ``index``.
+
+        Raises:
+            IndexError: outside 0 to ``len - 1``.
+        """
+        stage, pose, rng = self.moment(self._checked(index))
+        world = self.world(index)
+        laser, surface, points, reflectance = self._turn(stage, pose, world.surfaces, rng)
+        raw, instance = world.surfaces.raw[surface], world.surfaces.instance[surface]
+        returned = np.bincount(instance, minlength=world.scene.instances + 1)
+        objects = [o for o in (*world.scene.placed, *stage.movers) if o.prototype.name and returned[o.instance]]
+        placed = pose.copy()
+        placed[0, 3] += APART * (index // STRETCH_FRAMES)
+        return Scan(
+            points=points,
+            reflectance=reflectance,
+            sensor=self.sensor,
+            label=SEMANTIC_KITTI.decode(raw),
+            raw_label=raw | instance.astype(np.uint32) << np.uint32(16),
+            instance=instance,
+            ring=laser.astype(np.int16),
+            boxes=boxes_of(objects, pose, stage),
+            pose=placed,
+            id=f"town-{self.seed}-{index:06d}",
+            domain=SYNTHETIC,
+        )
+
+    def _turn(
+        self, stage: Stage, pose: Pose, surfaces: SurfaceTable, rng: np.random.Generator
+    ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+        """Laser, surface, point in the sensor frame and reflectance of every return of one turn."""
+        turn = pose[:3, :3].astype(np.float32)
+        directions = self._rays @ turn.T
+        origins = pose[:3, 3].astype(np.float32) + self._heights[:, None] * turn[:, 2]
+        eye = origins.mean(0)
+        hits = stage.cast(origins, directions, eye)
+        see_through(stage, hits, origins, directions, eye, surfaces, rng)
+        back, far, reflectance = measure(hits, directions, self._laser, surfaces, self._gains, self._noise, rng)
+        points = far[:, None] * self._rays[back]
+        points[:, 2] += self._heights[back]
+        distance = np.sqrt(np.einsum("ij,ij->i", points, points))
+        kept = np.flatnonzero((distance >= self.sensor.range_min) & (distance <= self.sensor.range_max))
+        return self._laser[back[kept]], hits.surface[back[kept]], points[kept], reflectance[kept]

@@ -1,0 +1,197 @@
+"""The traffic of a stretch: who drives, walks and rides where.
+
+Every mover keeps to one street coordinate and runs along the other at its own speed. Two movers, or a mover
+and something solid, never share a place at any moment of the stretch: whoever would is left out.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.town.bodywork import PAINTS
+from lidar_synth.town.furnish import draw_vehicle
+from lidar_synth.town.materials import RGB
+from lidar_synth.town.movers import Mover
+from lidar_synth.town.paving import PLAZA_DEPTH
+from lidar_synth.town.people import CLOTHES, PHASES, cyclist, motorcyclist, walker
+from lidar_synth.town.prototype import Prototype
+from lidar_synth.town.scene import Scene
+from lidar_synth.town.street import LEFT, RIGHT, Street
+from lidar_synth.town.vehicles import vehicles
+
+Rng = np.random.Generator
+_DRIVEN = {
+    "hatchback": 0.16, "compact": 0.16, "small": 0.08, "sedan": 0.11, "old_sedan": 0.02, "estate": 0.14, "suv": 0.09,
+    "mpv": 0.08, "minivan": 0.04, "van": 0.04, "panel_van": 0.03, "box_lorry": 0.025, "small_lorry": 0.02, "bus": 0.02,
+    "flatbed": 0.01,
+}  # fmt: skip
+
+
+Box = NDArray[np.float64]
+
+
+def _track(shape: Prototype, along: bool, at: float, start: float, velocity: float, times: Box, gap: float) -> Box:
+    """(T, 4) lowest and highest s, lowest and highest t that something takes at each time."""
+    low, high = shape.mesh.bounds
+    half = (np.abs([low[:2], high[:2]]).max(0) + gap)[:: 1 if along else -1]
+    way, other = start + velocity * times, np.full(len(times), at)
+    s, t = (way, other) if along else (other, way)
+    return np.stack([s - half[0], s + half[0], t - half[1], t + half[1]], 1)
+
+
+class Traffic:
+    """All movers of a stretch.
+
+    Args:
+        street, scene: where they move.
+        times: (T,) seconds at which they must be clear of one another.
+        rng: draws them.
+    """
+
+    def __init__(self, street: Street, scene: Scene, times: Box, rng: Rng) -> None:
+        self._street, self._scene, self._times, self._rng = street, scene, times, rng
+        ego = vehicles()["estate"]
+        self._tracks = [_track(ego, True, street.lanes[0].t, 0.0, street.speed, times, 1.2)]
+        self.movers: list[Mover] = []
+        self._drive()
+        self._cross()
+        self._walk()
+        self._ride()
+
+    def _try(
+        self,
+        shapes: tuple[Prototype, ...],
+        colour: RGB,
+        along: bool,
+        at: float,
+        start: float,
+        way: int,
+        speed: float,
+        gap: float,
+        stride: float = 1.0,
+        scale: float = 1.0,
+        solid: bool = False,
+    ) -> None:
+        """Add a mover with a gap (metres) around it, unless it would meet another, or what is solid on its way."""
+        track = _track(shapes[0], along, at, start, way * speed, self._times, gap)
+        low, high = self._street.ends
+        if track[:, 0].min() < low or track[:, 1].max() > high or any(_meet(track, other) for other in self._tracks):
+            return
+        if solid:
+            footprints = np.array(self._scene.footprints).reshape(-1, 1, 4)
+            if len(footprints) and _meet(track[None], footprints):
+                return
+        self._tracks.append(track)
+        instance, surfaces = self._scene.dress(shapes[0], colour, moving=speed > 0)
+        self.movers.append(Mover(shapes, stride, along, at, start, way, speed, instance, surfaces, scale))
+
+    def _vehicle(self) -> tuple[tuple[Prototype, ...], RGB]:
+        rng = self._rng
+        if rng.random() < 0.04:
+            return (motorcyclist(),), CLOTHES[rng.integers(len(CLOTHES))]
+        return (vehicles()[draw_vehicle(rng, _DRIVEN)],), PAINTS[rng.integers(len(PAINTS))]
+
+    def _drive(self) -> None:
+        """Cars on the stretch's own lanes, a tram on its rails."""
+        street, rng = self._street, self._rng
+        density = {"residential": 0.25, "main": 0.6, "junction": 0.55, "square": 0.4, "edge": 0.4}[street.kind]
+        for lane in street.lanes:
+            mean = street.speed * rng.uniform(0.9, 1.15)
+            s = rng.uniform(-70, -40)
+            while s < street.length + 150:
+                if rng.random() < density:
+                    shapes, colour = self._vehicle()
+                    speed = street.speed if lane == street.lanes[0] else mean
+                    self._try(
+                        shapes,
+                        colour,
+                        True,
+                        lane.t + rng.normal(0, 0.12),
+                        s if lane.way > 0 else street.length - s,
+                        lane.way,
+                        speed,
+                        0.6,
+                    )
+                s += rng.uniform(9, 40)
+        if street.median > 2.2 and rng.random() < 0.6:
+            self._try(
+                (vehicles()["tram"],),
+                (0.85, 0.75, 0.15),
+                True,
+                0.0,
+                rng.uniform(-50, street.length + 60),
+                int(rng.choice([-1, 1])),
+                7.0,
+                0.1,
+            )
+
+    def _cross(self) -> None:
+        """Cars on side streets: waiting at their line or leaving."""
+        street, rng = self._street, self._rng
+        for c in street.crossings:
+            for side in c.sides:
+                sign = 2 * side - 1
+                stop = street.edge[side] + 4.2
+                for k in range(rng.poisson(1.2 if street.kind == "junction" else 0.5)):
+                    shapes, colour = self._vehicle()
+                    self._try(shapes, colour, False, c.s - sign * c.half / 2, sign * (stop + 7.5 * k), -sign, 0.0, 0.4)
+                if rng.random() < 0.7:
+                    shapes, colour = self._vehicle()
+                    start = sign * (street.edge[side] + rng.uniform(5, 40))
+                    self._try(shapes, colour, False, c.s + sign * c.half / 2, start, sign, rng.uniform(4, 9), 0.5)
+
+    def _walk(self) -> None:
+        """Pedestrians on pavements, on the square, on their way across."""
+        street, rng = self._street, self._rng
+        strips = []
+        for side in (RIGHT, LEFT):
+            pavement = street.band(side, "sidewalk")
+            if pavement:
+                strips.append(
+                    (side, pavement[0] + 0.3, pavement[1] - 0.3, {"residential": 4, "edge": 1}.get(street.kind, 9))
+                )
+            if street.plaza == side:
+                strips.append((side, street.front(side) + 1, street.front(side) + PLAZA_DEPTH - 2, 16))
+        for side, low, high, mean in strips:
+            for _ in range(rng.poisson(mean)):
+                sign = 2 * side - 1
+                self._person(True, sign * rng.uniform(low, max(low, high)), rng.uniform(-50, street.length + 60))
+        for _ in range(rng.poisson({"residential": 1, "edge": 0.2}.get(street.kind, 3))):
+            self._person(False, rng.uniform(-10, street.length + 40), rng.uniform(-10, 10))
+
+    def _person(self, along: bool, at: float, start: float) -> None:
+        rng = self._rng
+        bag = bool(rng.random() < 0.3)
+        shapes = tuple(walker(p, bag=bag) for p in range(PHASES))
+        scale = rng.uniform(0.6, 0.8) if rng.random() < 0.12 else rng.uniform(0.9, 1.08)
+        self._try(shapes, CLOTHES[rng.integers(len(CLOTHES))], along, at, start, int(rng.choice([-1, 1])),
+                  rng.uniform(0.9, 1.7), 0.25, 1.4 * scale, scale, solid=True)  # fmt: skip
+
+    def _ride(self) -> None:
+        """Cyclists at the right edge of the carriageway or on their own way."""
+        street, rng = self._street, self._rng
+        shapes = tuple(cyclist(p) for p in range(PHASES))
+        for side, way in ((RIGHT, 1), (LEFT, -1)):
+            own = street.band(side, "cycleway")
+            sign = 2 * side - 1
+            kerb = street.edge[side] - (2.9 if street.parking[side] == "street" else 0.7)
+            for _ in range(rng.poisson(2.2 if own else 1.1)):
+                at = sign * ((own[0] + own[1]) / 2 if own else kerb)
+                self._try(
+                    shapes,
+                    CLOTHES[rng.integers(len(CLOTHES))],
+                    True,
+                    at,
+                    rng.uniform(-40, street.length + 50),
+                    way,
+                    rng.uniform(3, 6.5),
+                    0.4,
+                    4.0,
+                    solid=True,
+                )
+
+
+def _meet(a: Box, b: Box) -> bool:
+    """Whether two boxes (..., 4) ever overlap."""
+    return bool(
+        ((a[..., 0] < b[..., 1]) & (a[..., 1] > b[..., 0]) & (a[..., 2] < b[..., 3]) & (a[..., 3] > b[..., 2])).any()
+    )

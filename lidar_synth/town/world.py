@@ -1,0 +1,98 @@
+"""A stretch of road, whole: its static world as triangles, its movers, the ego vehicle's way.
+
+Everything is drawn from a counter-based generator keyed by (seed, stretch), so that a stretch is the same
+whoever asks for it and in whatever order.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.town.backdrop import close_ends, second_row
+from lidar_synth.town.course import Course, Relief
+from lidar_synth.town.furnish import furnish
+from lidar_synth.town.ground import KINDS, Ground
+from lidar_synth.town.lots import draw_lots, paint_lots
+from lidar_synth.town.materials import SurfaceTable
+from lidar_synth.town.movers import Mover
+from lidar_synth.town.paving import pave
+from lidar_synth.town.scene import Placed, Scene
+from lidar_synth.town.street import KINDS as STREETS
+from lidar_synth.town.street import REACH, SHARES, Street, draw_street
+from lidar_synth.town.traffic import Traffic
+from lidar_synth.town.yards import build_lot
+
+STRETCH_FRAMES = 20
+"""Frames that share a stretch of road."""
+
+
+WORLD, LIGHT, SCAN, IMAGE = range(4)
+"""What random numbers are for."""
+
+
+def generator(purpose: int, seed: int, stretch: int, frame: int = 0) -> np.random.Generator:
+    """The random numbers for one purpose in a stretch, or in one of its frames."""
+    return np.random.Generator(np.random.Philox(key=(seed, purpose), counter=(0, 0, stretch, frame)))
+
+
+@dataclass(frozen=True)
+class World:
+    """One stretch of road.
+
+    Args:
+        street: its plan.
+        scene: what stands in it, and its ground.
+        triangles: (F, 3, 3) float32, metres, the static world.
+        faces: (F,) int32 surface number of each.
+        surfaces: all surfaces, of the static world and of the movers.
+        movers: what moves.
+    """
+
+    street: Street
+    scene: Scene
+    triangles: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    surfaces: SurfaceTable
+    movers: list[Mover]
+
+    def parked(self) -> list[Placed]:
+        """Objects with an instance that are part of the static world."""
+        return self.scene.placed
+
+
+def build_world(seed: int, stretch: int, interval: float) -> World:
+    """The stretch number ``stretch`` of a seed's town.
+
+    Args:
+        seed: of the town.
+        stretch: 0 and up.
+        interval: seconds from frame to frame.
+    """
+    rng = generator(WORLD, seed, stretch)
+    kind = str(rng.choice(STREETS, p=SHARES))
+    times = np.arange(STRETCH_FRAMES, dtype=float) * interval
+    street = draw_street(kind, float(times[-1]), rng)
+    course = Course(
+        -REACH - 40,
+        street.length + REACH + 40,
+        float(rng.choice([0.0, 1 / 500, 1 / 220, 1 / 150], p=[0.3, 0.2, 0.3, 0.2])),
+        rng,
+    )
+    relief = Relief(0.004 if rng.random() < 0.6 else 0.014, rng)
+    lots = draw_lots(street, rng)
+    paint = pave(street, rng)
+    paint_lots(lots, paint, rng)
+    fine = (-REACH, street.length + REACH)
+    ground = Ground(course, relief, street.edge, paint.reach, fine, paint.rects, paint.corners)
+    scene = Scene(ground)
+    rows = [scene.surfaces.add(k.finish, k.raw) for k in KINDS.values()]
+    scene.add(ground.mesh(rng), np.array(rows, np.int32))
+    for lot in lots:
+        build_lot(lot, street, scene, rng)
+    close_ends(street, scene, rng)
+    furnish(street, lots, scene, rng)
+    second_row(street, scene, rng)
+    movers = Traffic(street, scene, times, rng).movers
+    mesh = scene.mesh()
+    return World(street, scene, mesh.triangles, mesh.slot, scene.surfaces.freeze(), movers)

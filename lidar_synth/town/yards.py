@@ -1,0 +1,164 @@
+"""Building a lot: its house, its boundary, driveway, plants and what stands in its yard."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from lidar_synth.town import fences
+from lidar_synth.town import furniture as fit
+from lidar_synth.town.bodywork import PAINTS
+from lidar_synth.town.buildings import building, garage
+from lidar_synth.town.facades import finishes
+from lidar_synth.town.furniture import BUILDING, Thing
+from lidar_synth.town.lots import Lot
+from lidar_synth.town.materials import Finish
+from lidar_synth.town.scene import Scene
+from lidar_synth.town.street import LEFT, Street
+from lidar_synth.town.vehicles import vehicles
+
+Rng = np.random.Generator
+HOUSE = (BUILDING,) * 10
+"""Classes of a building's slots."""
+
+
+def build_lot(lot: Lot, street: Street, scene: Scene, rng: Rng) -> None:
+    """Put a lot's house, boundary, plants and what stands in its yard into the scene."""
+    house = lot.front + lot.setback
+    if lot.plan is not None:
+        _put_facing(
+            scene,
+            Thing(building(lot.plan, rng), finishes(rng), HOUSE),
+            lot,
+            lot.start + lot.at,
+            house,
+            lot.plan.width,
+        )
+    if lot.boundary != "none":
+        openings = [lot.driveway] if lot.driveway else []
+        if lot.plan is not None and not lot.driveway:
+            middle = lot.start + lot.at + lot.plan.width / 2
+            openings = [(middle - 0.6, middle + 0.6)]
+        low = lot.start + 0.1
+        for a, b in [*openings, (lot.end - 0.1, 0.0)]:
+            _bound(scene, lot.boundary, low, a, lot.sign * (lot.front + 0.3), rng)
+            low = b
+    if lot.driveway:
+        _use_driveway(scene, lot, house, rng)
+    _plant(scene, lot, street, house, rng)
+
+
+def _put_facing(scene: Scene, thing: Thing, lot: Lot, s: float, front: float, width: float) -> None:
+    """A building whose front looks at the street, its lower-s corner at s."""
+    if lot.side == LEFT:
+        scene.put(thing, s, front)
+    else:
+        scene.put(thing, s + width, -front, np.pi)
+
+
+def _bound(scene: Scene, kind: str, start: float, end: float, t: float, rng: Rng) -> None:
+    """A boundary along the street, in pieces that follow its bends."""
+    if end - start < 0.8:
+        return
+    height = rng.uniform(0.7, 1.25)
+    stone = (
+        Finish(str(rng.choice(["stone", "concrete", "brick"])))
+        if rng.random() < 0.6
+        else Finish("render", (0.8, 0.78, 0.72))
+    )
+    shade = float(rng.uniform(0.1, 0.5))
+    pieces = max(1, int(np.ceil((end - start) / 7)))
+    ends = np.linspace(start, end, pieces + 1)
+    for a, b in pairwise(ends):
+        for part in _boundary(kind, b - a, height, stone, shade, rng):
+            scene.put(part[0], a, t + part[1], 0.0, part[2])
+
+
+def _boundary(
+    kind: str, length: float, height: float, stone: Finish, shade: float, rng: Rng
+) -> list[tuple[Thing, float, float]]:
+    """(thing, shift of t, lift) of one piece."""
+    iron = (shade, shade, 1.1 * shade)
+    match kind:
+        case "hedge":
+            return [(fences.hedged(length, rng), 0.0, 0.0)]
+        case "wall":
+            return [(fences.low_wall(length, height, stone), 0.0, 0.0)]
+        case "bars":
+            return [(fences.bar_fence(length, height, 0.13, iron, False), 0.0, 0.0)]
+        case "boards":
+            return [(fences.bar_fence(length, height, 0.12, (0.5, 0.38, 0.25), True), 0.0, 0.0)]
+        case "wire":
+            return [(fences.wire_fence(length, height), 0.0, 0.0)]
+        case "wallhedge":
+            return [
+                (fences.low_wall(length, 0.4, stone), 0.0, 0.0),
+                (fences.hedged(length, rng), 0.4 if shade > 0.3 else -0.0, 0.35),
+            ]
+    return [
+        (fences.low_wall(length, 0.45, stone), 0.0, 0.0),
+        (fences.bar_fence(length, 0.7, 0.13, iron, False), 0.0, 0.5),
+    ]
+
+
+def _use_driveway(scene: Scene, lot: Lot, house: float, rng: Rng) -> None:
+    assert lot.driveway is not None
+    middle = sum(lot.driveway) / 2
+    if rng.random() < 0.6:
+        shed = Thing(garage(2.9, 6.0), finishes(rng), HOUSE)
+        _put_facing(scene, shed, lot, middle - 1.45, house + rng.uniform(0.5, 3), 2.9)
+    if rng.random() < 0.4 and lot.setback > 2.5:
+        kinds = vehicles()
+        kind = str(rng.choice(["hatchback", "compact", "sedan", "estate", "suv", "mpv", "small", "caravan"]))
+        yaw = np.pi / 2 * (1 if rng.random() < 0.5 else -1)
+        scene.park(kinds[kind], PAINTS[rng.integers(len(PAINTS))], middle, lot.sign * (lot.front + 2.6), yaw)
+    if rng.random() < 0.35:
+        scene.put(fit.bin_(rng), lot.driveway[0] - 0.5, lot.sign * (lot.front + 0.9), -lot.sign * np.pi / 2)
+
+
+def _plant(scene: Scene, lot: Lot, street: Street, house: float, rng: Rng) -> None:
+    """Bushes and trees before, between and behind."""
+    depth = lot.setback if lot.plan else 16.0
+    width = lot.end - lot.start
+    # The nearer the street, the more a plant weighs: those behind a house are hardly seen.
+    for _ in range(rng.poisson((0.4 + lot.garden) * width * min(depth, 10) / 11)):
+        s, t = rng.uniform(lot.start + 0.8, lot.end - 0.8), lot.front + rng.uniform(0.9, max(1.0, depth - 0.6))
+        if lot.driveway and lot.driveway[0] - 1 < s < lot.driveway[1] + 1:
+            continue
+        species = str(
+            rng.choice(["bush", "thuja", "fruit", "round", "birch", "spruce"], p=[0.56, 0.13, 0.16, 0.06, 0.04, 0.05])
+        )
+        seen = t < 15 and -35 < s < street.length + 40
+        scene.put(fit.grown(species, rng, near=seen), s, lot.sign * t, solid=0.5)
+    behind = house + (lot.plan.depth if lot.plan else 0)
+    for _ in range(rng.poisson(width / 6)):
+        species = str(rng.choice(["round", "birch", "spruce", "poplar", "fruit"]))
+        scene.put(
+            fit.grown(species, rng, near=False),
+            rng.uniform(lot.start, lot.end),
+            lot.sign * (behind + rng.uniform(2, 16)),
+        )
+    if lot.plan and rng.random() < 0.5:
+        gap = lot.start + lot.at / 2 if lot.at > 2 else lot.start + 0.3
+        thing = fences.hedged(8.0, rng) if rng.random() < 0.5 else fences.wire_fence(8.0, 1.2)
+        scene.put(thing, lot.start + 0.2 if lot.driveway else gap, lot.sign * house, lot.sign * np.pi / 2)
+    if lot.plan:
+        _close_gap(scene, lot, behind, rng)
+
+
+def _close_gap(scene: Scene, lot: Lot, behind: float, rng: Rng) -> None:
+    """What one sees between two houses: a hedge, a fence, a shed or bushes at the back."""
+    assert lot.plan is not None
+    for low, high in ((lot.start, lot.start + lot.at), (lot.start + lot.at + lot.plan.width, lot.end)):
+        draw = rng.random()
+        if high - low < 1.5 or draw < 0.2:
+            continue
+        t = lot.sign * (behind + rng.uniform(-3, 4))
+        if draw < 0.45:
+            scene.put(fences.hedged(high - low, rng), low, t)
+        elif draw < 0.6:
+            scene.put(fences.bar_fence(high - low, 1.6, 0.11, (0.45, 0.35, 0.25), True), low, t)
+        elif draw < 0.8 and high - low > 3.4:
+            _put_facing(scene, Thing(garage(3.2, 4.0), finishes(rng), HOUSE), lot, low + 0.1, abs(t), 3.2)
+        else:
+            for s in np.arange(low + 0.7, high, 1.6):
+                scene.put(fit.grown("bush", rng, rng.uniform(1.0, 1.5), near=False), s, t)
