@@ -1,0 +1,37 @@
+"""``lidar-synth import``: a peer's released weights as a checkpoint of this package."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidar_synth.errors import ConfigError
+
+
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE.pth", help="The peer's released weights.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.safetensors", help="Where the checkpoint will stand.")],
+    peer: Annotated[str, typer.Option(help="Whose weights: r2flow.")] = "r2flow",
+) -> None:
+    """Convert a peer's released weights to a checkpoint.
+
+    The file is read without running any code in it. Names, sign and time are converted; a file that does not
+    fit exactly is refused with its missing and unexpected keys.
+
+    \b
+    Examples:
+      lidar-synth import r2flow-kitti360-1rf.pth r2flow-1rf.safetensors
+      lidar-synth sample scans --model r2flow-1rf.safetensors --count 16 --steps 32
+    """
+    from lidar_synth.checkpoint import VELOCITY, save_checkpoint
+    from lidar_synth.importers import IMPORTERS
+
+    if peer not in IMPORTERS:
+        raise ConfigError(f"--peer {peer}", f"one of {', '.join(IMPORTERS)}")
+    header, networks = IMPORTERS[peer](file)
+    digest = save_checkpoint(out, header, networks)
+    count = sum(p.numel() for p in networks[VELOCITY].parameters())
+    rows, columns = header.sensor.shape
+    print(f"{out}: {count / 1e6:.1f} M parameters, {rows} x {columns}, {', '.join(header.channels)}")
+    print(f"hash {digest}; weights {header.provenance['licence']}; data {header.provenance['data']}, "
+          f"{header.provenance['data_licence']}")  # fmt: skip

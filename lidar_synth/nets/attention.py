@@ -1,0 +1,107 @@
+"""Attention over a neighbourhood on a range image, exact and in plain PyTorch.
+
+Each token attends to a window of tokens around it. Columns wrap, as the image is a full turn. At the top and
+at the bottom the window is moved inwards so that it keeps its size (Hassani et al., "Neighborhood Attention
+Transformer", CVPR 2023). Attention over a set knows no order, so that moving the window is the same as
+padding: the row that lies j rows above the top is replaced by row 2m + 1 - j, with m rows to each side. For
+three rows, row 2 is set above row 0; the window of row 0 is then {2, 0, 1}. Columns are padded by those of the
+other side. After that all windows are alike, and a tile of queries together with its margin of keys is
+ordinary attention under one constant mask. Padding and tiling are done once, on the numbers of the tokens.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lidar_synth.nets.layers import piece_length
+
+Grid = tuple[int, int]
+"""Rows and columns: of an image, of its tokens, of a window."""
+
+TILE: Grid = (2, 16)
+"""Queries of a tile at most. A larger one wastes more products and copies less; the result is the same."""
+
+
+class Neighbourhood(NamedTuple):
+    """A grid of tokens cut into tiles.
+
+    Args:
+        tokens: (tiles, n) the tokens whose queries a tile holds; each token once.
+        keys: (tiles, m) the tokens of a tile and of its margin.
+        place: (N,) where each token stands in ``tokens``.
+        mask: (n, m) 0 where a key lies in a query's window, else -inf.
+    """
+
+    tokens: Tensor
+    keys: Tensor
+    place: Tensor
+    mask: Tensor
+
+
+def neighbourhood(grid: Grid, window: Grid, device: torch.device, dtype: torch.dtype) -> Neighbourhood:
+    """The tiles of a grid for windows of odd size, no larger than the grid; ``mask`` in ``dtype``."""
+    tile = (_divisor(grid[0], TILE[0]), _divisor(grid[1], TILE[1]))
+    span = (tile[0] + window[0] - 1, tile[1] + window[1] - 1)
+    numbers = torch.arange(grid[0] * grid[1], device=device).view(grid)
+    tokens = _tiles(numbers, tile, tile)
+    mask = torch.zeros((), device=device, dtype=dtype).where(_near(tile, window, device), -torch.inf)
+    return Neighbourhood(tokens, _tiles(_surround(numbers, window), span, tile), tokens.flatten().argsort(), mask)
+
+
+def neighbourhood_attention(q: Tensor, k: Tensor, v: Tensor, near: Neighbourhood) -> Tensor:
+    """softmax(q k^T) v over the window around each token; q and k are scaled already.
+
+    Args:
+        q, k, v: (B, N, heads, D), tokens row by row.
+        near: the tiles of their grid.
+
+    Returns:
+        (B, N, heads, D).
+    """
+    length = piece_length(q, len(near.keys), near.keys.shape[1] * q[:, 0].numel())
+    out = []
+    for tokens, keys in zip(torch.split(near.tokens, length), torch.split(near.keys, length), strict=True):
+        h = F.scaled_dot_product_attention(_tiled(q, tokens), _tiled(k, keys), _tiled(v, keys), near.mask, scale=1.0)
+        out.append(h.transpose(1, 2).reshape(len(q), -1, *q.shape[2:]))
+    return _pick(torch.cat(out, 1), near.place)
+
+
+def _tiled(x: Tensor, index: Tensor) -> Tensor:
+    """The tokens (tiles, n) of x (B, N, heads, D) as (B tiles, heads, n, D)."""
+    return _pick(x, index.flatten()).reshape(-1, index.shape[1], *x.shape[2:]).transpose(1, 2)
+
+
+def _pick(x: Tensor, index: Tensor) -> Tensor:
+    """The tokens (n,) of x (B, N, ...) as (B, n, ...)."""
+    # One index over all rows: its gradient is several times as fast on a CPU as that along dimension 1.
+    rows = index + x.shape[1] * torch.arange(len(x), device=x.device)[:, None]
+    return x.flatten(0, 1).index_select(0, rows.flatten()).reshape(*rows.shape, *x.shape[2:])
+
+
+def _divisor(size: int, limit: int) -> int:
+    """The largest divisor of ``size`` up to ``limit``."""
+    return next(n for n in range(min(size, limit), 0, -1) if size % n == 0)
+
+
+def _surround(x: Tensor, window: Grid) -> Tensor:
+    """(H, W) with the margin that makes all windows alike; see the module's docstring."""
+    m, n = window[0] // 2, window[1] // 2
+    rows, columns = x.shape
+    x = torch.cat((x[m + 1 : 2 * m + 1], x, x[rows - 2 * m - 1 : rows - m - 1]))
+    return torch.cat((x[:, columns - n :], x, x[:, :n]), 1)
+
+
+def _tiles(x: Tensor, size: Grid, step: Grid) -> Tensor:
+    """(H, W) to (tiles, rows columns), overlapping where ``size`` is larger than ``step``."""
+    return x.unfold(0, size[0], step[0]).unfold(1, size[1], step[1]).flatten(2).flatten(0, 1)
+
+
+def _near(tile: Grid, window: Grid, device: torch.device) -> Tensor:
+    """(n, m) whether a key of a tile's span lies in the window of a query."""
+    axes = []
+    for size, reach in zip(tile, window, strict=True):
+        offset = torch.arange(size + reach - 1, device=device) - torch.arange(size, device=device)[:, None]
+        axes.append((offset >= 0) & (offset < reach))
+    return (axes[0][:, None, :, None] & axes[1][None, :, None, :]).flatten(2).flatten(0, 1)

@@ -1,0 +1,292 @@
+"""Checkpoints: what is written comes back, and nothing else is taken for one."""
+
+import json
+import os
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from lidar_synth.checkpoint import FORMAT, VELOCITY, Header, Part, load_checkpoint, read_header, save_checkpoint
+from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
+from lidar_synth.nets import build_network
+from lidar_synth.normalize import NORMALISATIONS
+from lidar_synth.sensor import Sensor
+
+SENSOR = Sensor("small", columns=32, range_min=1.0, range_max=80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+ARGUMENTS: dict[str, Any] = {
+    "resolution": [8, 32],
+    "channels": 7,
+    "width": 16,
+    "time_width": 8,
+    "depths": [1, 1],
+    "heads": [2, 2],
+}
+HEADER = Header(
+    networks={VELOCITY: Part("hdit", ARGUMENTS)},
+    sensor=SENSOR,
+    normalisation=NORMALISATIONS["r2flow"],
+    channels=("range", "reflectance", "label"),
+    time_grid=(1.0, 0.86, 0.58, 0.22, 0.0),
+    provenance={"data": "town", "data_licence": "MIT", "licence": "MIT", "metrics": {"jsd": 0.1}},
+    conditioning={"semantic": {"classes": 19}},
+)
+
+
+def network(seed: int = 0) -> nn.Module:
+    torch.manual_seed(seed)
+    net = build_network("hdit", ARGUMENTS | {"angles": torch.from_numpy(SENSOR.ray_angles())})
+    for parameter in net.parameters():
+        nn.init.normal_(parameter)
+    return net
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "model.safetensors"
+    save_checkpoint(path, HEADER, {VELOCITY: network()})
+    return path
+
+
+def rewrite(path: Path, **changes: Any) -> None:
+    """Change keys of the header (None = take out) without touching anything else."""
+    content = path.read_bytes()
+    size = struct.unpack("<Q", content[:8])[0]
+    outer = json.loads(content[8 : 8 + size])
+    header = json.loads(outer["__metadata__"]["lidar_synth"]) | changes
+    outer["__metadata__"]["lidar_synth"] = json.dumps({k: v for k, v in header.items() if v is not None})
+    text = json.dumps(outer).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + size :])
+
+
+def replace_weights(path: Path, change: Any) -> None:
+    """Save other weights under a header that knows nothing of it but their sum, as a careless tool would."""
+    from lidar_synth.checkpoint import _sum
+
+    tensors = load_file(path)
+    change(tensors)
+    save_file(tensors, path, {"lidar_synth": json.dumps({**HEADER.to_dict(), "weights": _sum(tensors)})})
+
+
+def test_everything_comes_back(saved: Path) -> None:
+    header, networks, digest = load_checkpoint(saved)
+    assert header == HEADER
+    original = network()
+    assert all(torch.equal(v, original.state_dict()[k]) for k, v in networks[VELOCITY].state_dict().items())
+    y = torch.randn(1, 7, 8, 32)
+    with torch.no_grad():
+        assert torch.equal(networks[VELOCITY](y, 0.5), original.eval()(y, 0.5))
+    assert not networks[VELOCITY].training
+    assert read_header(saved) == (HEADER, digest)
+    assert [p.name for p in saved.parent.iterdir()] == [saved.name]
+
+
+def test_the_same_content_is_the_same_bytes_and_hash(saved: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.safetensors"
+    digest = save_checkpoint(again, HEADER, {VELOCITY: network()})
+    assert again.read_bytes() == saved.read_bytes()
+    assert digest == load_checkpoint(saved).hash
+    other_weights = save_checkpoint(again, HEADER, {VELOCITY: network(1)})
+    other_grid = save_checkpoint(again, replace(HEADER, time_grid=(1.0, 0.0)), {VELOCITY: network()})
+    assert len({digest, other_weights, other_grid}) == 3
+
+
+def test_a_loaded_checkpoint_saves_to_the_same_bytes(saved: Path, tmp_path: Path) -> None:
+    header, networks, digest = load_checkpoint(saved)
+    assert save_checkpoint(tmp_path / "copy.safetensors", header, networks) == digest
+    assert (tmp_path / "copy.safetensors").read_bytes() == saved.read_bytes()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_halves_the_parameters_only(saved: Path, tmp_path: Path, dtype: torch.dtype) -> None:
+    path = tmp_path / "half.safetensors"
+    save_checkpoint(path, HEADER, {VELOCITY: network()}, dtype)
+    assert path.stat().st_size < 0.7 * saved.stat().st_size
+    half, whole = load_checkpoint(path).networks[VELOCITY], load_checkpoint(saved).networks[VELOCITY]
+    assert {t.dtype for t in half.state_dict().values()} == {torch.float32}
+    for (name, a), b in zip(half.named_parameters(), whole.parameters(), strict=True):
+        assert torch.equal(a, b.to(dtype).float()), name
+    assert all(torch.equal(a, b) for a, b in zip(half.buffers(), whole.buffers(), strict=True))
+
+
+# --- files that are no checkpoint of this version ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.999])
+def test_a_truncated_file(saved: Path, share: float) -> None:
+    content = saved.read_bytes()
+    saved.write_bytes(content[: int(share * len(content))])
+    for read in (load_checkpoint, read_header):
+        with pytest.raises(DataError, match=r"model.safetensors is cut, damaged or no .safetensors file"):
+            read(saved)
+
+
+def test_a_flipped_bit_in_a_weight(saved: Path) -> None:
+    content = bytearray(saved.read_bytes())
+    content[-1000] ^= 1
+    saved.write_bytes(content)
+    with pytest.raises(DataError, match="do not have the sum in the header"):
+        load_checkpoint(saved)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "lidar-synth-checkpoint/2"}, f"format 'lidar-synth-checkpoint/2'; expected '{FORMAT}'"),
+        ({"format": None}, "format None"),
+        ({"convention": "t=0 noise"}, "convention 't=0 noise'"),
+        ({"label_encoding": "one-hot"}, "label_encoding 'one-hot'"),
+        ({"colour": "red"}, r"header keys \['colour'\]"),
+        ({"sensor": None}, "a header without 'sensor'"),
+        ({"sensor": {"name": "x"}}, "sensor"),
+        ({"sensor": SENSOR.to_dict() | {"columns": 64}}, "a network for .7, 8, 32. channels, rows and columns"),
+        ({"normalisation": {"kind": "cubic"}}, "normalisation|header that does not fit"),
+        ({"channels": ["range"]}, "a network for"),
+        ({"channels": ["range", "colour"]}, "colour"),
+        ({"time_grid": [1.0, 0.5]}, "time grid"),
+        ({"time_grid": [1.0, 0.2, 0.6, 0.0]}, "time grid"),
+        ({"provenance": {"data": "town"}}, "without data_licence, licence"),
+        ({"networks": {}}, "networks"),
+        ({"networks": {VELOCITY: {"architecture": "vgg", "arguments": {}}}}, "architecture 'vgg'"),
+        ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"a": 1}}}}, "'a'"),
+        ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"width": 32}}}}, "other shapes"),
+        ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"depths": [1, 2]}}}}, "missing"),
+        ({"networks": [1]}, "header that does not fit"),
+        ({"weights": None}, "do not have the sum"),
+    ],
+    ids=str,
+)
+def test_a_header_that_is_not_ours(saved: Path, changes: dict[str, Any], message: str) -> None:
+    rewrite(saved, **changes)
+    with pytest.raises(DataError, match=message) as caught:
+        load_checkpoint(saved)
+    assert str(saved) in str(caught.value)
+
+
+def test_weights_without_a_header(tmp_path: Path) -> None:
+    path = tmp_path / "weights.safetensors"
+    save_file({"a": torch.zeros(2)}, path)
+    with pytest.raises(DataError, match="no header of lidar_synth"):
+        load_checkpoint(path)
+
+
+def test_a_pickle_is_never_loaded(tmp_path: Path) -> None:
+    path, trace = tmp_path / "model.pth", tmp_path / "ran"
+    for new_format in (True, False):
+        torch.save(Evil(trace), path, _use_new_zipfile_serialization=new_format)
+        for read in (load_checkpoint, read_header):
+            with pytest.raises(DataError, match=r"is a PyTorch pickle.*lidar-synth import .*model\.pth OUT"):
+                read(path)
+    assert not trace.exists()
+
+
+class Evil:
+    """Leaves a trace where it is unpickled."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.trace),)
+
+
+def test_keys_and_shapes_have_to_fit_exactly(saved: Path) -> None:
+    def rename(tensors: dict[str, Tensor]) -> None:
+        tensors[f"{VELOCITY}.spare"] = tensors.pop(f"{VELOCITY}.norm.weight")
+
+    def cut(tensors: dict[str, Tensor]) -> None:
+        tensors[f"{VELOCITY}.norm.weight"] = tensors[f"{VELOCITY}.norm.weight"][:-1]
+
+    def add(tensors: dict[str, Tensor]) -> None:
+        tensors["codec.weight"] = torch.zeros(1)
+
+    def add_inside(tensors: dict[str, Tensor]) -> None:
+        tensors[f"{VELOCITY}.spare"] = torch.zeros(1)
+
+    def spoil(tensors: dict[str, Tensor]) -> None:
+        tensors[f"{VELOCITY}.norm.weight"][3] = torch.nan
+
+    content = saved.read_bytes()
+    for change, message in (
+        (rename, r"missing keys \['norm.weight'\] and unexpected keys \['spare'\]"),
+        (cut, r"other shapes: norm.weight \(15,\) for \(16,\)"),
+        (add_inside, r"missing keys \[\] and unexpected keys \['spare'\]"),
+        (add, r"tensors \['codec.weight'\]"),
+        (spoil, r"NaN or infinity in \['velocity.norm.weight'\]"),
+    ):
+        saved.write_bytes(content)
+        replace_weights(saved, change)
+        with pytest.raises(DataError, match=message):
+            load_checkpoint(saved)
+
+
+def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.safetensors", tmp_path):
+        with pytest.raises(FileError, match="cannot be read"):
+            load_checkpoint(path)
+
+
+# --- what is not written -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "networks", "message"),
+    [
+        (HEADER, {}, "networks"),
+        (HEADER, {VELOCITY: network(), "codec": network()}, "networks"),
+        (HEADER, {VELOCITY: nn.Linear(2, 2)}, "missing keys"),
+        (replace(HEADER, provenance=HEADER.provenance | {"jsd": float("nan")}), {VELOCITY: network()}, "JSON"),
+        (replace(HEADER, provenance=HEADER.provenance | {"path": Path("x")}), {VELOCITY: network()}, "JSON"),
+    ],
+    ids=["none", "too many", "another", "nan", "path"],
+)
+def test_what_does_not_fit_is_not_written(
+    tmp_path: Path, header: Header, networks: dict[str, nn.Module], message: str
+) -> None:
+    with pytest.raises(LidarSynthError, match=message):
+        save_checkpoint(tmp_path / "model.safetensors", header, networks)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_weights_that_are_not_finite_do_not_replace_good_ones(saved: Path) -> None:
+    before, broken = saved.read_bytes(), network()
+    next(broken.parameters()).data[0] = torch.inf
+    with pytest.raises(DataError, match="NaN or infinity"):
+        save_checkpoint(saved, HEADER, {VELOCITY: broken})
+    assert saved.read_bytes() == before
+
+
+def test_a_forgotten_sensor_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"NaN or infinity in \['velocity.angles.cells'\]"):
+        save_checkpoint(tmp_path / "model.safetensors", HEADER, {VELOCITY: build_network("hdit", ARGUMENTS)})
+
+
+def test_a_place_that_cannot_be_written(tmp_path: Path, saved: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "taken.safetensors").mkdir()
+    for path in (tmp_path / "file" / "model.safetensors", tmp_path / "taken.safetensors"):
+        with pytest.raises(FileError, match="cannot be written"):
+            save_checkpoint(path, HEADER, {VELOCITY: network()})
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", saved.name, "taken.safetensors"]
+
+
+def test_a_full_disk_leaves_the_old_checkpoint(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    before = saved.read_bytes()
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(FileError, match="No space left on device"):
+        save_checkpoint(saved, HEADER, {VELOCITY: network(1)})
+    assert saved.read_bytes() == before
+    assert [p.name for p in saved.parent.iterdir()] == [saved.name]
+
+
+def test_other_names_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"ends in \.safetensors"):
+        save_checkpoint(tmp_path / "model.pth", HEADER, {VELOCITY: network()})

@@ -1,0 +1,330 @@
+"""HDiT: the attention against its definition, the network against R2Flow's own numbers and against its symmetries."""
+
+import copy
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.torch import load_file
+from torch import Tensor
+
+from lidar_synth.checkpoint import Part
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.importers.r2flow import POSITIONS as PEER_POSITIONS
+from lidar_synth.importers.r2flow import convert
+from lidar_synth.nets import NETWORKS, attention, build_network, layers
+from lidar_synth.nets.attention import neighbourhood, neighbourhood_attention
+from lidar_synth.nets.hdit import HDiT
+from lidar_synth.nets.positions import BASES, POSITIONS, AnglePosition
+from lidar_synth.nets.transformer import from_patches, to_patches
+
+SMALL: dict[str, Any] = {"resolution": (8, 64), "width": 16, "time_width": 16, "depths": (1, 1, 1), "heads": (2, 4, 4)}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Small networks gain nothing from more threads, and wait for each other on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def angles(rows: int, columns: int) -> Tensor:
+    """Elevation falling and azimuth rising over a grid."""
+    grid = torch.meshgrid(torch.linspace(0.05, -0.4, rows), torch.linspace(-3.1, 3.1, columns), indexing="ij")
+    return torch.stack(grid)
+
+
+def network(seed: int = 0, **arguments: Any) -> HDiT:
+    """A small network all of whose weights count (fresh ones leave every residual layer at zero)."""
+    torch.manual_seed(seed)
+    net = HDiT(**{**SMALL, "angles": angles(*arguments.get("resolution", SMALL["resolution"])), **arguments})
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    return net.eval()
+
+
+def distance(a: Tensor, b: Tensor) -> float:
+    """Relative in the l2 norm."""
+    return float((a - b).detach().norm() / b.norm())
+
+
+def by_definition(q: Tensor, k: Tensor, v: Tensor, grid: tuple[int, int], window: tuple[int, int]) -> Tensor:
+    """Neighbourhood attention, one token after the other."""
+    out = torch.empty_like(v)
+    for row in range(grid[0]):
+        top = min(max(row - window[0] // 2, 0), grid[0] - window[0])
+        for column in range(grid[1]):
+            columns = [(column + d) % grid[1] for d in range(-(window[1] // 2), window[1] // 2 + 1)]
+            keys = [r * grid[1] + c for r in range(top, top + window[0]) for c in columns]
+            token = row * grid[1] + column
+            weights = torch.einsum("bhd,bnhd->bnh", q[:, token], k[:, keys]).softmax(1)
+            out[:, token] = torch.einsum("bnh,bnhd->bhd", weights, v[:, keys])
+    return out
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    grid=st.tuples(st.integers(3, 9), st.integers(4, 24)),
+    window=st.tuples(st.sampled_from([1, 3, 5]), st.sampled_from([1, 3, 9])),
+    tile=st.tuples(st.integers(1, 4), st.integers(1, 16)),
+    seed=st.integers(0, 1000),
+)
+def test_neighbourhood_attention_is_exact(
+    grid: tuple[int, int], window: tuple[int, int], tile: tuple[int, int], seed: int
+) -> None:
+    window = (min(window[0], (grid[0] - 1) // 2 * 2 + 1), window[1])
+    torch.manual_seed(seed)
+    q, k, v = torch.randn(3, 2, grid[0] * grid[1], 2, 4, dtype=torch.float64)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(attention, "TILE", tile)
+        near = neighbourhood(grid, window, q.device, q.dtype)
+    torch.testing.assert_close(neighbourhood_attention(q, k, v, near), by_definition(q, k, v, grid, window))
+
+
+def test_every_query_sees_its_whole_window() -> None:
+    near = neighbourhood((4, 12), (3, 9), torch.device("cpu"), torch.float32)
+    assert ((near.mask == 0).sum(1) == 27).all()
+    assert near.tokens.flatten().sort().values.tolist() == list(range(48))
+
+
+@settings(deadline=None, max_examples=30)
+@given(rows=st.integers(1, 4), columns=st.integers(1, 4), patch=st.tuples(st.integers(1, 3), st.integers(1, 4)))
+def test_patches_come_back(rows: int, columns: int, patch: tuple[int, int]) -> None:
+    resolution = (rows * patch[0], columns * patch[1])
+    x = torch.randn(2, *resolution, 3)
+    assert torch.equal(from_patches(to_patches(x, patch), patch, resolution), x)
+
+
+# --- R2Flow's numbers -------------------------------------------------------------------------------------------
+
+
+def read_golden(folder: Path, name: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    return json.loads((folder / f"{name}.json").read_text()), load_file(folder / f"{name}.safetensors")
+
+
+def golden_network(folder: Path, name: str) -> tuple[HDiT, dict[str, Tensor], float]:
+    """A golden network through the importer, its tensors, and the tolerance of its numbers."""
+    about, tensors = read_golden(folder, name)
+    config = about["config"]
+    arguments = {
+        "resolution": config["resolution"],
+        "channels": config["in_channels"],
+        "width": config["base_channels"],
+        "time_width": config["temb_channels"],
+        "depths": config["num_residual_blocks"],
+        "heads": config["attn_num_heads"],
+        "position": PEER_POSITIONS[config["coords_encoding"]],
+    }
+    weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}
+    net = convert(weights, Part("hdit", arguments))
+    assert isinstance(net, HDiT)
+    assert sum(p.numel() for p in net.parameters()) == about["parameters"]
+    return net, tensors, about["sensitivity"]["suggested_rel_l2_tolerance"]
+
+
+TINY = ("r2flow_hdit_tiny_learnable", "r2flow_hdit_tiny_fourier")
+
+
+@pytest.mark.parametrize("grad", [False, True], ids=["inference", "training"])
+@pytest.mark.parametrize("name", TINY)
+def test_golden_velocities(golden: Path, name: str, grad: bool) -> None:
+    """v(y, t) = -u(1 - t, y): the peer's t = 0 is noise and its velocity points to the data."""
+    net, tensors, tolerance = golden_network(golden, name)
+    with torch.set_grad_enabled(grad):
+        assert distance(-net(tensors["input.x"], 1 - tensors["input.t"]), tensors["output"]) < tolerance
+        one = -net(tensors["input.x"][:1], 1 - tensors["input.t_scalar"])
+    assert distance(one, tensors["output_scalar_t"]) < tolerance
+
+
+@pytest.mark.parametrize("name", TINY)
+@torch.no_grad()
+def test_golden_intermediate_results(golden: Path, name: str) -> None:
+    net, tensors, tolerance = golden_network(golden, name)
+    taps = {}
+    net.down[0][-1].register_forward_hook(lambda _, __, out: taps.update(down_level_0=out))
+    net.middle[-1].register_forward_hook(lambda _, __, out: taps.update(mid=out))
+    net.tokenize.register_forward_hook(lambda _, __, out: taps.update(tokens=out))
+    net.time.register_forward_hook(lambda _, __, out: taps.update(time_embedding=out))
+    net.position.register_forward_hook(lambda _, __, out: taps.update(spatial_embedding=out))
+    net(tensors["input.x"], 1 - tensors["input.t"])
+    assert len(taps) == 5
+    for tap, value in taps.items():
+        expected = tensors[f"tap.{tap}"]
+        assert distance(value.reshape(expected.shape), expected) < tolerance, tap
+
+
+@pytest.mark.parametrize("name", TINY)
+@torch.no_grad()
+def test_golden_sampling(golden: Path, name: str) -> None:
+    """Euler steps in our time, downwards, pass through the peer's states."""
+    net = golden_network(golden, name)[0]
+    about, tensors = read_golden(golden, "r2flow_sampling")
+    tolerance = max(1e-5, 20 * about["models"][name]["f32_vs_f64"]["rel_l2"])
+    states, velocities = tensors[f"{name}/states"], tensors[f"{name}/velocities"]
+    times = 1 - tensors[f"{name}/input.grid"]
+    y = tensors[f"{name}/input.x0"]
+    for i in range(len(times) - 1):
+        v = net(y, times[i])
+        assert distance(-v, velocities[i]) < tolerance
+        y = y + (times[i + 1] - times[i]) * v
+        assert distance(y, states[i + 1]) < tolerance
+    assert distance(y, tensors[f"{name}/output"]) < tolerance
+
+
+@pytest.mark.parametrize("grid", ["polar", "hdl64e"])
+@pytest.mark.parametrize("basis", sorted(BASES))
+@torch.no_grad()
+def test_golden_positions(golden: Path, basis: str, grid: str) -> None:
+    about, tensors = read_golden(golden, "r2flow_positions")
+    config, coords = about["config"], tensors[f"input.coords_{grid}"][0]
+    expected = tensors[f"basis.{basis}/{grid}"][0].movedim(0, -1)
+    torch.testing.assert_close(BASES[basis](coords), expected, rtol=1e-5, atol=2e-6)
+    position = AnglePosition(basis, config["resolution"], config["dim"], config["mlp_ratio"], config["mapping_depth"])
+    peer = f"weights.{basis}/spatial_pe."
+    names = {"linear.weight": "0.linear.weight", "mapping.norms.0.weight": "1.0.scale"}
+    names |= {"mapping.norms.3.weight": "1.3.scale"}
+    for i in (1, 2):
+        names[f"mapping.norms.{i}.weight"] = f"1.{i}.norm.scale"
+        names[f"mapping.layers.{i - 1}.expand.weight"] = f"1.{i}.gegelu.weight"
+        names[f"mapping.layers.{i - 1}.contract.weight"] = f"1.{i}.linear.weight"
+    position.load_state_dict({ours: tensors[peer + theirs] for ours, theirs in names.items()})
+    assert distance(position(coords), tensors[f"output.{basis}/{grid}"][0]) < 1e-5
+
+
+def test_the_full_network_has_the_published_size() -> None:
+    with torch.device("meta"):
+        net = build_network("hdit", {"resolution": [64, 1024]})
+    assert sum(p.numel() for p in net.parameters()) == 80_908_420
+
+
+# --- what has to hold for any network --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("position", POSITIONS)
+@pytest.mark.parametrize("resolution", [(8, 64), (24, 96), (12, 80)])
+@torch.no_grad()
+def test_any_resolution_and_position(position: str, resolution: tuple[int, int]) -> None:
+    net = network(resolution=resolution, position=position, channels=7)
+    y = torch.randn(2, 7, *resolution)
+    v = net(y, torch.tensor([0.2, 0.9]))
+    assert v.shape == y.shape
+    assert v.isfinite().all()
+    for i, t in enumerate([0.2, 0.9]):
+        torch.testing.assert_close(net(y[i : i + 1], t)[0], v[i], rtol=1e-4, atol=1e-4)
+
+
+@torch.no_grad()
+def test_a_turned_scene_gives_a_turned_velocity() -> None:
+    """There is no seam: with the angles turned along, the network does not know where the image begins."""
+    net = network(position="polar_coordinates")
+    y, shift = torch.randn(1, 2, 8, 64), 16  # a coarsest token has 16 columns
+    turned = copy.deepcopy(net)
+    turned.angles.cells = net.angles.cells.roll(shift, -1)
+    torch.testing.assert_close(turned(y.roll(shift, -1), 0.5), net(y, 0.5).roll(shift, -1), rtol=1e-4, atol=1e-4)
+    assert distance(net(y.roll(shift, -1), 0.5), net(y, 0.5).roll(shift, -1)) > 1e-2
+
+
+@torch.no_grad()
+def test_pieces_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    net, y = network(), torch.randn(3, 2, 8, 64)
+    whole = net(y, 0.5)
+    monkeypatch.setattr(layers, "PIECE", 2000)
+    assert layers.piece_length(y, 100, 300) < 10
+    torch.testing.assert_close(net(y, 0.5), whole, rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_conditions_are_further_channels() -> None:
+    net = network(condition_channels=3)
+    y, cond = torch.randn(2, 2, 8, 64), torch.randn(2, 3, 8, 64)
+    v = net(y, 0.5, cond)
+    assert v.shape == y.shape
+    assert distance(net(y, 0.5, 2 * cond), v) > 1e-3
+    for given_, found in ((None, "no condition"), (cond[:, :2], r"\(2, 2, 8, 64\)"), (cond[:1], r"\(1, 3, 8, 64\)")):
+        with pytest.raises(DataError, match=rf"{found}.*expected \(2, 3, 8, 64\)"):
+            net(y, 0.5, given_)
+    with pytest.raises(DataError, match="takes no condition"):
+        network()(y, 0.5, cond)
+
+
+def test_states_and_times_of_another_shape_are_refused() -> None:
+    net = network()
+    for shape in ((2, 3, 8, 64), (2, 2, 8, 32), (2, 8, 64)):
+        with pytest.raises(DataError, match=r"expected \(B, 2, 8, 64\)"):
+            net(torch.zeros(shape), 0.5)
+    with pytest.raises(DataError, match=r"times of shape \(3,\) for 2 states"):
+        net(torch.zeros(2, 2, 8, 64), torch.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"resolution": (8, 60)}, r"resolution \(8, 60\).*multiples of \(4, 16\)"),
+        ({"resolution": (6, 64)}, "multiples of"),
+        ({"resolution": (8,)}, "arguments of its class"),
+        ({"heads": (2, 4)}, "heads"),
+        ({"heads": (2, 4, 5)}, "multiples of 4"),
+        ({"window": (2, 9)}, "odd"),
+        ({"window": (9, 9)}, r"window \(9, 9\) on a grid of"),
+        ({"position": "sine"}, "one of learned"),
+        ({"patch": (0, 4)}, "arguments of its class"),
+        ({"widht": 32}, "widht"),
+        ({"angles": torch.zeros(2, 8, 8)}, r"\(2, 8, 64\)"),
+    ],
+    ids=str,
+)
+def test_impossible_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build_network("hdit", SMALL | arguments)
+
+
+def test_unknown_architectures_are_refused() -> None:
+    with pytest.raises(ConfigError, match=f"'unet9'.*one of {', '.join(NETWORKS)}"):
+        build_network("unet9", {})
+
+
+@torch.no_grad()
+def test_a_forgotten_sensor_cannot_pass() -> None:
+    assert network(angles=None)(torch.randn(1, 2, 8, 64), 0.5).isnan().all()
+
+
+def test_gradient_checkpointing_gives_the_same_gradients() -> None:
+    net, y = network(), torch.randn(1, 2, 8, 64)
+    gradients = []
+    for net.gradient_checkpointing in (False, True):
+        net.zero_grad()
+        net(y, 0.3).square().mean().backward()
+        gradients.append([p.grad for p in net.parameters()])
+    assert all(g is not None and g.abs().sum() > 0 for g in gradients[0])
+    torch.testing.assert_close(gradients[1], gradients[0])
+
+
+@torch.no_grad()
+def test_half_precision_keeps_the_angles() -> None:
+    """In bfloat16 the velocity is near, and comes in the state's type; angles and harmonics are not rounded."""
+    net, y = network(), torch.randn(2, 2, 8, 64)
+    expected = net(y, 0.4)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = net(y, 0.4)
+    exact = {name: b.clone() for name, b in net.named_buffers()}
+    half = net.to(torch.bfloat16)
+    assert {p.dtype for p in half.parameters()} == {torch.bfloat16}
+    assert len(exact) == 5
+    assert all(torch.equal(b, exact[name]) for name, b in half.named_buffers())
+    for v in (mixed, half(y, 0.4)):
+        assert v.dtype == torch.float32
+        assert 1e-4 < distance(v, expected) < 0.1
+
+
+@torch.no_grad()
+def test_it_compiles_as_one_graph() -> None:
+    net, y, t = network(), torch.randn(2, 2, 8, 64), torch.tensor([0.1, 0.8])
+    compiled = torch.compile(net, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(y, t), net(y, t), rtol=1e-4, atol=1e-4)

@@ -1,0 +1,294 @@
+"""R2Flow's checkpoints: their keys, their convention, and files that are not what they seem."""
+
+import copy
+import json
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+from typer.testing import CliRunner
+
+from lidar_synth.checkpoint import VELOCITY, load_checkpoint
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.importers.r2flow import HARMONICS, block_names, convert, peer_names, read_r2flow
+from lidar_synth.nets import build_network
+from lidar_synth.nets.hdit import HDiT
+
+DEPTHS = (1, 1, 1, 1)
+CFG: dict[str, Any] = {
+    "data": {
+        "dataset": "kitti_360",
+        "data_format": "logscale",
+        "train_reflectance": True,
+        "projection": "spherical-1024",
+        "resolution": [64, 64],
+        "min_depth": 1.45,
+        "max_depth": 80.0,
+    },
+    "model": {
+        "architecture": "nat_hdit",
+        "base_channels": 16,
+        "temb_channels": 16,
+        "num_residual_blocks": list(DEPTHS),
+        "coords_encoding": "learnable_embedding",
+    },
+    "flow": {"num_sampling_steps": 32, "solver": "dopri5"},
+    "training": {"lr": 1e-4},
+    "finetuning": {"init_ckpt": None, "k_distil": None},
+}
+
+
+def peer_weights(position: str = "learned") -> dict[str, Tensor]:
+    """Random weights by the peer's names and in its shapes."""
+    torch.manual_seed(0)
+    net = build_network(
+        "hdit",
+        {"resolution": (64, 64), "width": 16, "time_width": 16, "depths": DEPTHS, "position": position,
+         "angles": torch.rand(2, 64, 64)},
+    )  # fmt: skip
+    state = net.state_dict()
+    weights = {theirs: torch.randn_like(state[ours]) for ours, theirs in peer_names(DEPTHS, position).items()}
+    weights["coords"] = state["angles.cells"][None]
+    weights["tokenizer.0.weight"] = torch.randn(16, 2, 1, 4)
+    if position == "learned":
+        weights["spatial_pe.embedding"] = torch.randn(1, 64, 16, 16)
+    for ours, theirs in block_names(DEPTHS).items():
+        level = len(DEPTHS) - 1 if ours.startswith("middle") else int(ours.split(".")[1])
+        for i, name in enumerate(HARMONICS):
+            weights[f"{theirs}.{name}"] = state[f"rotary.{level}.harmonics"][i].clone()
+    return weights
+
+
+def write(path: Path, weights: dict[str, Tensor], cfg: dict[str, Any] = CFG) -> Path:
+    """A file as the peer's training writes it, with what a sampler does not need."""
+    optimizer = {"state": {0: {"step": 1, "exp_avg": torch.zeros(3)}}, "param_groups": [{"lr": 1e-4}]}
+    torch.save({"cfg": cfg, "weights": weights, "optimizer": optimizer, "lr_scheduler": {}, "num_images": 96}, path)
+    return path
+
+
+@pytest.fixture
+def released(tmp_path: Path) -> Path:
+    return write(tmp_path / "r2flow-kitti360-1rf.pth", peer_weights())
+
+
+def change(**groups: dict[str, Any]) -> dict[str, Any]:
+    """The configuration with some of its values replaced."""
+    cfg = copy.deepcopy(CFG)
+    for group, values in groups.items():
+        cfg[group] |= values
+    return cfg
+
+
+def test_the_header_says_what_the_peer_does(released: Path) -> None:
+    header, _ = read_r2flow(released)
+    assert header.channels == ("range", "reflectance")
+    assert (header.normalisation.kind, header.normalisation.range_min, header.normalisation.range_max) == (
+        "log",
+        1.45,
+        80.0,
+    )
+    assert header.sensor.shape == (64, 64)
+    assert (header.sensor.up, header.sensor.down) == (3.0, -25.0)
+    assert len(header.time_grid) == 33
+    assert header.provenance["data"] == "KITTI-360"
+    assert header.provenance["images"] == 96
+    json.dumps(header.to_dict())
+
+
+@pytest.mark.parametrize(
+    ("cfg", "expected"),
+    [
+        (change(finetuning={"k_distil": 4}), {"time_grid": (1.0, 0.75, 0.5, 0.25, 0.0)}),
+        (change(data={"dataset": "kitti_raw"}), {"sensor.name": "hdl64e_kitti"}),
+        (change(data={"data_format": "metric"}), {"normalisation.kind": "linear"}),
+        (change(data={"projection": "unfolding-1024"}), {"sensor.name": "hdl64e_kitti360/beams"}),
+    ],
+    ids=["distilled", "kitti raw", "metric", "unfolded"],
+)
+def test_other_configurations(tmp_path: Path, cfg: dict[str, Any], expected: dict[str, Any]) -> None:
+    header, _ = read_r2flow(write(tmp_path / "other.pth", peer_weights(), cfg))
+    for name, value in expected.items():
+        found: Any = header
+        for part in name.split("."):
+            found = getattr(found, part)
+        assert found == value
+
+
+@torch.no_grad()
+def test_time_and_sign_are_folded_into_the_weights(released: Path) -> None:
+    weights = peer_weights()
+    net = read_r2flow(released)[1][VELOCITY]
+    assert isinstance(net, HDiT)
+    for t in (0.0, 0.3, 1.0):
+        turn = 2 * math.pi * weights["timestep_pe.0.freqs"].double() * (1 - t)
+        features = torch.cat((turn.cos(), turn.sin())).float()
+        expected = net.time.mapping(features @ weights["timestep_pe.0.linear.weight"].T)
+        torch.testing.assert_close(net.time(torch.tensor([t]))[0], expected, rtol=1e-4, atol=1e-4)
+    assert torch.equal(net.detokenize.weight, -weights["detokenizer.1.weight"])
+
+
+def test_all_keys_of_the_released_network(golden: Path, tmp_path: Path) -> None:
+    """80.9 M parameters by name and shape; one number stands for each tensor, so that the file stays small."""
+    published = json.loads((golden / "r2flow_hdit_full_keys.json").read_text())
+    weights = {key: torch.zeros(1).expand(shape) for key, shape, _, _ in published["keys"]}
+    path = write(tmp_path / "full.pth", weights, published["checkpoint"]["cfg_defaults"])
+    assert path.stat().st_size < 1 << 20
+    header, networks = read_r2flow(path)
+    assert sum(p.numel() for p in networks[VELOCITY].parameters()) == published["parameters"]
+    assert header.sensor.name == "hdl64e_kitti360"
+    assert header.sensor.shape == (64, 1024)
+
+
+def test_golden_through_file_and_checkpoint(golden: Path, tmp_path: Path) -> None:
+    """.pth -> import -> checkpoint -> network gives the peer's own numbers."""
+    name = "r2flow_hdit_tiny_learnable"
+    about = json.loads((golden / f"{name}.json").read_text())
+    tensors, config = load_file(golden / f"{name}.safetensors"), about["config"]
+    weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}
+    model = {key: config[key] for key in ("base_channels", "temb_channels", "num_residual_blocks", "coords_encoding")}
+    path = write(tmp_path / "tiny.pth", weights, change(data={"resolution": config["resolution"]}, model=model))
+    out = tmp_path / "tiny.safetensors"
+    result = run_import(path, out)
+    assert result.exit_code == 0, result.output
+    header, networks, digest = load_checkpoint(out)
+    assert digest in result.output
+    assert header.sensor.shape == (16, 128)
+    with torch.no_grad():
+        velocity = -networks[VELOCITY](tensors["input.x"], 1 - tensors["input.t"])
+    error = float((velocity - tensors["output"]).norm() / tensors["output"].norm())
+    assert error < about["sensitivity"]["suggested_rel_l2_tolerance"]
+
+
+def run_import(path: Path, out: Path, *options: str) -> Any:
+    import typer
+
+    from lidar_synth.cli.import_ import import_
+
+    app = typer.Typer()
+    app.command()(import_)
+    return CliRunner().invoke(app, [str(path), str(out), *options])
+
+
+def test_the_command_refuses_unknown_peers(released: Path, tmp_path: Path) -> None:
+    result = run_import(released, tmp_path / "out.safetensors", "--peer", "nobody")
+    assert isinstance(result.exception, ConfigError)
+    assert "one of r2flow" in str(result.exception)
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+# --- files that do not fit -----------------------------------------------------------------------------------------
+
+
+def drop(weights: dict[str, Tensor]) -> None:
+    del weights["up_levels.expand_1.alpha"]
+
+
+def add(weights: dict[str, Tensor]) -> None:
+    weights["label_head.weight"] = torch.zeros(2)
+
+
+def reshape(weights: dict[str, Tensor]) -> None:
+    weights["detokenizer.0.scale"] = torch.zeros(8)
+
+
+def retune(weights: dict[str, Tensor]) -> None:
+    weights["up_levels.level_0.0.residual_attn.rope.freqs_w"] = torch.ones(2, 2)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (drop, r"missing keys \['up_levels.expand_1.alpha'\], unexpected keys \[\]"),
+        (add, r"missing keys \[\], unexpected keys \['label_head.weight'\]"),
+        (reshape, r"other shapes: norm.weight \(8,\) for \(16,\)"),
+        (retune, "up_levels.level_0.0 has other rotary harmonics"),
+    ],
+)
+def test_weights_that_do_not_fit(tmp_path: Path, spoil: Callable[[dict[str, Tensor]], None], message: str) -> None:
+    weights = peer_weights()
+    spoil(weights)
+    path = write(tmp_path / "other.pth", weights)
+    with pytest.raises(DataError, match=message) as caught:
+        read_r2flow(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("cfg", "message"),
+    [
+        (change(model={"architecture": "adm_unet"}), "'adm_unet'.*expected nat_hdit"),
+        (change(model={"coords_encoding": None}), "coords_encoding None"),
+        (change(data={"data_format": "cartesian"}), "'cartesian'.*one of logscale"),
+        (change(data={"dataset": "nuscenes"}), "'nuscenes'"),
+        (change(data={"resolution": [64, 72]}), "resolution"),
+        ({"data": CFG["data"]}, "without 'model'"),
+    ],
+    ids=["architecture", "position", "format", "dataset", "resolution", "groups"],
+)
+def test_configurations_that_do_not_fit(tmp_path: Path, cfg: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        read_r2flow(write(tmp_path / "other.pth", peer_weights(), cfg))
+
+
+def test_fourier_features_have_to_be_octaves() -> None:
+    from lidar_synth.checkpoint import Part
+
+    weights = peer_weights("fourier_features")
+    octaves = torch.tensor([[2.0**i, 0.0] for i in range(6)] + [[0.0, 2.0**i] for i in range(4)])
+    weights["spatial_pe.0.embedding.freqs"] = octaves[..., None, None]
+    weights["spatial_pe.0.embedding.phase"] = torch.zeros(10)
+    arguments = {
+        "resolution": [64, 64],
+        "width": 16,
+        "time_width": 16,
+        "depths": list(DEPTHS),
+        "position": "fourier_features",
+    }
+    convert(weights, Part("hdit", arguments))
+    weights["spatial_pe.0.embedding.phase"][2] = 0.5
+    with pytest.raises(DataError, match="octaves"):
+        convert(weights, Part("hdit", arguments))
+
+
+class Evil:
+    """Leaves a trace where it is unpickled."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.trace),)
+
+
+def test_code_in_a_pickle_does_not_run(tmp_path: Path) -> None:
+    trace, path = tmp_path / "ran", tmp_path / "evil.pth"
+    torch.save({"cfg": CFG, "weights": Evil(trace)}, path)
+    with pytest.raises(DataError, match=r"calls for \w+\.mkdir .*was not loaded"):
+        read_r2flow(path)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.9])
+def test_a_truncated_file(released: Path, share: float) -> None:
+    content = released.read_bytes()
+    released.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(DataError, match="is cut, damaged or no .pth file"):
+        read_r2flow(released)
+
+
+@pytest.mark.parametrize("content", [[1, 2], {"state_dict": {}}, {"cfg": CFG}], ids=["list", "other", "no weights"])
+def test_a_pickle_of_something_else(tmp_path: Path, content: Any) -> None:
+    torch.save(content, tmp_path / "other.pth")
+    with pytest.raises(DataError, match="cfg and weights"):
+        read_r2flow(tmp_path / "other.pth")
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="cannot be read"):
+        read_r2flow(tmp_path / "none.pth")
