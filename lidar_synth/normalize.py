@@ -4,6 +4,7 @@ encode and decode are exact inverses up to float32 rounding for every range insi
 (range_min, range_max); everything outside decodes to 0 = no return.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -12,6 +13,8 @@ import torch
 
 from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.scan import RangeImage
+from lidar_synth.sensor import Sensor
 
 LABEL_BITS = 5
 NO_LABEL = len(NAMES)
@@ -136,3 +139,99 @@ def decode_labels(bits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     nearest = torch.einsum("bchw,ck->bkhw", bits, corners).argmax(1)
     gap = (bits - corners[:, nearest].movedim(0, 1)).abs().amax(1)
     return codes[nearest].to(torch.uint8), (1 - gap).clamp(0, 1).float()
+
+
+CHANNELS = {"range": 1, "reflectance": 1, "label": LABEL_BITS}
+"""What a network's tensor can hold: {channel of a range image: channels of the tensor}."""
+
+
+@dataclass(frozen=True)
+class TensorFormat:
+    """Which channels of a range image stand, one after the other, in a network's tensor, and in which scale.
+
+    Args:
+        channels: names of ``CHANNELS``, in the tensor's order; "range" is one of them.
+        normalisation: of the range.
+
+    Raises:
+        ConfigError: on an unknown or repeated channel, or where "range" is missing.
+    """
+
+    channels: tuple[str, ...]
+    normalisation: Normalisation
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "channels", tuple(self.channels))
+        unknown = [name for name in self.channels if name not in CHANNELS]
+        if unknown or "range" not in self.channels or len(set(self.channels)) < len(self.channels):
+            raise ConfigError(f"channels {self.channels}", f"range and some of {tuple(CHANNELS)}, each once")
+
+    @property
+    def size(self) -> int:
+        """C, channels of the tensor."""
+        return sum(CHANNELS[name] for name in self.channels)
+
+    def encode(self, fields: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Fields of range images to a tensor.
+
+        Args:
+            fields: (B, H, W) each: "range" float32 metres, 0 = no return; "reflectance" float32 in [0, 1];
+                "label" uint8 train ids, 255 = ignore; more than ``channels`` do no harm.
+
+        Returns:
+            (B, C, H, W) float32 in [-1, 1].
+
+        Raises:
+            ConfigError: where a channel is missing.
+            DataError: on a label that is no train id.
+        """
+        if missing := [name for name in self.channels if name not in fields]:
+            raise ConfigError(f"range images without {missing}", f"all of {self.channels}")
+        encoders = {
+            "range": lambda d: self.normalisation.encode(d)[:, None],
+            "reflectance": lambda r: encode_reflectance(r)[:, None],
+            "label": encode_labels,
+        }
+        return torch.cat([encoders[name](fields[name]) for name in self.channels], 1)
+
+    def decode(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        """A tensor to the fields of range images; without a return, a cell has no reflectance, label or confidence.
+
+        Args:
+            x: (B, C, H, W) floating.
+
+        Returns:
+            (B, H, W) each, as for ``encode``; with "label" also "confidence" float32 in [0, 1].
+
+        Raises:
+            DataError: on another number of channels, NaN or infinity.
+        """
+        if x.ndim != 4 or x.shape[1] != self.size:
+            raise DataError(f"a tensor of shape {tuple(x.shape)}", f"(B, {self.size}, H, W) for {self.channels}")
+        if not bool(x.isfinite().all()):
+            raise DataError(f"a tensor for {self.channels} with NaN or infinity", "finite values")
+        part = dict(
+            zip(self.channels, torch.split(x.float(), [CHANNELS[name] for name in self.channels], 1), strict=True)
+        )
+        fields = {"range": self.normalisation.decode(part["range"][:, 0])}
+        empty = fields["range"] == 0
+        if "reflectance" in part:
+            fields["reflectance"] = decode_reflectance(part["reflectance"][:, 0]).masked_fill_(empty, 0)
+        if "label" in part:
+            label, confidence = decode_labels(part["label"])
+            fields["label"] = label.masked_fill_(empty, IGNORE)
+            fields["confidence"] = confidence.masked_fill_(empty, 0)
+        return fields
+
+    def from_images(self, images: Sequence[RangeImage]) -> torch.Tensor:
+        """(B, C, H, W) of B range images of one shape; see ``encode``."""
+        values: list[dict[str, Any]] = [{**image.channels, "range": image.range} for image in images]
+        if missing := [name for name in self.channels if any(name not in v for v in values)]:
+            raise ConfigError(f"range images without {missing}", f"all of {self.channels}")
+        return self.encode({n: torch.from_numpy(np.stack([v[n] for v in values])) for n in self.channels})
+
+    def to_images(self, x: torch.Tensor, sensor: Sensor) -> list[RangeImage]:
+        """B range images of a tensor (B, C, H, W) on the sensor's grid; see ``decode``."""
+        fields = {name: values.cpu().numpy() for name, values in self.decode(x).items()}
+        distance = fields.pop("range")
+        return [RangeImage(d, sensor, {n: v[i] for n, v in fields.items()}) for i, d in enumerate(distance)]

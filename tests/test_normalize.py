@@ -4,19 +4,24 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
+from conftest import random_scan
 from hypothesis import given
 from hypothesis.extra import numpy as hnp
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.normalize import (
+    CHANNELS,
     NORMALISATIONS,
     Normalisation,
+    TensorFormat,
     decode_labels,
     decode_reflectance,
     encode_labels,
     encode_reflectance,
 )
+from lidar_synth.projection import project
+from lidar_synth.sensor import presets
 
 
 @pytest.mark.parametrize("name", sorted(NORMALISATIONS))
@@ -70,3 +75,44 @@ def test_bad_input_is_refused() -> None:
         Normalisation("cubic", 1, 2)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="range_min < range_max"):
         Normalisation("log", 5, 2)
+
+
+@pytest.mark.parametrize("channels", [("range",), ("reflectance", "range"), tuple(CHANNELS)])
+def test_a_range_image_survives_the_way_to_a_tensor_and_back(channels: tuple[str, ...]) -> None:
+    sensor = presets()["town"]
+    image = project(random_scan(sensor))
+    tensors = TensorFormat(channels, NORMALISATIONS["r2flow"])
+    x = tensors.from_images([image, image])
+    assert x.shape == (2, tensors.size, 64, 1024)
+    assert x.abs().max() <= 1
+    back = tensors.to_images(x, sensor)[1]
+    assert np.allclose(back.range, image.range, rtol=2e-5)
+    for name in set(channels) - {"range"}:
+        assert np.allclose(back.channels[name], image.channels[name], atol=1e-6), name
+    assert set(back.channels) == set(channels) - {"range"} | ({"confidence"} if "label" in channels else set())
+    if "label" in channels:
+        assert np.array_equal(back.channels["confidence"], image.mask)
+
+
+def test_a_cell_without_a_return_has_no_label_reflectance_or_confidence() -> None:
+    tensors = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow"])
+    x = tensors.encode({"range": torch.full((1, 1, 2), 9.0), "reflectance": torch.full((1, 1, 2), 0.7),
+                        "label": torch.full((1, 1, 2), 3, dtype=torch.uint8)})  # fmt: skip
+    x[:, 0, 0, 1] = -0.9  # nearer than 1.45 m
+    fields = tensors.decode(x)
+    assert fields["label"].tolist() == [[[3, IGNORE]]]
+    assert fields["confidence"].tolist() == [[[1, 0]]]
+    assert fields["reflectance"].tolist() == [[[pytest.approx(0.7), 0]]]
+
+
+def test_a_tensor_that_does_not_fit_is_refused() -> None:
+    tensors = TensorFormat(("range", "reflectance"), NORMALISATIONS["r2flow"])
+    with pytest.raises(DataError, match=r"shape \(1, 3, 4, 4\); expected \(B, 2, H, W\)"):
+        tensors.decode(torch.zeros(1, 3, 4, 4))
+    with pytest.raises(DataError, match="NaN or infinity"):
+        tensors.decode(torch.full((1, 2, 4, 4), torch.nan))
+    with pytest.raises(ConfigError, match=r"without \['reflectance'\]"):
+        tensors.encode({"range": torch.zeros(1, 4, 4)})
+    for channels in (("reflectance",), ("range", "colour"), ("range", "range")):
+        with pytest.raises(ConfigError, match="range and some of"):
+            TensorFormat(channels, NORMALISATIONS["r2flow"])

@@ -10,9 +10,25 @@ from typing import Annotated
 import typer
 
 from lidar_synth import __version__
+from lidar_synth.cli.convert import convert
+from lidar_synth.cli.doctor import doctor
+from lidar_synth.cli.import_ import import_
+from lidar_synth.cli.sample import sample
+from lidar_synth.cli.town import town
+from lidar_synth.cli.train import distill, train
+from lidar_synth.cli.view import view
 from lidar_synth.errors import ConfigError, LidarSynthError
 
-COMMANDS: dict[str, Callable[..., None]] = {}
+COMMANDS: dict[str, Callable[..., None]] = {
+    "town": town,
+    "convert": convert,
+    "view": view,
+    "sample": sample,
+    "train": train,
+    "distill": distill,
+    "import": import_,
+    "doctor": doctor,
+}
 """Commands by name, in the order of the help."""
 
 app = typer.Typer(

@@ -1,0 +1,47 @@
+"""``lidar-synth sample``: scans from a model."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def sample(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
+    model: Annotated[str, typer.Option(help="a shipped model's name or a .safetensors checkpoint")] = "town",
+    count: Annotated[int, typer.Option(min=1, help="scans")] = 16,
+    seed: Annotated[int, typer.Option(min=0, help="scan i is a function of the model, the seed and i")] = 0,
+    steps: Annotated[int | None, typer.Option(min=1, help="of a uniform time grid; default: the model's own")] = None,
+    solver: Annotated[str, typer.Option(help="euler | heun")] = "euler",
+    to: Annotated[str, typer.Option(help="npz (keeps all) | kitti | semantic_kitti | range | pcd | ...")] = "npz",
+    device: Annotated[str, typer.Option(help="cpu | cuda")] = "cpu",
+    dtype: Annotated[str, typer.Option(help="float32 | bfloat16: what the network computes in")] = "float32",
+    batch: Annotated[int | None, typer.Option(min=1, help="scans at a time; bounds the memory")] = None,
+) -> None:
+    """Generates scans and writes them in any format. Run it again to go on where it stopped.
+
+    \b
+    Examples:
+      lidar-synth sample out
+      lidar-synth sample out --count 100 --seed 7 --to semantic_kitti
+      lidar-synth sample out --model runs/town_teacher/town_teacher.safetensors --steps 50
+    """
+    import torch
+    from tqdm import tqdm
+
+    from lidar_synth.formats import WRITERS
+    from lidar_synth.formats.source import choose
+    from lidar_synth.generator import load_generator
+
+    writer = choose("format", to, WRITERS)(out)
+    precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
+    generator = load_generator(model, device=device, dtype=precision, batch=batch)
+    missing = [i for i in range(count) if not writer.complete(i)]
+    with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
+        for first in range(0, len(missing), generator.batch):
+            indices = missing[first : first + generator.batch]
+            for index, scan in zip(indices, generator.scans(seed, indices, steps=steps, solver=solver), strict=True):
+                writer.write(scan, index)
+            bar.update(len(indices))
+    writer.finish()
+    typer.echo(f"{out}: {len(missing)} scans written, {count - len(missing)} were there already")

@@ -1,0 +1,47 @@
+"""``lidar-synth train`` and ``lidar-synth distill``: train a teacher, distil a student."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML, such as those in configs/")]
+Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="values to change")]
+Resume = Annotated[bool, typer.Option("--resume", help="go on where the run in the output folder stopped")]
+Minutes = Annotated[float | None, typer.Option(help="stop, saved, after so long; --resume goes on")]
+
+
+def train(config: ConfigFile, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
+    """Trains a teacher: a rectified flow from noise to scans.
+
+    The output folder gets the checkpoint, named as the folder; state.safetensors, to go on after a stop or a kill
+    with the same losses; logs for TensorBoard; and pictures of samples. torchrun runs it on several GPUs.
+
+    \b
+    Examples:
+      lidar-synth train configs/town_teacher.yaml
+      lidar-synth train configs/town_teacher.yaml --resume recipe.iterations=20000
+      lidar-synth train mine.yaml init=runs/town_teacher/town_teacher.safetensors data.path=scans
+      torchrun --nproc-per-node 8 -m lidar_synth train configs/kitti360_teacher.yaml precision=bf16
+    """
+    from lidar_synth.cli.run import run
+    from lidar_synth.config import TrainConfig, load_config
+
+    typer.echo(run(load_config(TrainConfig, config, overrides or ()), resume, minutes))
+
+
+def distill(config: ConfigFile, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
+    """Distils a student that needs few steps from a teacher.
+
+    Where the configuration gives no time grid, the timesteps are selected first.
+
+    \b
+    Examples:
+      lidar-synth distill configs/town_student.yaml
+      lidar-synth distill configs/town_student.yaml strategy=uniform_piecewise output=runs/uniform
+      lidar-synth distill configs/town_student.yaml teacher=mine.safetensors grid=[1,0.86,0.58,0.22,0]
+    """
+    from lidar_synth.cli.run import run
+    from lidar_synth.config import DistillConfig, load_config
+
+    typer.echo(run(load_config(DistillConfig, config, overrides or ()), resume, minutes))

@@ -1,0 +1,103 @@
+"""The training loop: a generator that yields one record per optimiser step, so that any engine can drive it.
+
+Teacher and student differ in the task only: what is asked of the network where (an ``Example`` for a ``Batch``).
+The caller logs, saves and stops as it likes; a ``Training`` that was saved goes on with the same losses.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, NamedTuple
+
+from lidar_synth.distill import STRATEGIES
+from lidar_synth.errors import DataError
+from lidar_synth.flow import METRICS, TIMESTEPS, Example, Velocity, flow_matching, velocity_loss
+from lidar_synth.train.data import Batch, Batches, micro_batches
+from lidar_synth.train.schedules import SCHEDULES
+from lidar_synth.train.state import Training
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+Task = Callable[[Batch], Example]
+"""What a batch is made into: at which state and time the network is trained, and on which velocity."""
+
+
+def teacher_task(timesteps: str = "uniform") -> Task:
+    """Flow matching with t from one of ``TIMESTEPS`` (Eq. 1)."""
+    return lambda batch: flow_matching(batch.y0, batch.y1, TIMESTEPS[timesteps](batch.u))
+
+
+def student_task(strategy: str, teacher: Velocity, grid: Sequence[float], steps: int) -> Task:
+    """Distillation of ``teacher`` by one of ``STRATEGIES`` on the student's ``grid`` with ``steps`` Euler steps of
+    the teacher per piece (Algorithm 1)."""
+    return lambda batch: STRATEGIES[strategy](teacher, batch.y0, batch.y1, batch.u, grid, steps, None)
+
+
+class Record(NamedTuple):
+    """What is known after a step.
+
+    Args:
+        step: steps done, from 1.
+        loss: mean over the step's samples of this process.
+        gradient: norm before clipping.
+        rate: learning rate of the step.
+        teacher_evaluations: of this process in this step, one per sample and evaluation.
+    """
+
+    step: int
+    loss: float
+    gradient: float
+    rate: float
+    teacher_evaluations: int
+
+
+def steps(training: Training, task: Task, batches: Batches, accelerator: "Accelerator") -> Iterator[Record]:
+    """Train to the end of the recipe, step by step.
+
+    Args:
+        training: the run, at its first step or as it was loaded; changed in place.
+        task: what to train on.
+        batches: the data.
+        accelerator: Accelerate's: one process or several, its precision.
+
+    Yields:
+        A record after each step; between two of them ``training`` may be saved or sampled from.
+
+    Raises:
+        DataError: where the loss or its gradient is not finite; ``training`` is left as it was before that step.
+    """
+    recipe = training.recipe
+    metric, schedule = METRICS[recipe.metric], SCHEDULES[recipe.schedule]
+    network, optimizer = accelerator.prepare(training.network, training.optimizer)
+    training.network.train()
+    while training.step < recipe.iterations:
+        rate = recipe.rate * schedule(training.step, recipe.warmup, recipe.iterations)
+        for group in training.optimizer.param_groups:
+            group["lr"] = rate
+        parts = list(micro_batches(
+            training.step, recipe.batch, recipe.accumulate, accelerator.process_index, accelerator.num_processes
+        ))  # fmt: skip
+        total, evaluations = 0.0, 0
+        for positions in parts:
+            with nullcontext() if positions is parts[-1] else accelerator.no_sync(network):
+                with accelerator.autocast():
+                    example = task(batches(positions))
+                    loss = velocity_loss(network, example, metric) / len(parts)
+                accelerator.backward(loss)
+            total += accelerator.reduce(loss.detach(), "mean").item()
+            evaluations += example.teacher_evaluations * accelerator.num_processes
+        gradient = float(accelerator.clip_grad_norm_(network.parameters(), recipe.clip))
+        if not (math.isfinite(total) and math.isfinite(gradient)):
+            optimizer.zero_grad()
+            raise DataError(
+                f"step {training.step + 1}: the loss is {total}, the norm of its gradient {gradient}",
+                "finite values",
+                "The last saved state and checkpoint are kept. Lower the rate, or train without bf16.",
+            )
+        optimizer.step()
+        optimizer.zero_grad()
+        training.step += 1
+        if training.step % recipe.ema_every == 0:
+            training.update_average()
+        yield Record(training.step, total, gradient, rate, evaluations)

@@ -1,0 +1,140 @@
+"""What a training run consists of, and how it is kept through a kill.
+
+The file is safetensors like a checkpoint, but it is for going on, not for sampling: it holds the network, the
+averaged weights, the optimiser's moments and the step. All else follows from the configuration and the step.
+"""
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.flow import METRICS
+from lidar_synth.train.schedules import SCHEDULES
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the weights are moved; the defaults are those of R2Flow's 1-RF.
+
+    Args:
+        iterations: optimiser steps in all.
+        batch: samples of a step, over all processes and micro-batches.
+        accumulate: micro-batches of a step.
+        metric: a name of ``METRICS``.
+        rate: the learning rate (AdamW) at the top of the schedule.
+        betas, weight_decay: AdamW's.
+        schedule: a name of ``SCHEDULES``.
+        warmup: steps until the rate is reached.
+        clip: largest norm of the gradient.
+        ema_decay: of the averaged weights, at each of their updates; less at the beginning.
+        ema_every: steps between these.
+
+    Raises:
+        ConfigError: on an unknown name or a number below 1.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # read where a configuration is checked
+
+    iterations: int
+    batch: int = 8
+    accumulate: int = 1
+    metric: str = "squared_l2"
+    rate: float = 1e-4
+    betas: tuple[float, float] = (0.9, 0.99)
+    weight_decay: float = 0.01
+    schedule: str = "cosine"
+    warmup: int = 10_000
+    clip: float = 1.0
+    ema_decay: float = 0.995
+    ema_every: int = 10
+
+    def __post_init__(self) -> None:
+        for key, table in (("metric", METRICS), ("schedule", SCHEDULES)):
+            if getattr(self, key) not in table:
+                raise ConfigError(f"{key} {getattr(self, key)!r}", f"one of {', '.join(table)}")
+        if min(self.iterations, self.batch, self.accumulate, self.ema_every) < 1 or not self.rate > 0:
+            raise ConfigError(f"{self}", "iterations, batch, accumulate, ema_every of at least 1 and a rate above 0")
+
+
+class Training:
+    """What a run consists of between two steps: the network, its averaged twin, the optimiser, the step.
+
+    Args:
+        network: the velocity network, on its device.
+        recipe: how it is trained.
+    """
+
+    def __init__(self, network: nn.Module, recipe: Recipe) -> None:
+        self.network = network
+        self.recipe = recipe
+        self.average = copy.deepcopy(network).eval().requires_grad_(False)
+        self.optimizer = torch.optim.AdamW(
+            network.parameters(), recipe.rate, recipe.betas, weight_decay=recipe.weight_decay
+        )
+        self.step = 0
+
+    def update_average(self) -> None:
+        """Move the averaged weights towards the network's."""
+        updates = self.step // self.recipe.ema_every
+        # The start is forgotten soon: an average over few steps follows at once.
+        keep = min(self.recipe.ema_decay, (1 + updates) / (10 + updates))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - keep)
+
+    def save(self, path: Path) -> None:
+        """Write all of it beside ``path``, then rename.
+
+        Raises:
+            FileError: where it cannot be written.
+        """
+        tensors = {f"network.{n}": p for n, p in self.network.state_dict().items()}
+        tensors |= {f"average.{n}": p for n, p in self.average.state_dict().items()}
+        for i, moments in self.optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{i}.{n}": value for n, value in moments.items()}
+        part = path.with_name(f".{path.name}.part")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_file({n: t.detach().cpu().contiguous() for n, t in tensors.items()}, part, {"step": str(self.step)})
+            part.replace(path)
+        except (OSError, SafetensorError) as error:
+            part.unlink(missing_ok=True)
+            raise FileError(f"{path} cannot be written ({error})", "a folder on a disk with room") from error
+
+    def load(self, path: Path) -> None:
+        """Go on where ``save`` was called.
+
+        Raises:
+            FileError: where the file cannot be read.
+            DataError: where it is no state of such a run.
+        """
+        try:
+            with safe_open(path, "pt") as file:
+                step = int(file.metadata()["step"])
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
+        except OSError as error:
+            raise FileError(f"{path} cannot be read ({error})", "a saved state", "Start without --resume.") from error
+        except (SafetensorError, KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{path} is no saved state ({error})", "state.safetensors of a run") from error
+        parts: dict[str, dict[str, Any]] = {"network": {}, "average": {}, "optimizer": {}}
+        for name, tensor in tensors.items():
+            part, key = name.split(".", 1)
+            parts[part][key] = tensor
+        moments: dict[int, dict[str, Tensor]] = {}
+        for name, tensor in parts["optimizer"].items():
+            number, key = name.split(".")
+            moments.setdefault(int(number), {})[key] = tensor
+        try:
+            self.network.load_state_dict(parts["network"])
+            self.average.load_state_dict(parts["average"])
+            groups = self.optimizer.state_dict()["param_groups"]
+            self.optimizer.load_state_dict({"state": moments, "param_groups": groups})
+        except (RuntimeError, ValueError) as error:
+            raise DataError(f"{path} is the state of another network ({error})", "the same configuration") from error
+        self.step = step

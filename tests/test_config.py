@@ -1,0 +1,120 @@
+"""Configuration: every published file loads, overrides apply, what cannot be is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from lidar_synth.config import DistillConfig, Run, TrainConfig, load_config
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.sensor import load_sensor
+from lidar_synth.town import Town
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+RUNS = sorted(p for p in CONFIGS.glob("*.yaml") if "recipe" in yaml.safe_load(p.read_text()))
+TINY = CONFIGS / "town_tiny.yaml"
+
+
+def kind_of(path: Path) -> type[Run]:
+    return DistillConfig if "teacher" in yaml.safe_load(path.read_text()) else TrainConfig
+
+
+@pytest.fixture(autouse=True)
+def in_the_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(CONFIGS.parent)
+
+
+@pytest.mark.parametrize("path", RUNS, ids=lambda p: p.stem)
+def test_every_configuration_loads(path: Path) -> None:
+    config = load_config(kind_of(path), path)
+    assert config.output == Path("runs") / path.stem
+    again = kind_of(path).model_validate(yaml.safe_load(yaml.safe_dump(config.model_dump(mode="json"))))
+    assert again == config  # what a run writes beside its results is the configuration
+
+
+def test_the_published_recipes() -> None:
+    teacher = load_config(TrainConfig, CONFIGS / "kitti360_teacher.yaml")
+    assert teacher.network_arguments()["resolution"] == (64, 1024)
+    assert (teacher.recipe.iterations, teacher.recipe.batch, teacher.recipe.warmup) == (320_000, 8, 10_000)
+    student = load_config(DistillConfig, CONFIGS / "kitti360_student.yaml")
+    assert (student.grid, student.steps, student.recipe.metric) == ((1, 0.86, 0.58, 0.22, 0), 20, "pseudo_huber")
+
+
+def test_overrides() -> None:
+    overrides = ["recipe.batch=4", "data.flip=false", "recipe.rate=1e-3", "channels=[range]", "samples.every=0"]
+    config = load_config(TrainConfig, TINY, overrides)
+    assert (config.recipe.batch, config.data.flip, config.recipe.rate) == (4, False, 1e-3)
+    assert config.tensors().size == 1
+    assert config.network_arguments()["channels"] == 1
+    assert config.samples.every == 0
+
+
+def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    config = load_config(TrainConfig, TINY, ["data.seed=3"])
+    source = config.data.open(load_sensor(config.sensor))
+    assert isinstance(source, Town)
+    assert (len(source), source.seed, source.sensor.shape) == (40, 3, (16, 128))
+    disk = load_config(TrainConfig, CONFIGS / "kitti360_teacher.yaml")
+    monkeypatch.delenv("KITTI360_ROOT", raising=False)
+    with pytest.raises(ConfigError, match=r"data.path '\$KITTI360_ROOT'; expected variables that are set"):
+        disk.data.open(load_sensor(disk.sensor))
+    monkeypatch.setenv("KITTI360_ROOT", str(tmp_path / "nowhere"))
+    with pytest.raises(DataError, match="nowhere"):
+        disk.data.open(load_sensor(disk.sensor))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("sead=1", "unknown key 'sead'; known there: output, licence, data, recipe, seed"),
+        ("recipe.batches=1", "unknown key 'recipe.batches'; known there: iterations, batch, accumulate"),
+        ("data.twon=1", "unknown key 'data.twon'; known there: licence, town"),
+        ("recipe.batch=many", "recipe.batch = 'many'"),
+        ("recipe.batch=0", "of at least 1"),
+        ("recipe.metric=l7", "one of squared_l2, pseudo_huber, l1"),
+        ("recipe=null", "recipe = None"),
+        ("normalisation=cubic", "normalisation 'cubic'; expected one of r2flow"),
+        ("channels=[range, colour]", "range and some of"),
+        ("sensor=hdl99", "sensor 'hdl99'"),
+        ("network.arguments.patch=[3, 4]", r"resolution \(16, 128\); expected multiples of \(6, 8\)"),
+        ("network.arguments.depths=[1, 1, 1, 1, 1]", "expected multiples of"),
+        ("network.arguments.width=[1]", "arguments"),
+        ("network.arguments.depth=3", "arguments"),
+        ("network.arguments.channels=3", r"network.arguments with \['channels'\]"),
+        ("network.architecture=unet", "architecture 'unet'; expected one of"),
+        ("data.path=here", "data with town=40 and path=here; expected one of the two"),
+        ("data.town=null", "expected one of the two"),
+        ("precision=fp8", "precision = 'fp8'"),
+        ("batch", "override 'batch'; expected key=value"),
+        ("seed.x=1", "seed is a single value"),
+        ("channels=[range", "is not YAML"),
+    ],
+)
+def test_what_cannot_be_is_refused(override: str, message: str) -> None:
+    start = ["seed=0"] if override.startswith("seed.") else []
+    with pytest.raises(ConfigError, match=message):
+        load_config(TrainConfig, TINY, [*start, override])
+
+
+@pytest.mark.parametrize("grid", ["[1, 0.5, 0]", "[1, 0.5, 0.6, 0.2, 0]", "[0.9, 0.6, 0.5, 0.2, 0]"])
+def test_a_grid_that_is_none_is_refused(grid: str) -> None:
+    with pytest.raises(ConfigError, match="5 descending times from 1 to 0"):
+        load_config(DistillConfig, CONFIGS / "kitti360_student.yaml", [f"grid={grid}"])
+
+
+def test_files_that_are_no_configuration_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    with pytest.raises(FileError, match="cannot be read"):
+        load_config(TrainConfig, path)
+    path.write_text("a: [")
+    with pytest.raises(ConfigError, match="is not YAML"):
+        load_config(TrainConfig, path)
+    path.write_text("- a")
+    with pytest.raises(ConfigError, match="holds list; expected the keys output"):
+        load_config(TrainConfig, path)
+    values: dict[str, Any] = yaml.safe_load(TINY.read_text())
+    del values["licence"]
+    path.write_text(yaml.safe_dump(values))
+    with pytest.raises(ConfigError, match="'licence' is missing"):
+        load_config(TrainConfig, path)

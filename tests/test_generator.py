@@ -1,0 +1,204 @@
+"""The generator: a scan is a function of (checkpoint, condition, grid, seed, index); what cannot be is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from typer.testing import CliRunner
+
+import lidar_synth.generator as module
+from lidar_synth.checkpoint import VELOCITY, Header, Part, save_checkpoint
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.formats import WRITERS, open_scans
+from lidar_synth.generator import Generator, load_generator, shipped_models
+from lidar_synth.nets import build_network
+from lidar_synth.noise import gaussian
+from lidar_synth.normalize import CHANNELS, NORMALISATIONS
+from lidar_synth.projection import project
+from lidar_synth.scan import SYNTHETIC
+from lidar_synth.sensor import Sensor
+from lidar_synth.solvers import solve, uniform_grid
+
+SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+GRID = (1.0, 0.8, 0.5, 0.0)
+
+
+def write(path: Path, channels: tuple[str, ...] = tuple(CHANNELS), condition_channels: int = 0) -> Path:
+    """A checkpoint with random weights."""
+    arguments = {
+        "resolution": SENSOR.shape, "channels": sum(CHANNELS[c] for c in channels), "width": 16, "time_width": 16,
+        "depths": (1, 1), "heads": (2, 2), "patch": (2, 2), "window": (3, 3), "condition_channels": condition_channels,
+    }  # fmt: skip
+    torch.manual_seed(0)
+    network = build_network("hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())})
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)  # a fresh network answers zero
+    header = Header(
+        networks={VELOCITY: Part("hdit", arguments)}, sensor=SENSOR, normalisation=NORMALISATIONS["r2flow"],
+        channels=channels, time_grid=GRID, provenance={"data": "none", "data_licence": "none", "licence": "MIT"},
+        conditioning={"semantic": {}} if condition_channels else {},
+    )  # fmt: skip
+    save_checkpoint(path, header, {VELOCITY: network})
+    return path
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("generator") / "small.safetensors")
+
+
+@pytest.fixture(scope="module")
+def generator(path: Path) -> Generator:
+    return load_generator(path)
+
+
+def test_images_are_the_flow_from_the_contracts_noise(generator: Generator) -> None:
+    noise = gaussian(5, [3, 9], (generator.tensors.size, *SENSOR.shape))
+    with torch.inference_mode():
+        expected = generator.tensors.to_images(solve(generator.network, noise, GRID), SENSOR)
+    images = generator.range_images(5, [3, 9])
+    for image, other in zip(images, expected, strict=True):
+        assert np.allclose(image.range, other.range, atol=1e-3)
+        assert set(image.channels) == {"reflectance", "label", "confidence"}
+        assert (image.label[~image.mask] == IGNORE).all()
+        assert (image.channels["confidence"][~image.mask] == 0).all()
+    assert 0.05 < images[0].mask.mean() < 0.95
+    assert not np.array_equal(images[0].range, images[1].range)
+
+
+@settings(max_examples=10, deadline=None)
+@given(indices=st.lists(st.integers(0, 2**62), min_size=1, max_size=5), batch=st.integers(1, 3))
+def test_what_is_sampled_along_with_a_scan_does_not_matter(
+    generator: Generator, indices: list[int], batch: int
+) -> None:
+    together = torch.cat(list(replace(generator, batch=batch).samples(7, indices)))
+    for i, index in enumerate(indices):
+        alone = torch.cat(list(generator.samples(7, [index])))
+        assert (together[i] - alone[0]).abs().max() <= 1e-4
+
+
+def test_the_inner_batch_bounds_what_is_solved_at_once(generator: Generator) -> None:
+    sizes = [len(tensor) for tensor in replace(generator, batch=3).samples(0, range(7))]
+    assert sizes == [3, 3, 1]
+    assert generator.range_images(0, []) == []
+
+
+def test_scans_are_the_returns_of_the_images(generator: Generator) -> None:
+    [image], [scan] = generator.range_images(2, [11]), generator.scans(2, [11])
+    assert (scan.id, scan.domain, scan.sensor) == ("small/2/11", SYNTHETIC, SENSOR)
+    assert len(scan) == image.mask.sum()
+    assert np.array_equal(scan.label, image.label[image.mask])
+    assert np.array_equal(scan.confidence, image.channels["confidence"][image.mask])
+    assert np.array_equal(project(scan).mask, image.mask)  # every return goes back to its own cell
+
+
+def test_steps_and_solver_replace_the_checkpoints_own_grid(generator: Generator) -> None:
+    noise = gaussian(0, [0], (generator.tensors.size, *SENSOR.shape))
+    for steps, solver in ((2, "euler"), (3, "heun")):
+        [tensor] = generator.samples(0, [0], steps=steps, solver=solver)
+        with torch.inference_mode():
+            assert torch.allclose(tensor, solve(generator.network, noise, uniform_grid(steps), solver), atol=1e-5)
+    with pytest.raises(ConfigError, match="0 steps"):
+        generator.scans(0, [0], steps=0)
+    with pytest.raises(ConfigError, match="solver 'rk4'"):
+        generator.scans(0, [0], solver="rk4")
+
+
+@pytest.mark.parametrize("channels", [("range",), ("range", "reflectance")])
+def test_a_model_gives_what_its_checkpoint_has(channels: tuple[str, ...], tmp_path: Path) -> None:
+    generator = load_generator(write(tmp_path / "few.safetensors", channels))
+    [image], [scan] = generator.range_images(0, [0]), generator.scans(0, [0])
+    assert set(image.channels) == set(channels) - {"range"}
+    assert (scan.label, scan.confidence) == (None, None)
+
+
+def test_lower_precision_stays_close(path: Path, generator: Generator) -> None:
+    rough = load_generator(path, dtype=torch.bfloat16)
+    [a], [b] = generator.samples(0, [0]), rough.samples(0, [0])
+    assert b.dtype == torch.float32
+    assert 0 < (a - b).abs().mean() < 0.05
+
+
+def test_conditions(tmp_path: Path, generator: Generator) -> None:
+    conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 2))
+    one, many = torch.randn(2, 8, 32), torch.randn(3, 2, 8, 32)
+    same = conditioned.range_images(0, [4, 4], one)
+    assert np.allclose(same[0].range, same[1].range, atol=1e-3)
+    images = conditioned.range_images(0, [4, 4, 4], many)
+    [third] = conditioned.range_images(0, [4], many[2])
+    assert np.allclose(images[2].range, third.range, atol=1e-3)
+    assert not np.allclose(images[0].range, third.range, atol=1e-3)
+    with pytest.raises(DataError, match=r"condition of shape \(3, 8, 32\) for 'conditioned'; expected \(2, 8, 32\)"):
+        conditioned.scans(0, [0], torch.zeros(3, 8, 32))
+    with pytest.raises(DataError, match="no condition for 'conditioned'"):
+        conditioned.scans(0, [0])
+    with pytest.raises(ConfigError, match="the model is unconditional"):
+        generator.scans(0, [0], one)
+
+
+def test_names_and_paths(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "weights").mkdir()
+    monkeypatch.setattr(module, "files", lambda package: tmp_path)
+    with pytest.raises(ConfigError, match=r"model 'town'; expected a shipped one \(none in this installation\)"):
+        load_generator("town")
+    (tmp_path / "weights" / "town.safetensors").write_bytes(path.read_bytes())
+    assert load_generator("town").scans(0, [1])[0].id == "town/0/1"
+    with pytest.raises(ConfigError, match=r"model 'city'; expected a shipped one \(town\) or a .safetensors file"):
+        load_generator("city")
+    with pytest.raises(FileError, match="nowhere"):
+        load_generator(tmp_path / "nowhere.safetensors")
+    with pytest.raises(ConfigError, match=r"\.pth"):
+        load_generator(tmp_path / "peer.pth")
+
+
+def test_what_ships_can_be_loaded() -> None:
+    for name, file in shipped_models().items():
+        assert file.stat().st_size <= 16e6
+        [scan] = load_generator(name).scans(0, [0])
+        assert scan.label is not None
+        assert len(scan) > 10_000
+
+
+def test_a_gpu_is_refused_where_there_is_none_and_in_a_worker(
+    path: Path, generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="torch sees no GPU"):
+            load_generator(path, device="cuda")
+    monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=0))
+    three_ways = r"\(A\) bake .*\(B\) a rolling .*\(C\) mix in"
+    with pytest.raises(ConfigError, match=three_ways):
+        load_generator(path, device="cuda")
+    monkeypatch.setattr(Generator, "device", torch.device("cuda"))
+    with pytest.raises(ConfigError, match=three_ways):
+        generator.scans(0, [0])
+    monkeypatch.setattr(Generator, "device", torch.device("cpu"))
+    assert generator.scans(0, [0])
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_sample_writes_every_format_and_goes_on(form: str, path: Path, tmp_path: Path) -> None:
+    from lidar_synth.cli import app
+
+    def sample(*options: str) -> str:
+        result = CliRunner().invoke(
+            app, ["sample", str(tmp_path / "out"), "--model", str(path), "--to", form, *options]
+        )
+        assert result.exception is None, result.exception
+        return result.output
+
+    assert "2 scans written, 0 were there already" in sample("--count", "2", "--seed", "4")
+    assert "1 scans written, 2 were there already" in sample("--count", "3", "--seed", "4")
+    if form in ("npz", "semantic_kitti", "kitti"):
+        written = open_scans(tmp_path / "out", sensor=SENSOR)
+        expected = load_generator(path).scans(4, range(3))
+        assert len(written) == 3
+        for a, b in zip(written, expected, strict=True):
+            assert np.allclose(a.points, b.points, atol=1e-4)
+            assert np.array_equal(a.label, b.label)

@@ -1,0 +1,309 @@
+"""Training: data that follow from their position, schedules, the state through a kill, the loop."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from accelerate import Accelerator
+from conftest import random_scan
+from hypothesis import given
+from torch import Tensor, nn
+
+from lidar_synth.distill import STRATEGIES
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.flow import METRICS, Example
+from lidar_synth.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.projection import project
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor
+from lidar_synth.solvers import uniform_grid
+from lidar_synth.train import (
+    SCHEDULES,
+    Batch,
+    Batches,
+    Recipe,
+    Training,
+    cache_scans,
+    micro_batches,
+    steps,
+    student_task,
+    teacher_task,
+)
+
+SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+TENSORS = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow"])
+SCANS = [random_scan(SENSOR, 400, seed) for seed in range(5)]
+
+
+class Convolution(nn.Module):
+    """A velocity network that is trained in no time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner = nn.Conv2d(TENSORS.size + 1, 16, 3, padding=1)
+        self.outer = nn.Conv2d(16, TENSORS.size, 3, padding=1)
+
+    def forward(self, y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
+        time = t.view(-1, 1, 1, 1).expand(-1, 1, *y.shape[2:]).to(y.dtype)
+        return self.outer(torch.relu(self.inner(torch.cat((y, time), 1))))
+
+
+def new_training(**recipe: Any) -> Training:
+    torch.manual_seed(0)
+    return Training(Convolution(), Recipe(**{"iterations": 6, "batch": 4, "warmup": 2, "rate": 1e-2} | recipe))
+
+
+@pytest.fixture(scope="module")
+def batches() -> Batches:
+    return Batches(cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False), TENSORS, seed=3, flip=True, roll=True)
+
+
+@pytest.fixture(scope="module")
+def accelerator() -> Accelerator:
+    return Accelerator(cpu=True)
+
+
+# data
+
+
+def test_a_cache_holds_the_projected_scans_within_its_steps(tmp_path: Path) -> None:
+    for folder in (None, tmp_path / "cache"):
+        cache = cache_scans(SCANS, SENSOR, TENSORS.channels, folder, progress=False)
+        fields = cache.read([4, 0])
+        for i, scan in enumerate((SCANS[4], SCANS[0])):
+            image = project(scan)
+            assert np.abs(fields["range"][i].numpy() - image.range).max() <= 80 / 65535 / 2 * 1.01
+            assert np.array_equal(fields["range"][i].numpy() > 0, image.mask)
+            assert np.abs(fields["reflectance"][i].numpy() - image.channels["reflectance"]).max() <= 0.5 / 255 * 1.01
+            assert np.array_equal(fields["label"][i].numpy(), image.channels["label"])
+
+
+class Counted(list[Scan]):
+    """A source that counts what is read and stops answering after ``limit`` reads."""
+
+    def __init__(self, scans: list[Scan], limit: int = 10**9) -> None:
+        super().__init__(scans)
+        self.reads, self.limit = 0, limit
+
+    def __getitem__(self, index: Any) -> Any:
+        if self.reads == self.limit:
+            raise KeyboardInterrupt
+        self.reads += 1
+        return super().__getitem__(index)
+
+
+def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(tmp_path: Path) -> None:
+    scans = [SCANS[i % 5] for i in range(150)]
+    broken = Counted(scans, limit=100)
+    with pytest.raises(KeyboardInterrupt):
+        cache_scans(broken, SENSOR, ["range"], tmp_path, {"town": 150}, progress=False)
+    again = Counted(scans)
+    cache = cache_scans(again, SENSOR, ["range"], tmp_path, {"town": 150}, progress=False)
+    assert again.reads == 150 - 64  # what was noted as done is kept
+    fresh = cache_scans(scans, SENSOR, ["range"], progress=False)
+    assert np.array_equal(cache.fields["range"], fresh.fields["range"])
+    third = Counted(scans)
+    cache_scans(third, SENSOR, ["range"], tmp_path, {"town": 150}, progress=False)
+    assert third.reads == 0
+    with pytest.raises(ConfigError, match=r"cache of other data \(source differ\)"):
+        cache_scans(scans, SENSOR, ["range"], tmp_path, {"town": 151}, progress=False)
+    with pytest.raises(ConfigError, match="channels"):
+        cache_scans(scans, SENSOR, ["range", "label"], tmp_path, {"town": 150}, progress=False)
+    (tmp_path / "range.npy").unlink()
+    with pytest.raises(FileError, match="cannot be opened"):
+        cache_scans(scans, SENSOR, ["range"], tmp_path, {"town": 150}, progress=False)
+
+
+def test_a_source_that_gives_nothing_or_lacks_a_channel_is_refused() -> None:
+    with pytest.raises(DataError, match="without scans"):
+        cache_scans([], SENSOR, ["range"])
+    bare = Scan(SCANS[0].points, SCANS[0].reflectance, SENSOR)
+    with pytest.raises(ConfigError, match=r"has no \['label'\]"):
+        cache_scans([bare], SENSOR, ["range", "label"], progress=False)
+
+
+def test_what_stands_at_a_position_does_not_depend_on_the_others(batches: Batches) -> None:
+    together = batches(range(7, 13))
+    for i, position in enumerate(range(7, 13)):
+        alone = batches([position])
+        assert all(torch.equal(a[i], b[0]) for a, b in zip(together, alone, strict=True))
+
+
+@given(epoch=st.integers(0, 50))
+def test_every_epoch_is_a_permutation_of_all_scans(batches: Batches, epoch: int) -> None:
+    assert sorted(batches.scans_at(range(epoch * 5, epoch * 5 + 5))) == list(range(5))
+
+
+def test_augmentation_turns_and_mirrors_whole_columns(batches: Batches) -> None:
+    plain = Batches(batches.cache, TENSORS, seed=3)
+    seen = set()
+    for position in range(40):
+        sample, original = batches([position]).y0[0], plain([position]).y0[0]
+        found = [
+            (flip, shift)
+            for flip in (False, True)
+            for shift in range(32)
+            if torch.equal(sample, (original.flip(-1) if flip else original).roll(shift, -1))
+        ]
+        assert len(found) == 1, position
+        seen |= set(found)
+    assert {flip for flip, _ in seen} == {False, True}
+    assert len(seen) > 20
+
+
+def test_mirroring_an_image_is_mirroring_its_points() -> None:
+    mirrored = Scan(SCANS[0].points * np.float32([1, -1, 1]), SCANS[0].reflectance, SENSOR)
+    assert (project(mirrored).range == project(SCANS[0]).range[:, ::-1]).mean() > 0.99  # all but points on an edge
+
+
+@given(
+    step=st.integers(0, 100), size=st.integers(1, 4), accumulate=st.integers(1, 3), processes=st.integers(1, 3)
+)  # fmt: skip
+def test_processes_and_micro_batches_share_the_positions_of_a_step(
+    step: int, size: int, accumulate: int, processes: int
+) -> None:
+    batch = size * accumulate * processes
+    parts = [p for r in range(processes) for p in micro_batches(step, batch, accumulate, r, processes)]
+    assert sorted(i for p in parts for i in p) == list(range(step * batch, (step + 1) * batch))
+    assert {len(p) for p in parts} == {size}
+
+
+def test_a_batch_that_cannot_be_divided_is_refused() -> None:
+    with pytest.raises(ConfigError, match="batch 8 over 3 micro-batches and 1 processes"):
+        list(micro_batches(0, 8, 3))
+
+
+# schedules
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_a_schedule_warms_up_and_ends_near_zero(name: str) -> None:
+    rate = [SCHEDULES[name](step, 10, 1000) for step in range(1000)]
+    assert rate[:10] == pytest.approx([(i + 1) / 10 for i in range(10)])
+    assert max(rate) == 1
+    assert 0 < rate[-1] < 0.01
+    assert all(a >= b for a, b in pairwise(rate[10:]))
+
+
+def test_the_schedules_have_their_shape() -> None:
+    assert SCHEDULES["cosine"](505, 10, 1000) == pytest.approx(0.5)
+    assert SCHEDULES["cosine"](257, 10, 1000) == pytest.approx((1 + math.cos(math.pi * 247 / 990)) / 2)
+    assert [SCHEDULES["trapezoid"](s, 10, 1000) for s in (750, 875)] == [1, 0.5]
+    assert [SCHEDULES["trapezoid"](s, 10, 1000) for s in range(750)] == [
+        SCHEDULES["trapezoid"](s, 10, 1200) for s in range(750)
+    ]
+
+
+# the loop
+
+
+def test_training_lowers_the_loss(batches: Batches, accelerator: Accelerator) -> None:
+    training = new_training(iterations=60, clip=10.0)
+    records = list(steps(training, teacher_task(), batches, accelerator))
+    assert [r.step for r in records] == list(range(1, 61))
+    assert np.mean([r.loss for r in records[-10:]]) < 0.9 * np.mean([r.loss for r in records[:10]])
+    assert records[0].rate == pytest.approx(0.5e-2)
+    assert all(r.gradient > 0 and r.teacher_evaluations == 0 for r in records)
+
+
+def test_the_first_loss_is_that_of_the_metric_on_the_batch(batches: Batches, accelerator: Accelerator) -> None:
+    for metric in METRICS:
+        training = new_training(metric=metric)
+        batch = batches(range(4))
+        y = (1 - batch.u.view(-1, 1, 1, 1)) * batch.y0 + batch.u.view(-1, 1, 1, 1) * batch.y1
+        expected = METRICS[metric](training.network(y, batch.u), batch.y1 - batch.y0).mean()
+        record = next(steps(training, teacher_task(), batches, accelerator))
+        assert record.loss == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_accumulation_changes_rounding_only(batches: Batches, accelerator: Accelerator) -> None:
+    one, two = (
+        [r.loss for r in steps(new_training(accumulate=n), teacher_task(), batches, accelerator)] for n in (1, 2)
+    )
+    assert one == pytest.approx(two, rel=1e-4)
+
+
+def test_a_saved_run_goes_on_with_the_very_same_losses(
+    batches: Batches, accelerator: Accelerator, tmp_path: Path
+) -> None:
+    whole = new_training(ema_every=1)
+    losses = [r.loss for r in steps(whole, teacher_task(), batches, accelerator)]
+    first = new_training(ema_every=1)
+    for record in steps(first, teacher_task(), batches, accelerator):
+        if record.step == 3:
+            break
+    first.save(tmp_path / "run" / "state.safetensors")
+    assert [p.name for p in (tmp_path / "run").iterdir()] == ["state.safetensors"]
+    second = Training(Convolution(), whole.recipe)
+    second.load(tmp_path / "run" / "state.safetensors")
+    assert [r.loss for r in steps(second, teacher_task(), batches, accelerator)] == losses[3:]
+    for a, b in zip(whole.average.parameters(), second.average.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_the_average_follows_the_weights(batches: Batches, accelerator: Accelerator) -> None:
+    training = new_training(iterations=4, ema_every=2, ema_decay=0.5)
+    start = [p.clone() for p in training.average.parameters()]
+    seen = []
+    for _ in steps(training, teacher_task(), batches, accelerator):
+        seen.append([p.detach().clone() for p in training.network.parameters()])
+    keep = [2 / 11, 3 / 12]  # below the decay: the start is forgotten
+    for i, (average, first) in enumerate(zip(training.average.parameters(), start, strict=True)):
+        expected = first
+        for k, weights in zip(keep, (seen[1], seen[3]), strict=True):
+            expected = k * expected + (1 - k) * weights[i]
+        assert torch.allclose(average, expected, atol=1e-6)
+
+
+def test_a_loss_that_is_not_finite_stops_and_leaves_the_training_as_it_was(
+    batches: Batches, accelerator: Accelerator
+) -> None:
+    def poisoned(batch: Batch) -> Example:
+        example = teacher_task()(batch)
+        bad = torch.full_like(example.velocity, torch.nan) if training.step == 2 else example.velocity
+        return Example(example.y, example.t, bad)
+
+    training = new_training(ema_every=1)
+    run = steps(training, poisoned, batches, accelerator)
+    next(run), next(run)
+    before = [p.clone() for p in (*training.network.parameters(), *training.average.parameters())]
+    with pytest.raises(DataError, match="step 3: the loss is nan"):
+        next(run)
+    after = (*training.network.parameters(), *training.average.parameters())
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert training.step == 2
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_a_student_is_trained_by_every_strategy(strategy: str, batches: Batches, accelerator: Accelerator) -> None:
+    teacher = Convolution().eval().requires_grad_(False)
+    task = student_task(strategy, teacher, uniform_grid(4), 2)
+    records = list(steps(new_training(metric="pseudo_huber"), task, batches, accelerator))
+    assert all(math.isfinite(r.loss) for r in records)
+    assert [r.teacher_evaluations for r in records] == [8] * 6
+
+
+def test_a_state_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    training = new_training()
+    path = tmp_path / "state.safetensors"
+    with pytest.raises(FileError, match="cannot be read"):
+        training.load(path)
+    training.save(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DataError, match="is no saved state"):
+        training.load(path)
+    training.save(path)
+    other = Training(nn.Linear(2, 2), training.recipe)
+    with pytest.raises(DataError, match="state of another network"):
+        other.load(path)
+
+
+def test_a_recipe_with_an_unknown_name_is_refused() -> None:
+    with pytest.raises(ConfigError, match="metric 'l7'; expected one of squared_l2, pseudo_huber, l1"):
+        Recipe(iterations=1, metric="l7")
+    with pytest.raises(ConfigError, match="at least 1"):
+        Recipe(iterations=0)
