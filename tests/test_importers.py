@@ -227,9 +227,10 @@ def test_weights_that_do_not_fit(tmp_path: Path, spoil: Callable[[dict[str, Tens
         (change(data={"data_format": "cartesian"}), "'cartesian'.*one of logscale"),
         (change(data={"dataset": "nuscenes"}), "'nuscenes'"),
         (change(data={"resolution": [64, 72]}), "resolution"),
-        ({"data": CFG["data"]}, "without 'model'"),
+        ({"data": CFG["data"]}, "KeyError.'model'"),
+        (change(data={"min_depth": 90.0}), "range limits 90"),
     ],
-    ids=["architecture", "position", "format", "dataset", "resolution", "groups"],
+    ids=["architecture", "position", "format", "dataset", "resolution", "groups", "limits"],
 )
 def test_configurations_that_do_not_fit(tmp_path: Path, cfg: dict[str, Any], message: str) -> None:
     with pytest.raises(DataError, match=message):
@@ -282,10 +283,14 @@ def test_a_truncated_file(released: Path, share: float) -> None:
         read_r2flow(released)
 
 
-@pytest.mark.parametrize("content", [[1, 2], {"state_dict": {}}, {"cfg": CFG}], ids=["list", "other", "no weights"])
+@pytest.mark.parametrize(
+    "content",
+    [[1, 2], {"state_dict": {}}, {"cfg": CFG}, {"cfg": CFG, "weights": [1]}, {"cfg": CFG, "weights": {"coords": 1}}],
+    ids=["list", "other", "no weights", "list of weights", "numbers"],
+)
 def test_a_pickle_of_something_else(tmp_path: Path, content: Any) -> None:
     torch.save(content, tmp_path / "other.pth")
-    with pytest.raises(DataError, match="cfg and weights"):
+    with pytest.raises(DataError, match=r"cfg and weights|no tensors by name"):
         read_r2flow(tmp_path / "other.pth")
 
 

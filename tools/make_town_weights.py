@@ -1,11 +1,13 @@
 """The recipe of the weights that ship: teacher, timesteps, student, on scans of the town only.
 
-    python tools/make_town_weights.py WORK [--minutes 60] [--teacher-share 0.6] [KEY=VALUE ...]
+    python tools/make_town_weights.py WORK [--minutes 60] [--teacher-share 0.7]
+        [--teacher KEY=VALUE ...] [--student KEY=VALUE ...]
 
 Both runs have a budget of time in place of iterations: at a constant rate until three quarters of it are over, then
 the rate falls to zero over a third of the steps done so far (the schedule "trapezoid"). A run that was stopped or
-killed goes on when the same is typed again, with the budget anew. KEY=VALUE goes to the configurations of both, such
-as precision=bf16 or recipe.batch=16. On a busy machine set OMP_WAIT_POLICY=passive.
+killed goes on when the same is typed again, with the budget anew. KEY=VALUE changes the configurations
+(configs/town_teacher.yaml and town_student.yaml), such as recipe.batch=16; data has to stay the same in both. On a
+machine that does other things too, set OMP_WAIT_POLICY=passive.
 """
 
 import argparse
@@ -31,16 +33,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path, help="folder of the runs")
     parser.add_argument("--minutes", type=float, default=60, help="for teacher and student together")
-    parser.add_argument("--teacher-share", type=float, default=0.6, help="of the minutes")
+    parser.add_argument("--teacher-share", type=float, default=0.7, help="of the minutes")
+    parser.add_argument("--teacher", nargs="*", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--student", nargs="*", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", type=Path, default=ROOT / "lidar_synth" / "weights" / "town.safetensors")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     given = parser.parse_args()
 
-    folders = {name: given.work / f"town_{name}" for name in ("teacher", "student")}
-    common = [f"data.cache={given.work / 'cache'}", *given.overrides]
-    teacher = train(TrainConfig, folders["teacher"], given.minutes * given.teacher_share, common)
-    common.append(f"teacher={teacher}")
-    student = train(DistillConfig, folders["student"], given.minutes * (1 - given.teacher_share), common)
+    cache = f"data.cache={given.work / 'cache'}"
+    minutes = given.minutes * given.teacher_share
+    teacher = train(TrainConfig, given.work / "town_teacher", minutes, [cache, *given.teacher])
+    overrides = [cache, f"teacher={teacher}", *given.student]
+    student = train(DistillConfig, given.work / "town_student", given.minutes - minutes, overrides)
     ship(student, given.out)
 
 
@@ -65,7 +68,7 @@ def ship(path: Path, out: Path) -> None:
     """The student as the package holds it, in half precision if it has to be."""
     checkpoint = load_checkpoint(path)
     count = sum(p.numel() for network in checkpoint.networks.values() for p in network.parameters())
-    dtype = torch.float32 if 4 * count < 0.95 * LIMIT else torch.bfloat16
+    dtype = torch.float32 if 4 * count < 0.9 * LIMIT else torch.float16
     save_checkpoint(out, checkpoint.header, checkpoint.networks, dtype)
     size = out.stat().st_size
     assert size <= LIMIT, f"{out} has {size} bytes: make the network smaller"

@@ -1,4 +1,4 @@
-"""The town beside real KITTI-360 scans: geometry, ranges, reflectance and missing returns in one markdown table.
+"""The town beside real KITTI-360 scans: angles, ranges, reflectance and missing returns in one markdown table.
 
     LIDAR_SYNTH_REAL_SCANS=FOLDER python tools/town_statistics.py [--scans 120] [--seed 0]
 
@@ -50,6 +50,13 @@ def statistics(scan: Scan) -> dict[str, float]:
     # A row that no beam meets is empty for another reason than a lost ray.
     lost = ~filled[:, 1:-1] & filled[:, :-2] & filled[:, 2:]
     figures["single lost cells (both neighbours filled)"] = lost.mean()
+    elevation = np.degrees(np.arcsin(scan.points[:, 2] / distance))
+    for share in (0.5, 5, 25, 50, 75, 95, 99.5):
+        figures[f"elevation, {share:g} % lower than (degrees)"] = float(np.percentile(elevation, share))
+    azimuth = np.degrees(-np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+    for a in range(-180, 180, 45):
+        inside = (azimuth >= a) & (azimuth < a + 45)
+        figures[f"share of returns at azimuth {a} to {a + 45} degrees"] = inside.mean()
     for a, b in ((0, 16), (16, 32), (32, 48), (48, 64)):
         figures[f"returns per firing, rings {a} to {b - 1}"] = rings[a:b].mean()
     for a, b in GROUPS:

@@ -18,9 +18,10 @@ def import_(
     The file is read without running any code in it. Names, sign and time are converted; a file that does not
     fit exactly is refused with its missing and unexpected keys.
 
-    \b
     Examples:
+
       lidar-synth import r2flow-kitti360-1rf.pth r2flow-1rf.safetensors
+
       lidar-synth sample scans --model r2flow-1rf.safetensors --count 16 --steps 32
     """
     from lidar_synth.checkpoint import VELOCITY, save_checkpoint

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from lidar_synth.checkpoint import VELOCITY, Header, Part
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.nets import assemble
-from lidar_synth.nets.positions import LEARNED
+from lidar_synth.nets.positions import BASES, LEARNED
 from lidar_synth.normalize import Normalisation
 from lidar_synth.sensor import Sensor, presets
 from lidar_synth.solvers import uniform_grid
@@ -33,9 +33,7 @@ HEADS = (2, 4, 8, 16)
 MAPPING_DEPTH = 2
 """The peer's loader takes these from no configuration; nor patch, window and ratio, which are our defaults."""
 
-POSITIONS = {"learnable_embedding": LEARNED} | {
-    name: name for name in ("spherical_harmonics", "fourier_features", "polar_coordinates")
-}
+POSITIONS = {"learnable_embedding": LEARNED, **{name: name for name in BASES}}
 NORMALISATIONS: dict[str, Literal["log", "linear", "inverse"]] = {
     "logscale": "log",
     "inverse": "inverse",
@@ -80,8 +78,10 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             time_grid=_time_grid(content["cfg"]),
             provenance=_provenance(content, path),
         )
-    except (KeyError, TypeError) as error:
-        raise DataError(f"{path}: a configuration without {error}", "R2Flow's groups and keys") from error
+    except DataError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: a configuration that does not fit ({error!r})", "R2Flow's groups and keys") from error
     return header, {VELOCITY: convert(content["weights"], part, str(path))}
 
 
@@ -97,10 +97,13 @@ def _load(path: Path) -> dict[str, Any]:
                 "tensors and plain values only",
                 "A pickle with code in it can do anything: get the file from R2Flow's own release page.",
             ) from error
-        raise DataError(f"{path} is cut, damaged or no .pth file ({str(error)[:200]})", "a whole file") from error
+        raise DataError(f"{path} is cut, damaged or no .pth file", "a whole file of R2Flow's release") from error
     if not isinstance(content, dict) or not {"cfg", "weights"} <= set(content):
         given = sorted(map(str, content))[:8] if isinstance(content, dict) else type(content).__name__
         raise DataError(f"{path} holds {given}", "R2Flow's dictionary with cfg and weights among its keys")
+    weights = content["weights"]
+    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise DataError(f"{path}: its weights are no tensors by name", "the state dictionary of a network")
     return content
 
 

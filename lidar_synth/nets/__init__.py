@@ -69,4 +69,4 @@ def assemble(
         shapes = ", ".join(f"{key} {shape} for {expected[key]}" for key, shape in wrong.items())
         raise DataError(f"{what} has weights of other shapes: {shapes}", "the shapes that its arguments give")
     network.load_state_dict({key: v.to(device, torch.float32) for key, v in state.items()}, assign=True)
-    return network.eval()
+    return network.to(device).eval()

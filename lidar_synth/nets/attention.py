@@ -9,11 +9,9 @@ other side. After that all windows are alike, and a tile of queries together wit
 ordinary attention under one constant mask. Padding and tiling are done once, on the numbers of the tokens.
 """
 
-from typing import NamedTuple
-
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from lidar_synth.nets.layers import piece_length
 
@@ -24,14 +22,13 @@ TILE: Grid = (2, 16)
 """Queries of a tile at most. A larger one wastes more products and copies less; the result is the same."""
 
 
-class Neighbourhood(NamedTuple):
-    """A grid of tokens cut into tiles.
+class NeighbourhoodAttention(nn.Module):
+    """softmax(q k^T) v over the window around each token of a grid.
 
     Args:
-        tokens: (tiles, n) the tokens whose queries a tile holds; each token once.
-        keys: (tiles, m) the tokens of a tile and of its margin.
-        place: (N,) where each token stands in ``tokens``.
-        mask: (n, m) 0 where a key lies in a query's window, else -inf.
+        grid: rows and columns of tokens.
+        window: rows and columns of a neighbourhood, odd; no more rows than the grid, half of its columns at most
+            as many as the grid's.
     """
 
     tokens: Tensor
@@ -39,33 +36,30 @@ class Neighbourhood(NamedTuple):
     place: Tensor
     mask: Tensor
 
+    def __init__(self, grid: Grid, window: Grid) -> None:
+        super().__init__()
+        tile = (_divisor(grid[0], TILE[0]), _divisor(grid[1], TILE[1]))
+        span = (tile[0] + window[0] - 1, tile[1] + window[1] - 1)
+        numbers = torch.arange(grid[0] * grid[1], device="cpu").view(grid)  # real, even where weights are not (meta)
+        tokens = _tiles(numbers, tile, tile)
+        buffers = {
+            "tokens": tokens,  # (tiles, n) whose queries a tile holds; each token once
+            "keys": _tiles(_surround(numbers, window), span, tile),  # (tiles, m) those of a tile and of its margin
+            "place": tokens.flatten().argsort(),  # (N,) where each token stands in ``tokens``
+            "mask": _near(tile, window),  # (n, m) whether a key lies in a query's window
+        }
+        for name, buffer in buffers.items():
+            self.register_buffer(name, buffer, persistent=False)
 
-def neighbourhood(grid: Grid, window: Grid, device: torch.device, dtype: torch.dtype) -> Neighbourhood:
-    """The tiles of a grid for windows of odd size, no larger than the grid; ``mask`` in ``dtype``."""
-    tile = (_divisor(grid[0], TILE[0]), _divisor(grid[1], TILE[1]))
-    span = (tile[0] + window[0] - 1, tile[1] + window[1] - 1)
-    numbers = torch.arange(grid[0] * grid[1], device=device).view(grid)
-    tokens = _tiles(numbers, tile, tile)
-    mask = torch.zeros((), device=device, dtype=dtype).where(_near(tile, window, device), -torch.inf)
-    return Neighbourhood(tokens, _tiles(_surround(numbers, window), span, tile), tokens.flatten().argsort(), mask)
-
-
-def neighbourhood_attention(q: Tensor, k: Tensor, v: Tensor, near: Neighbourhood) -> Tensor:
-    """softmax(q k^T) v over the window around each token; q and k are scaled already.
-
-    Args:
-        q, k, v: (B, N, heads, D), tokens row by row.
-        near: the tiles of their grid.
-
-    Returns:
-        (B, N, heads, D).
-    """
-    length = piece_length(q, len(near.keys), near.keys.shape[1] * q[:, 0].numel())
-    out = []
-    for tokens, keys in zip(torch.split(near.tokens, length), torch.split(near.keys, length), strict=True):
-        h = F.scaled_dot_product_attention(_tiled(q, tokens), _tiled(k, keys), _tiled(v, keys), near.mask, scale=1.0)
-        out.append(h.transpose(1, 2).reshape(len(q), -1, *q.shape[2:]))
-    return _pick(torch.cat(out, 1), near.place)
+    def forward(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Queries, keys and values (B, N, heads, D), scaled already, tokens row by row, to (B, N, heads, D)."""
+        length = piece_length(q, len(self.keys), self.keys.shape[1] * q[:, 0].numel())
+        out = []
+        for tokens, keys in zip(torch.split(self.tokens, length), torch.split(self.keys, length), strict=True):
+            tiles = _tiled(q, tokens), _tiled(k, keys), _tiled(v, keys)
+            h = F.scaled_dot_product_attention(*tiles, self.mask, scale=1.0)
+            out.append(h.transpose(1, 2).reshape(len(q), -1, *q.shape[2:]))
+        return _pick(torch.cat(out, 1), self.place)
 
 
 def _tiled(x: Tensor, index: Tensor) -> Tensor:
@@ -98,10 +92,10 @@ def _tiles(x: Tensor, size: Grid, step: Grid) -> Tensor:
     return x.unfold(0, size[0], step[0]).unfold(1, size[1], step[1]).flatten(2).flatten(0, 1)
 
 
-def _near(tile: Grid, window: Grid, device: torch.device) -> Tensor:
+def _near(tile: Grid, window: Grid) -> Tensor:
     """(n, m) whether a key of a tile's span lies in the window of a query."""
     axes = []
     for size, reach in zip(tile, window, strict=True):
-        offset = torch.arange(size + reach - 1, device=device) - torch.arange(size, device=device)[:, None]
+        offset = torch.arange(size + reach - 1, device="cpu") - torch.arange(size, device="cpu")[:, None]
         axes.append((offset >= 0) & (offset < reach))
     return (axes[0][:, None, :, None] & axes[1][None, :, None, :]).flatten(2).flatten(0, 1)

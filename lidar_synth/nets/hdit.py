@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.nets.attention import Grid, neighbourhood
+from lidar_synth.nets.attention import Grid, NeighbourhoodAttention
 from lidar_synth.nets.layers import RMSNorm
 from lidar_synth.nets.positions import (
     LEARNED,
@@ -94,6 +94,7 @@ class HDiT(nn.Module):
         )
         self.time = TimeEmbedding(time_width, ratio, mapping_depth)
         self.rotary = nn.ModuleList(Rotary(g, h, w // h) for g, h, w in zip(self.grids, heads, widths, strict=True))
+        self.near = nn.ModuleList(NeighbourhoodAttention(grid, self.window) for grid in self.grids[:-1])
         self.tokenize = nn.Linear(cells * (channels + condition_channels), width, bias=False)
 
         def blocks(i: int) -> nn.ModuleList:
@@ -149,8 +150,8 @@ class HDiT(nn.Module):
     def _level(self, i: int, angles: Tensor, dtype: torch.dtype) -> Level:
         """What the blocks of level i share; its tokens look at ``angles`` (2, rows, columns)."""
         cosine, sine = self.rotary[i](angles)
-        near = neighbourhood(self.grids[i], self.window, angles.device, dtype) if i < len(self.grids) - 1 else None
-        return Level(cosine.to(dtype), sine.to(dtype), near)
+        near = self.near[i] if i < len(self.near) else None
+        return Level(cosine.to(dtype), sine.to(dtype), near)  # type: ignore[arg-type]  # a ModuleList holds any
 
     def _run(self, blocks: nn.Module, x: Tensor, time: Tensor, level: Level) -> Tensor:
         for block in blocks.children():

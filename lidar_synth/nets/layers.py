@@ -13,9 +13,9 @@ from torch import Tensor, nn
 EPS = 1e-6
 """Added to a mean square before its root is divided by."""
 
-PIECE = 6 << 20
-"""Floats of the largest temporary array on a CPU: 24 MB. From 32 MB on, glibc maps fresh memory for each array,
-and the faults of its pages cost more than the product that fills them."""
+PIECE = 1 << 20
+"""Floats of the largest temporary array of one piece on a CPU: 4 MB. Memory in larger blocks goes back to the system
+when it is freed, and each of its pages has to be asked for again."""
 
 
 def piece_length(x: Tensor, items: int, floats: int) -> int:

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidar_synth.nets.attention import Grid, Neighbourhood, neighbourhood_attention
+from lidar_synth.nets.attention import Grid, NeighbourhoodAttention
 from lidar_synth.nets.layers import EPS, AdaRMSNorm, GatedFeedForward, piece_length
 from lidar_synth.nets.positions import rotate
 
@@ -17,12 +17,12 @@ class Level(NamedTuple):
 
     Args:
         cosine, sine: (N, heads, D / 2) rotation of each token.
-        near: neighbourhoods; None where every token attends to all.
+        near: attention to the neighbourhood; None where every token attends to all.
     """
 
     cosine: Tensor
     sine: Tensor
-    near: Neighbourhood | None
+    near: NeighbourhoodAttention | None
 
 
 class SelfAttention(nn.Module):
@@ -50,7 +50,7 @@ class SelfAttention(nn.Module):
         pieces = [self._project(p, time, *t) for p, t in zip(torch.split(x, length, 1), tables, strict=True)]
         q, k, v = (torch.cat(z, 1) for z in zip(*pieces, strict=True))
         if level.near is not None:
-            h = neighbourhood_attention(q, k, v, level.near)
+            h = level.near(q, k, v)
         else:
             q, k, v = (z.transpose(1, 2) for z in (q, k, v))
             h = F.scaled_dot_product_attention(q, k, v, scale=1.0).transpose(1, 2)

@@ -6,6 +6,8 @@ import numpy as np
 
 from lidar_synth.town import fences
 from lidar_synth.town import furniture as fit
+from lidar_synth.town.boundaries import KINDS as BOUNDARIES
+from lidar_synth.town.boundaries import bound
 from lidar_synth.town.buildings import building
 from lidar_synth.town.facades import Plan, finishes
 from lidar_synth.town.furniture import Thing
@@ -36,6 +38,41 @@ def close_ends(street: Street, scene: Scene, rng: Rng) -> None:
             t += width + rng.uniform(1, 4)
 
 
+def line_side_streets(street: Street, scene: Scene, rng: Rng) -> None:
+    """Boundaries, houses and trees along the streets that meet this one; in full where the ego vehicle turns off."""
+    for c in street.crossings:
+        for side in c.sides:
+            if street.kind == "edge" or street.plaza == side:
+                continue
+            for way in (-1, 1):
+                edge = c.s + way * (c.half + c.pavement + 0.35)
+                kind = str(rng.choice(BOUNDARIES))
+                corner = street.front(side) + 1.0
+                _line(scene, (corner, corner + 18), edge, side, kind, rng)
+                t = corner + 20
+                while t < REACH:
+                    width = rng.uniform(9, 14)
+                    _line(scene, (t, t + width + 3), edge, side, kind, rng)
+                    near = street.turn == (c, side) and t < 60
+                    style, depth = str(rng.choice(["house", "house", "row", "block"])), rng.uniform(8, 10)
+                    plan = draw_house(style, width, depth, rng)
+                    mesh = building(plan, rng) if near else _plain_house(int(rng.integers(12)))
+                    low = t if side == LEFT else -t - width
+                    at = low if way < 0 else low + width
+                    house = Thing(mesh, finishes(rng), HOUSE)
+                    scene.put(house, edge + way * rng.uniform(2.5, 6), at, -way * np.pi / 2)
+                    for _ in range(rng.poisson(3)):
+                        species = str(rng.choice(["bush", "bush", "thuja", "fruit", "round"]))
+                        place = (2 * side - 1) * rng.uniform(t, t + width + 3)
+                        scene.put(fit.grown(species, rng, near=near), edge + way * rng.uniform(0.8, 3), place)
+                    t += width + rng.uniform(3, 6)
+
+
+def _line(scene: Scene, ends: tuple[float, float], at: float, side: int, kind: str, rng: Rng) -> None:
+    """A boundary along t on a side; ``ends`` are |t|."""
+    bound(scene, kind, ends if side == LEFT else (-ends[1], -ends[0]), at, False, rng)
+
+
 @cache
 def _plain_house(variant: int) -> Mesh:
     """A house that is only seen from afar."""
@@ -54,7 +91,7 @@ def second_row(street: Street, scene: Scene, rng: Rng) -> None:
             for s in np.arange(low, high, 9.0 + depth / 8):
                 far = not -REACH <= s <= street.length + REACH
                 t = street.front(side) + (12 if far and depth < 40 else depth) + rng.uniform(-4, 4)
-                crossed = any(side in c.sides and abs(s + 5 - c.s) < c.half + c.pavement + 7 for c in street.crossings)
+                crossed = any(side in c.sides and abs(s + 5 - c.s) < c.half + c.pavement + 20 for c in street.crossings)
                 if crossed or (street.plaza == side and t < street.front(side) + PLAZA_DEPTH + 20):
                     continue
                 if not open_land and rng.random() < 0.55:

@@ -73,9 +73,9 @@ def _skylights(slope: list[tuple[float, float, float]], count: int, rng: np.rand
     a, b, c, d = np.array(slope, float)
     up = np.cross(b - a, d - a)
     up = 0.04 * up / np.linalg.norm(up)
-    width, height = 0.8 / np.linalg.norm(b - a), 1.2 / np.linalg.norm(d - a)
+    width, height = 0.8 / float(np.linalg.norm(b - a)), 1.2 / float(np.linalg.norm(d - a))
     corners = []
-    for u in rng.uniform(0.1, 0.85, count):
+    for u in map(float, rng.uniform(0.1, 0.85, count)):
         edges = [(u, 0.4), (u + width, 0.4), (u + width, 0.4 + height), (u, 0.4 + height)]
         corners.append([(1 - v) * ((1 - s) * a + s * b) + v * ((1 - s) * d + s * c) + up for s, v in edges])
     return quads(np.array(corners).reshape(-1, 4, 3), GLASS)

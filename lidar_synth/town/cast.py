@@ -5,15 +5,14 @@ per frame the few rays that can meet a mover are carried into its own frame, so 
 """
 
 from collections.abc import Iterator
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import LibraryError
 from lidar_synth.town.meshes import Mesh
 from lidar_synth.town.scene import Placed
+from lidar_synth.town.solid import Solid
 from lidar_synth.town.world import World
 
 Floats = NDArray[np.float32]
@@ -33,43 +32,6 @@ class Hits(NamedTuple):
     distance: Floats
     surface: NDArray[np.int32]
     normal: Floats
-
-
-def _embree() -> tuple[Any, Any]:
-    try:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-    except ImportError as error:
-        raise LibraryError(
-            f"the town needs embreex, which does not import here ({error})",
-            "embreex 2.17 or later; there is no wheel for Linux on aarch64",
-            "Type 'pip install embreex', or read a dataset that was made elsewhere: everything but the town works.",
-        ) from error
-    return EmbreeScene, TriangleMesh
-
-
-class Solid:
-    """Triangles that rays can hit.
-
-    Args:
-        triangles: (F, 3, 3) float32 metres.
-
-    Raises:
-        LibraryError: where embreex is missing.
-    """
-
-    def __init__(self, triangles: Floats) -> None:
-        scene, mesh = _embree()
-        self._scene = scene()
-        self._mesh = mesh(self._scene, np.ascontiguousarray(triangles, np.float32))
-
-    def first(self, origins: Floats, directions: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
-        """Distance (inf = none), triangle (-1 = none) and normal (not unit) of the first hit of each ray."""
-        out = self._scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1)
-        face: NDArray[np.int32] = out["primID"]
-        distance: Floats = out["tfar"]
-        distance[face < 0] = np.inf
-        return distance, face, out["Ng"]
 
 
 class _Shape(NamedTuple):
@@ -104,7 +66,7 @@ class Stage:
     """
 
     def __init__(self, world: World, movers: list[Placed]) -> None:
-        self._solid, self._faces = _static(world), world.faces
+        self._solid, self._faces = world.solid, world.faces
         self.movers = movers
         shapes = [_shape(m.prototype.mesh) for m in movers]
         middles = [m.pose[:3, :3] @ (m.scale * s.middle) + m.pose[:3, 3] for m, s in zip(movers, shapes, strict=True)]
@@ -157,18 +119,3 @@ def trace(placed: Placed, origins: Floats, directions: Floats) -> tuple[Floats, 
     start = ((origins - placed.pose[:3, 3].astype(np.float32)) @ turn) / np.float32(placed.scale)
     found, face, normal = shape.solid.first(start, directions @ turn)
     return found * np.float32(placed.scale), placed.surfaces[shape.mesh.slot[face]], normal @ turn.T
-
-
-@cache
-def _static_cache() -> dict[int, tuple[World, Solid]]:
-    return {}
-
-
-def _static(world: World) -> Solid:
-    """The Embree scene of a stretch; the last two are kept."""
-    kept = _static_cache()
-    if id(world) not in kept:
-        while len(kept) > 1:
-            kept.pop(next(iter(kept)))
-        kept[id(world)] = (world, Solid(world.triangles))
-    return kept[id(world)][1]

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.sensor import Sensor, load_sensor
-from lidar_synth.town.cast import Solid
 from lidar_synth.town.meshes import Mesh, boxes, fan, merge, tube
+from lidar_synth.town.solid import Solid
 
 HEIGHT = 1.73
 """Metres of the sensor's origin above the road."""

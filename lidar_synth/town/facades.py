@@ -70,13 +70,15 @@ def finishes(rng: np.random.Generator) -> tuple[Finish, ...]:
     )  # fmt: skip
 
 
-def panels(rect: Array, deep: Array | float, frame: Frame) -> Array:
-    """(n, 4, 3) upright rectangles (n, 4: u0, u1, z0, z1) of a facade, ``deep`` metres behind its plane."""
+def panels(rect: Array, deep: float, frame: Frame) -> Array:
+    """(n, 4, 3) upright rectangles (n, 4: u0, u1, z0, z1) of a wall, ``deep`` metres behind its plane."""
     origin, along, inward = frame
-    u = rect[:, [0, 1, 1, 0]][..., None]
-    z = rect[:, [2, 2, 3, 3]][..., None]
-    depth = np.broadcast_to(np.asarray(deep, float).reshape(-1, 1, 1), u.shape)
-    return np.asarray(origin + u * along + z * np.array((0, 0, 1.0)) + depth * inward)
+    base = origin + deep * inward
+    corners = np.empty((len(rect), 4, 3))
+    for axis in (0, 1):
+        corners[..., axis] = base[axis] + rect[:, [0, 1, 1, 0]] * along[axis]
+    corners[..., 2] = base[2] + rect[:, [2, 2, 3, 3]]
+    return corners
 
 
 def reveals(rect: Array, deep: float, frame: Frame) -> Array:

@@ -71,6 +71,8 @@ def _park_crossing(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> Non
     if c.half < 2.9 and rng.random() < 0.5:
         return
     for side in c.sides:
+        if street.turn == (c, side):
+            continue
         sign = 2 * side - 1
         way = int(rng.choice([-1, 1]))
         t = street.edge[side] + 9.0 + rng.uniform(0, 5)

@@ -3,10 +3,11 @@
 Lots are drawn before the ground is laid, because driveways and yards are painted on it; ``yards`` builds them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidar_synth.town.boundaries import KINDS
 from lidar_synth.town.facades import Plan
 from lidar_synth.town.paving import PLAZA_DEPTH, Paint
 from lidar_synth.town.street import LEFT, RIGHT, Street
@@ -47,10 +48,8 @@ class Lot:
         return 2 * self.side - 1
 
 
-_BOUNDARIES = ("hedge", "hedge", "wall", "bars", "boards", "wire", "wallhedge", "wallhedge", "wallbars", "none")
-
-
 def draw_house(style: str, width: float, depth: float, rng: Rng) -> Plan:
+    """A house, row, block, shop or hall of the given width and depth in metres."""
     match style:
         case "house":
             roof = str(rng.choice(["gable", "cross", "hip"], p=[0.6, 0.25, 0.15]))
@@ -85,7 +84,7 @@ def draw_lots(street: Street, rng: Rng) -> list[Lot]:
     lots = []
     for side in (RIGHT, LEFT):
         front = street.front(side)
-        boundary = str(rng.choice(_BOUNDARIES))
+        boundary = str(rng.choice(KINDS))
         setback = rng.uniform(2.0, 8.0) if street.kind in ("residential", "edge") else rng.uniform(0.0, 6.0)
         for low, high in street.gaps(side, 1.0):
             s = low
@@ -129,8 +128,9 @@ def _draw_lot(
         middle = (room[0] + room[1]) / 2
         driveway = (middle - 1.4, middle + 1.4)
     if rng.random() < 0.25 and style not in ("shop", "row"):
-        boundary = str(rng.choice(_BOUNDARIES))
-    plan = draw_house(style, width, rng.uniform(8, 12), rng)
+        boundary = str(rng.choice(KINDS))
+    near = -45 < s + width / 2 < street.length + 50
+    plan = replace(draw_house(style, width, rng.uniform(8, 12), rng), detail=near)
     return Lot(
         s,
         end,

@@ -71,6 +71,8 @@ def merge(parts: Iterable[Mesh]) -> Mesh:
 
 
 def _slots(slot: Slots, shape: tuple[int, ...]) -> NDArray[np.int32]:
+    if isinstance(slot, int):
+        return np.full(int(np.prod(shape)), slot, np.int32)
     return np.broadcast_to(np.asarray(slot, np.int32), shape).reshape(-1)
 
 

@@ -64,10 +64,22 @@ def stand(movers: list[Mover], scene: Scene, time: float, about: tuple[float, fl
     ]
 
 
-def ego_place(street: Street, time: float) -> tuple[float, float]:
-    """Street coordinates of the ego vehicle at a time in seconds; it keeps its lane only nearly."""
-    s = street.speed * time
-    return s, float(street.lanes[0].t + 0.15 * np.sin(0.11 * s))
+def ego_place(street: Street, time: float) -> tuple[float, float, float]:
+    """Street coordinates of the ego vehicle at a time in seconds, and its yaw (radians) from the street's heading.
+
+    It keeps its lane, though only nearly, or turns off in an arc into the right lane of a side street.
+    """
+    way, lane = street.speed * time, street.lanes[0].t
+    if street.turn is None:
+        return way, float(lane + 0.15 * np.sin(0.11 * way)), 0.0
+    crossing, side = street.turn
+    sign = 2 * side - 1
+    radius = (4.0, 8.0)[side]
+    target = crossing.s + sign * crossing.half / 2
+    angle = float(np.clip((way - (target - radius)) / radius, 0, np.pi / 2))
+    beyond = max(0.0, way - (target - radius) - radius * np.pi / 2)
+    s = min(way, target - radius) + radius * np.sin(angle)
+    return float(s), float(lane + sign * (radius * (1 - np.cos(angle)) + beyond)), sign * angle
 
 
 def ego_pose(street: Street, scene: Scene, time: float, height: float, sway: NDArray[np.float64]) -> Pose:
@@ -79,7 +91,7 @@ def ego_pose(street: Street, scene: Scene, time: float, height: float, sway: NDA
         height: metres of the sensor above the ground.
         sway: (roll, pitch) of the body on its springs, radians.
     """
-    pose = scene.poses(*ego_place(street, time), 0.0, 4.0)
+    pose = scene.poses(*ego_place(street, time), 4.0)
     roll, pitch = sway
     rolled = np.array([(1, 0, 0), (0, np.cos(roll), -np.sin(roll)), (0, np.sin(roll), np.cos(roll))])
     pitched = np.array([(np.cos(pitch), 0, np.sin(pitch)), (0, 1, 0), (-np.sin(pitch), 0, np.cos(pitch))])

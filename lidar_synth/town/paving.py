@@ -83,6 +83,9 @@ def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> N
     if len(c.sides) == 1 and street.median:
         low, high = (low, -street.median) if RIGHT in c.sides else (street.median, high)
     paint((c.s - c.half, c.s + c.half), (low, high), asphalt)
+    if street.kind == "junction" and street.median:
+        # The strip between the ways ends before the zebra crossings.
+        paint((c.s - c.half - 6.5, c.s + c.half + 6.5), (-street.median, street.median), asphalt)
     if not street.marked or street.kind not in ("junction", "main", "square"):
         return
     for side in c.sides:

@@ -20,7 +20,6 @@ _GRAIN, _GLOSS = column("grain"), column("gloss")
 _GLASS = np.array([INDEX["glass"], INDEX["carglass"]])
 _CUT = {INDEX["leaf"]: 0.42, INDEX["wire"]: 0.78}
 """Share of these that the camera looks through."""
-_LUMA = np.array([0.3, 0.59, 0.11], np.float32)
 
 
 @dataclass(frozen=True)
@@ -177,12 +176,21 @@ def render(
         _, more = pixel_rays(pose, pixels[edge] + (du, dv))
         image[edge] += np.minimum(shade(stage, eye, more, surfaces, light)[0], 1.3)
     image[edge] /= 4
-    # Exposed for the ground: about the middle of the picture's lower half at a mid grey.
-    lower = image.reshape(height, width, 3)[height // 2 :]
-    exposure = np.clip(0.20 / max(float(np.median(lower @ _LUMA)), 0.02), 0.6, 3.5)
-    value = image.reshape(height, width, 3) * exposure
+    value = image.reshape(height, width, 3)
+    value *= _exposure(value)
     value += rng.standard_normal(value.shape, np.float32) * (0.004 + 0.012 * np.sqrt(np.clip(value, 0, 1)))
-    curve = np.clip(value, 0, None)
+    return develop(value)
+
+
+def _exposure(image: Floats) -> float:
+    """The factor that sets the middle of the picture's lower half to a mid grey."""
+    lower = image[len(image) // 2 :] @ np.array([0.3, 0.59, 0.11], np.float32)
+    return float(np.clip(0.20 / max(float(np.median(lower)), 0.02), 0.6, 3.5))
+
+
+def develop(image: Floats) -> NDArray[np.uint8]:
+    """uint8 sRGB of exposed linear RGB: what is too bright goes white slowly."""
+    curve = np.clip(image, 0, None)
     curve = np.clip(curve * (1 + 0.18 * curve) / (1 + 0.30 * curve), 0, 1) ** (1 / 2.2)
     return np.asarray(curve * 255 + 0.5, np.uint8)
 

@@ -63,6 +63,7 @@ class Street:
         median: half width of the strip between the ways, 0 = none.
         marked: whether lane markings are painted.
         plaza: the side with an open square (RIGHT, LEFT), or None.
+        turn: the side street into which the ego vehicle turns and the side to which, or None.
         ends: lowest and highest s of the street, where it meets another one and houses close the view; infinite
             where it goes on.
     """
@@ -78,6 +79,7 @@ class Street:
     median: float = 0.0
     marked: bool = True
     plaza: int | None = None
+    turn: tuple[SideStreet, int] | None = None
     ends: tuple[float, float] = (-np.inf, np.inf)
 
     def front(self, side: int) -> float:
@@ -94,8 +96,8 @@ class Street:
         return None
 
     def gaps(self, side: int, margin: float) -> list[tuple[float, float]]:
-        """Intervals of s, within reach, that no side street of a side takes."""
-        low, high = -REACH, self.length + REACH
+        """Intervals of s, within reach and the street's ends, that no side street of a side takes."""
+        low, high = max(-REACH, self.ends[0]), min(self.length + REACH, self.ends[1])
         gaps = []
         for c in sorted(self.crossings):
             if side in c.sides:
@@ -173,6 +175,8 @@ def _edge(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list
     return bands, [width, width], ["none", "none"], [Lane(-width / 2, 1), Lane(width / 2, -1)]
 
 
+_TURNS = {"residential": 0.3, "main": 0.1, "junction": 0.4, "square": 0.25, "edge": 0.0}
+"""How often the ego vehicle turns off, where there is a street to turn into."""
 _SPEEDS = {
     "residential": (6.5, 9.5),
     "main": (10.0, 14.5),
@@ -184,7 +188,8 @@ _SPEEDS = {
 
 def draw_street(kind: str, seconds: float, rng: np.random.Generator) -> Street:
     """A street of a kind, long enough for the ego vehicle to drive ``seconds``."""
-    speed = rng.uniform(*_SPEEDS[kind])
+    turns = rng.random() < _TURNS[kind]
+    speed = rng.uniform(4.5, 7.0) if turns else rng.uniform(*_SPEEDS[kind])
     length = speed * seconds
     median, marked, plaza = 0.0, True, None
     wide = kind == "main" or (kind in ("junction", "square") and rng.random() < 0.55)
@@ -198,7 +203,14 @@ def draw_street(kind: str, seconds: float, rng: np.random.Generator) -> Street:
     ends = _ends(kind, length, rng)
     if kind == "square":
         plaza = int(rng.integers(2))
+    crossings = _crossings(kind, length, ends, rng)
+    exits = [(c, side) for c in crossings for side in c.sides if 12 < c.s < length - 10]
+    if turns and not exits:
+        added = SideStreet(0.4 * length + 4, rng.uniform(2.7, 3.4), rng.uniform(1.5, 2.2), (RIGHT, LEFT))
+        crossings = (*(c for c in crossings if abs(c.s - added.s) > 30), added)
+        exits = [(added, RIGHT), (added, LEFT)]
+    turn = exits[rng.integers(len(exits))] if turns and exits else None
     return Street(
         kind, length, (edge[0], edge[1]), (tuple(bands[0]), tuple(bands[1])), tuple(lanes),
-        _crossings(kind, length, ends, rng), (parking[0], parking[1]), speed, median, marked, plaza, ends,
+        crossings, (parking[0], parking[1]), speed, median, marked, plaza, turn, ends,
     )  # fmt: skip

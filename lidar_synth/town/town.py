@@ -100,7 +100,8 @@ class Town:
         rng = generator(SCAN, self.seed, stretch, frame)
         world, time = self.world(index), frame * self.interval
         pose = ego_pose(world.street, world.scene, time, HEIGHT, rng.normal(0, 0.003, 2))
-        movers = stand(world.movers, world.scene, time, ego_place(world.street, time), 100.0)
+        about = ego_place(world.street, time)[:2]
+        movers = stand(world.movers, world.scene, time, about, self.sensor.range_max + 20)
         return Stage(world, movers), pose, rng
 
     def image(self, index: int) -> NDArray[np.uint8]:
@@ -137,7 +138,7 @@ class Town:
             points=points,
             reflectance=reflectance,
             sensor=self.sensor,
-            label=SEMANTIC_KITTI.decode(raw),
+            label=SEMANTIC_KITTI.decode(world.surfaces.raw)[surface],
             raw_label=raw | instance.astype(np.uint32) << np.uint32(16),
             instance=instance,
             ring=laser.astype(np.int16),

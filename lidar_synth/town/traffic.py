@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lidar_synth.town.bodywork import PAINTS
 from lidar_synth.town.furnish import draw_vehicle
 from lidar_synth.town.materials import RGB
-from lidar_synth.town.movers import Mover
+from lidar_synth.town.movers import Mover, ego_place
 from lidar_synth.town.paving import PLAZA_DEPTH
 from lidar_synth.town.people import CLOTHES, PHASES, cyclist, motorcyclist, walker
 from lidar_synth.town.prototype import Prototype
@@ -38,6 +38,14 @@ def _track(shape: Prototype, along: bool, at: float, start: float, velocity: flo
     return np.stack([s - half[0], s + half[0], t - half[1], t + half[1]], 1)
 
 
+def _ego_track(street: Street, times: Box) -> Box:
+    """``_track`` of the ego vehicle, 4.7 m long and 1.8 m wide, with 1.2 m around it."""
+    s, t, yaw = np.array([ego_place(street, time) for time in times]).T
+    along, across = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
+    half_s, half_t = 2.35 * along + 0.9 * across + 1.2, 2.35 * across + 0.9 * along + 1.2
+    return np.stack([s - half_s, s + half_s, t - half_t, t + half_t], 1)
+
+
 class Traffic:
     """All movers of a stretch.
 
@@ -49,8 +57,7 @@ class Traffic:
 
     def __init__(self, street: Street, scene: Scene, times: Box, rng: Rng) -> None:
         self._street, self._scene, self._times, self._rng = street, scene, times, rng
-        ego = vehicles()["estate"]
-        self._tracks = [_track(ego, True, street.lanes[0].t, 0.0, street.speed, times, 1.2)]
+        self._tracks = [_ego_track(street, times)]
         self.movers: list[Mover] = []
         self._drive()
         self._cross()
@@ -159,12 +166,14 @@ class Traffic:
             self._person(False, rng.uniform(-10, street.length + 40), rng.uniform(-10, 10))
 
     def _person(self, along: bool, at: float, start: float) -> None:
+        """Someone who walks, or on a pavement also stands."""
         rng = self._rng
-        bag = bool(rng.random() < 0.3)
-        shapes = tuple(walker(p, bag=bag) for p in range(PHASES))
+        bag, stands = bool(rng.random() < 0.3), along and bool(rng.random() < 0.2)
+        shapes = tuple(walker(p, stands, bag) for p in range(1 if stands else PHASES))
         scale = rng.uniform(0.6, 0.8) if rng.random() < 0.12 else rng.uniform(0.9, 1.08)
-        self._try(shapes, CLOTHES[rng.integers(len(CLOTHES))], along, at, start, int(rng.choice([-1, 1])),
-                  rng.uniform(0.9, 1.7), 0.25, 1.4 * scale, scale, solid=True)  # fmt: skip
+        way, speed = int(rng.choice([-1, 1])), 0.0 if stands else rng.uniform(0.9, 1.7)
+        colour = CLOTHES[rng.integers(len(CLOTHES))]
+        self._try(shapes, colour, along, at, start, way, speed, 0.25, 1.4 * scale, scale, solid=True)
 
     def _ride(self) -> None:
         """Cyclists at the right edge of the carriageway or on their own way."""

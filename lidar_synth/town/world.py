@@ -5,11 +5,12 @@ whoever asks for it and in whatever order.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.town.backdrop import close_ends, second_row
+from lidar_synth.town.backdrop import close_ends, line_side_streets, second_row
 from lidar_synth.town.course import Course, Relief
 from lidar_synth.town.furnish import furnish
 from lidar_synth.town.ground import KINDS, Ground
@@ -17,7 +18,8 @@ from lidar_synth.town.lots import draw_lots, paint_lots
 from lidar_synth.town.materials import SurfaceTable
 from lidar_synth.town.movers import Mover
 from lidar_synth.town.paving import pave
-from lidar_synth.town.scene import Placed, Scene
+from lidar_synth.town.scene import Scene
+from lidar_synth.town.solid import Solid
 from lidar_synth.town.street import KINDS as STREETS
 from lidar_synth.town.street import REACH, SHARES, Street, draw_street
 from lidar_synth.town.traffic import Traffic
@@ -56,9 +58,10 @@ class World:
     surfaces: SurfaceTable
     movers: list[Mover]
 
-    def parked(self) -> list[Placed]:
-        """Objects with an instance that are part of the static world."""
-        return self.scene.placed
+    @cached_property
+    def solid(self) -> Solid:
+        """The static world made ready for rays (half a second, once)."""
+        return Solid(self.triangles)
 
 
 def build_world(seed: int, stretch: int, interval: float) -> World:
@@ -91,6 +94,7 @@ def build_world(seed: int, stretch: int, interval: float) -> World:
     for lot in lots:
         build_lot(lot, street, scene, rng)
     close_ends(street, scene, rng)
+    line_side_streets(street, scene, rng)
     furnish(street, lots, scene, rng)
     second_row(street, scene, rng)
     movers = Traffic(street, scene, times, rng).movers

@@ -1,17 +1,15 @@
 """Building a lot: its house, its boundary, driveway, plants and what stands in its yard."""
 
-from itertools import pairwise
-
 import numpy as np
 
 from lidar_synth.town import fences
 from lidar_synth.town import furniture as fit
 from lidar_synth.town.bodywork import PAINTS
+from lidar_synth.town.boundaries import bound
 from lidar_synth.town.buildings import building, garage
 from lidar_synth.town.facades import finishes
 from lidar_synth.town.furniture import BUILDING, Thing
 from lidar_synth.town.lots import Lot
-from lidar_synth.town.materials import Finish
 from lidar_synth.town.scene import Scene
 from lidar_synth.town.street import LEFT, Street
 from lidar_synth.town.vehicles import vehicles
@@ -40,7 +38,7 @@ def build_lot(lot: Lot, street: Street, scene: Scene, rng: Rng) -> None:
             openings = [(middle - 0.6, middle + 0.6)]
         low = lot.start + 0.1
         for a, b in [*openings, (lot.end - 0.1, 0.0)]:
-            _bound(scene, lot.boundary, low, a, lot.sign * (lot.front + 0.3), rng)
+            bound(scene, lot.boundary, (low, a), lot.sign * (lot.front + 0.3), True, rng)
             low = b
     if lot.driveway:
         _use_driveway(scene, lot, house, rng)
@@ -53,51 +51,6 @@ def _put_facing(scene: Scene, thing: Thing, lot: Lot, s: float, front: float, wi
         scene.put(thing, s, front)
     else:
         scene.put(thing, s + width, -front, np.pi)
-
-
-def _bound(scene: Scene, kind: str, start: float, end: float, t: float, rng: Rng) -> None:
-    """A boundary along the street, in pieces that follow its bends."""
-    if end - start < 0.8:
-        return
-    height = rng.uniform(0.7, 1.25)
-    stone = (
-        Finish(str(rng.choice(["stone", "concrete", "brick"])))
-        if rng.random() < 0.6
-        else Finish("render", (0.8, 0.78, 0.72))
-    )
-    shade = float(rng.uniform(0.1, 0.5))
-    pieces = max(1, int(np.ceil((end - start) / 7)))
-    ends = np.linspace(start, end, pieces + 1)
-    for a, b in pairwise(ends):
-        for part in _boundary(kind, b - a, height, stone, shade, rng):
-            scene.put(part[0], a, t + part[1], 0.0, part[2])
-
-
-def _boundary(
-    kind: str, length: float, height: float, stone: Finish, shade: float, rng: Rng
-) -> list[tuple[Thing, float, float]]:
-    """(thing, shift of t, lift) of one piece."""
-    iron = (shade, shade, 1.1 * shade)
-    match kind:
-        case "hedge":
-            return [(fences.hedged(length, rng), 0.0, 0.0)]
-        case "wall":
-            return [(fences.low_wall(length, height, stone), 0.0, 0.0)]
-        case "bars":
-            return [(fences.bar_fence(length, height, 0.13, iron, False), 0.0, 0.0)]
-        case "boards":
-            return [(fences.bar_fence(length, height, 0.12, (0.5, 0.38, 0.25), True), 0.0, 0.0)]
-        case "wire":
-            return [(fences.wire_fence(length, height), 0.0, 0.0)]
-        case "wallhedge":
-            return [
-                (fences.low_wall(length, 0.4, stone), 0.0, 0.0),
-                (fences.hedged(length, rng), 0.4 if shade > 0.3 else -0.0, 0.35),
-            ]
-    return [
-        (fences.low_wall(length, 0.45, stone), 0.0, 0.0),
-        (fences.bar_fence(length, 0.7, 0.13, iron, False), 0.0, 0.5),
-    ]
 
 
 def _use_driveway(scene: Scene, lot: Lot, house: float, rng: Rng) -> None:

@@ -19,6 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.formats.files import write_file
 from lidar_synth.noise import gaussian, uniform
 from lidar_synth.normalize import TensorFormat
 from lidar_synth.projection import project
@@ -133,9 +134,7 @@ def _open_folder(folder: Path, facts: dict[str, Any], sensor: Sensor) -> tuple[I
 
 
 def _note(folder: Path, facts: dict[str, Any], done: int) -> None:
-    part = folder / "cache.json.part"
-    part.write_text(json.dumps(facts | {"done": done}, indent=1))
-    part.replace(folder / "cache.json")
+    write_file(folder / "cache.json", json.dumps(facts | {"done": done}, indent=1).encode())
 
 
 class Batch(NamedTuple):

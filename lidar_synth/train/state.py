@@ -11,11 +11,12 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.flow import METRICS
+from lidar_synth.formats.files import write_file
 from lidar_synth.train.schedules import SCHEDULES
 
 
@@ -98,14 +99,8 @@ class Training:
         tensors |= {f"average.{n}": p for n, p in self.average.state_dict().items()}
         for i, moments in self.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{i}.{n}": value for n, value in moments.items()}
-        part = path.with_name(f".{path.name}.part")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            save_file({n: t.detach().cpu().contiguous() for n, t in tensors.items()}, part, {"step": str(self.step)})
-            part.replace(path)
-        except (OSError, SafetensorError) as error:
-            part.unlink(missing_ok=True)
-            raise FileError(f"{path} cannot be written ({error})", "a folder on a disk with room") from error
+        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+        write_file(path, save(tensors, {"step": str(self.step)}))
 
     def load(self, path: Path) -> None:
         """Go on where ``save`` was called.

@@ -123,11 +123,11 @@ def on_cuda(net: nn.Module, rounds: int) -> None:
     half = full_network(None).cuda()
     half.load_state_dict(net.state_dict())
     half.to(torch.bfloat16)
-    for batch in (1, 2, 4, 8, 16, 32, 64):
+    for batch in (1, 4, 16, 64):
         noise = torch.randn(batch, 2, 64, 1024, device="cuda")
         torch.compiler.reset()
         torch.cuda.reset_peak_memory_stats()
-        fast = torch.compile(half, mode="max-autotune" if batch > 1 else "reduce-overhead")
+        fast = torch.compile(half, mode="reduce-overhead")  # CUDA graphs: no launch of single kernels
         times = []
         for velocity in (half, fast):
             for _ in range(3):

@@ -17,7 +17,7 @@ import multiprocessing
 from timing import machine
 
 from lidar_synth.town import STRETCH_FRAMES, Town
-from lidar_synth.town.cast import Solid
+from lidar_synth.town.solid import Solid
 from lidar_synth.town.world import build_world
 
 

@@ -1,0 +1,47 @@
+"""Triangles that rays can hit: the one place that knows Embree (PyPI ``embreex``)."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import LibraryError
+
+Floats = NDArray[np.float32]
+
+
+def _embree() -> tuple[Any, Any]:
+    try:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+    except ImportError as error:
+        raise LibraryError(
+            f"the town needs embreex, which does not import here ({error})",
+            "embreex 2.17 or later; there is no wheel for Linux on aarch64",
+            "Type 'pip install embreex', or read a dataset that was made elsewhere: everything but the town works.",
+        ) from error
+    return EmbreeScene, TriangleMesh
+
+
+class Solid:
+    """Triangles that rays can hit.
+
+    Args:
+        triangles: (F, 3, 3) float32 metres.
+
+    Raises:
+        LibraryError: where embreex is missing.
+    """
+
+    def __init__(self, triangles: Floats) -> None:
+        scene, mesh = _embree()
+        self._scene = scene()
+        self._mesh = mesh(self._scene, np.ascontiguousarray(triangles, np.float32))
+
+    def first(self, origins: Floats, directions: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
+        """Distance (inf = none), triangle (-1 = none) and normal (not unit) of the first hit of each ray."""
+        out = self._scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1)
+        face: NDArray[np.int32] = out["primID"]
+        distance: Floats = out["tfar"]
+        distance[face < 0] = np.inf
+        return distance, face, out["Ng"]

@@ -1,0 +1,194 @@
+"""The town on disk: the datasets' layouts, read back by the package's readers; runs that go on where they stopped."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidar_synth.cli.town import town as command
+from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.formats import KITTI360, KITTIObject, SemanticKITTI, open_scans
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import load_sensor
+from lidar_synth.town import LAYOUTS, Town, export_town
+from lidar_synth.town.export import _parts
+
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def town() -> Town:
+    return Town(seed=5, scans=COUNT)
+
+
+@pytest.fixture(scope="module")
+def scans(town: Town) -> list[Scan]:
+    return [town[i] for i in range(COUNT)]
+
+
+@pytest.fixture(scope="module", params=sorted(LAYOUTS))
+def written(request: pytest.FixtureRequest, town: Town, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    root = tmp_path_factory.mktemp(request.param)
+    assert export_town(town, root, request.param, camera=False, progress=False) == (COUNT, 0)
+    return request.param, root
+
+
+def test_points_come_back_bit_by_bit(written: tuple[str, Path], scans: list[Scan]) -> None:
+    layout, root = written
+    read = open_scans(root, split="train" if layout == "semantic_kitti" else None)
+    assert len(read) == COUNT
+    for i, scan in enumerate(scans):
+        assert np.array_equal(read[i].points, scan.points)
+        assert np.array_equal(read[i].reflectance, scan.reflectance)
+
+
+def test_labels_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:
+    layout, root = written
+    if layout == "kitti":
+        pytest.skip("KITTI's object set has no label per point")
+    read = open_scans(root)
+    for i, scan in enumerate(scans):
+        if layout == "semantic_kitti":
+            assert np.array_equal(read[i].raw_label, scan.raw_label)
+            assert np.array_equal(read[i].label, scan.label)
+        else:
+            # KITTI-360 has fewer classes: its riders and trunks are one with others.
+            assert (read[i].label == scan.label).mean() > 0.97  # type: ignore[union-attr]
+
+
+def test_poses_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:
+    layout, root = written
+    if layout == "kitti":
+        pytest.skip("KITTI's object set has no poses")
+    for i, scan in enumerate(scans):
+        pose = open_scans(root)[i].pose
+        assert pose is not None and scan.pose is not None
+        assert np.allclose(pose, scan.pose, atol=1e-5)
+
+
+def test_boxes_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:
+    layout, root = written
+    if layout == "semantic_kitti":
+        pytest.skip("SemanticKITTI has no boxes")
+    tolerance = 0.02 if layout == "kitti" else 1e-3
+    for i, scan in enumerate(scans):
+        read, boxes = open_scans(root)[i].boxes, scan.boxes
+        assert read is not None and boxes is not None
+        expected = boxes[boxes.truncation >= 0] if layout == "kitti" else boxes
+        assert len(read) >= len(expected) > 0
+        for value, name in zip(expected.values, expected.names, strict=True):
+            apart = np.linalg.norm(read.values[:, :3] - value[:3], axis=1)
+            match = int(apart.argmin())
+            assert apart[match] < 3 * tolerance
+            assert np.allclose(read.values[match, 3:6], value[3:6], atol=tolerance)
+            if layout == "kitti":
+                assert read.names[match] == name
+
+
+def test_a_kitti_label_tells_what_the_camera_sees(written: tuple[str, Path], scans: list[Scan]) -> None:
+    layout, root = written
+    if layout != "kitti":
+        pytest.skip("only KITTI's object set")
+    read = KITTIObject(root)[0].boxes
+    boxes = scans[0].boxes
+    assert read is not None and boxes is not None
+    seen = boxes[boxes.truncation >= 0]
+    for i, value in enumerate(seen.values):
+        match = int(np.linalg.norm(read.values[:, :3] - value[:3], axis=1).argmin())
+        assert read.occlusion[match] == seen.occlusion[i]
+        assert np.allclose(read.image_box[match], seen.image_box[i], atol=0.006)
+        assert read.truncation[match] == pytest.approx(seen.truncation[i], abs=0.006)
+
+
+def test_the_calibration_comes_back(written: tuple[str, Path], town: Town, scans: list[Scan]) -> None:
+    _, root = written
+    camera = open_scans(root).calibration(0)
+    assert camera is not None
+    expected, depth = town.calibration.pixels(scans[0].points)
+    found, _ = camera.pixels(scans[0].points)
+    ahead = depth > 1
+    assert np.allclose(found[ahead], expected[ahead], atol=0.01)
+
+
+def test_the_folder_says_what_it_holds(written: tuple[str, Path]) -> None:
+    layout, root = written
+    text = (root / "README.md").read_text()
+    assert "synthetic" in text and "not KITTI-360" in text and layout in text
+    assert json.loads((root / "town.json").read_text())["seed"] == 5
+
+
+def test_readers_of_each_layout_take_it(written: tuple[str, Path]) -> None:
+    layout, root = written
+    if layout == "kitti360":
+        assert len(KITTI360(root, split="r2flow/train")) == len(KITTI360(root, split="lidm/train")) == COUNT
+    if layout == "semantic_kitti":
+        assert len(SemanticKITTI(root, split="train")) == COUNT
+        times = [float(line) for line in (root / "sequences" / "00" / "times.txt").read_text().split()]
+        assert np.allclose(times, [0, 0.4, 0.8])
+
+
+def test_a_run_goes_on_where_it_stopped(tmp_path: Path, town: Town) -> None:
+    assert export_town(town, tmp_path, "semantic_kitti", camera=False, progress=False) == (COUNT, 0)
+    scan = tmp_path / "sequences" / "00" / "velodyne" / "000001.bin"
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    scan.unlink()
+    assert export_town(town, tmp_path, "semantic_kitti", camera=False, progress=False) == (1, 2)
+    after = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    # The poses of a whole folder are read and written again, with the rounding of a matrix product.
+    poses = tmp_path / "sequences" / "00" / "poses.txt"
+    rows = [np.array(files.pop(poses).split(), float) for files in (before, after)]
+    assert after == before and np.allclose(*rows)
+    longer = Town(seed=5, scans=COUNT + 1)
+    assert export_town(longer, tmp_path, "semantic_kitti", camera=False, progress=False) == (1, COUNT)
+
+
+def test_a_folder_with_another_town_is_refused(tmp_path: Path, town: Town) -> None:
+    export_town(Town(seed=5, scans=0), tmp_path, "kitti", camera=False, progress=False)
+    with pytest.raises(ConfigError, match=r"holds a town with .*'seed': 5"):
+        export_town(Town(seed=6, scans=1), tmp_path, "kitti", camera=False, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("layout", "jobs", "sequence"), [("kitti-360", 1, None), ("kitti360", 0, None), ("kitti360", 1, 100)]
+)
+def test_wrong_calls_are_refused(tmp_path: Path, town: Town, layout: str, jobs: int, sequence: int | None) -> None:
+    with pytest.raises(ConfigError):
+        export_town(town, tmp_path / "out", layout, jobs=jobs, sequence=sequence)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unwritable_target_is_named(tmp_path: Path, town: Town) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FileError, match="cannot be written"):
+        export_town(town, tmp_path / "file" / "out", "kitti360", camera=False, progress=False)
+
+
+def test_processes_write_the_same_files(tmp_path: Path, town: Town) -> None:
+    for jobs in (1, 2):
+        export_town(town, tmp_path / str(jobs), "kitti360", camera=False, jobs=jobs, progress=False)
+    one, two = (
+        {p.relative_to(tmp_path / j): p.read_bytes() for p in (tmp_path / j).rglob("*") if p.is_file()} for j in "12"
+    )
+    assert one == two
+
+
+def test_work_is_parted_by_stretch() -> None:
+    assert _parts(list(range(45)), 1) == [list(range(20)), list(range(20, 40)), list(range(40, 45))]
+    assert _parts([3, 4, 5, 6], 2) == [[3, 4], [5, 6]]
+    assert _parts([19, 20], 1) == [[19], [20]]
+
+
+def test_the_command_writes_pictures_and_takes_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command(tmp_path / "a", scans=1, seed=5, layout="kitti")
+    assert "1 scans written, 0 were there already" in capsys.readouterr().out
+    scan = KITTIObject(tmp_path / "a")[0]
+    assert scan.image_path is not None
+    from PIL import Image
+
+    with Image.open(scan.image_path) as image:
+        assert image.size == (1408, 376)
+        assert np.array_equal(np.asarray(image), Town(seed=5, scans=1).image(0))
+    command(tmp_path / "b", scans=1, sensor="hdl32e_nuscenes", camera=False, layout="semantic_kitti")
+    read = SemanticKITTI(tmp_path / "b", sensor="hdl32e_nuscenes")[0]
+    assert len(read) > 5000 and read.sensor == load_sensor("hdl32e_nuscenes")
