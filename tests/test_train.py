@@ -1,6 +1,7 @@
 """Training: data that follow from their position, schedules, the state through a kill, the loop."""
 
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
