@@ -20,9 +20,7 @@ header, which holds that of the weights. Nothing is ever unpickled.
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -30,10 +28,11 @@ from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files import write_file
 from lidar_synth.nets import assemble
 from lidar_synth.normalize import LABEL_BITS, Normalisation, TensorFormat
 from lidar_synth.sensor import Sensor
@@ -189,7 +188,7 @@ def save_checkpoint(
         text = json.dumps({**header.to_dict(), "weights": _sum(tensors)}, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"a header with a value that JSON does not hold ({error})", "plain, finite values") from error
-    _write(path, tensors, {"lidar_synth": text})
+    write_file(path, save(tensors, {"lidar_synth": text}), durable=True)
     return _hash(text)
 
 
@@ -253,21 +252,6 @@ def _read(path: Path, weights: bool = True) -> tuple[str, Header, dict[str, Tens
         return text, Header.from_dict(values), tensors
     except (ValueError, AttributeError) as error:  # a ConfigError is a ValueError
         raise DataError(f"{path}: {error}") from error
-
-
-def _write(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(tensors, part, metadata)
-        with part.open("r+b") as file:
-            os.fsync(file.fileno())
-        part.replace(path)
-    except (OSError, SafetensorError) as error:
-        raise FileError(f"checkpoint {path} cannot be written ({error})", "a folder on a disk with room") from error
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
 
 
 def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:

@@ -5,6 +5,7 @@ and left out. Each worker process has its own copy of source and writer, and the
 whole folder at the end.
 """
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -175,7 +176,9 @@ def in_processes(
     if jobs == 1 or len(items) < 2:
         yield map(work, items)
         return
-    # Spawned, not forked: the parent may hold threads (numba, torch) that a fork would break.
+    # Spawned, not forked: the parent may hold threads (numba, torch) that a fork would break. One process per core
+    # does the work: threads inside numpy would only fight for the cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
         try:
             yield pool.map(_next, items, chunksize=chunk)

@@ -12,8 +12,8 @@ import pytest
 from layouts import MAKERS, formats, nuscenes_arrays, some_scan, write_all, write_nuscenes
 
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
+from lidar_synth.files import write_file
 from lidar_synth.formats import READERS, WRITERS, NuScenes, SemanticKITTI, open_scans
-from lidar_synth.formats.files import write_file
 from lidar_synth.formats.points import read_points
 
 RAW = ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw", "folder"]

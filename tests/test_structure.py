@@ -5,9 +5,9 @@ from pathlib import Path
 
 import lidar_synth
 
-ORDER = """errors classes sensor scan projection normalize noise nets codec conditions flow solvers timesteps distill
-checkpoint importers generator labels augment formats bank mixing service convert bake town metrics train config viz
-doctor cli""".split()
+ORDER = """errors files classes sensor scan projection normalize noise nets codec conditions flow solvers timesteps
+distill checkpoint importers generator labels augment formats bank mixing service convert bake town metrics train config
+viz doctor cli""".split()
 """A module may import only from those before it."""
 
 PACKAGE = Path(lidar_synth.__file__).parent

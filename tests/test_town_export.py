@@ -147,7 +147,7 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path, town: Town) -> None:
 
 def test_a_folder_with_another_town_is_refused(tmp_path: Path, town: Town) -> None:
     export_town(Town(seed=5, scans=0), tmp_path, "kitti", camera=False, progress=False)
-    with pytest.raises(ConfigError, match=r"holds a town with .*'seed': 5"):
+    with pytest.raises(ConfigError, match=r"was filled with .*'seed': 5"):
         export_town(Town(seed=6, scans=1), tmp_path, "kitti", camera=False, progress=False)
 
 
@@ -176,7 +176,8 @@ def test_processes_write_the_same_files(tmp_path: Path, town: Town) -> None:
 
 
 def test_work_is_parted_by_stretch() -> None:
-    assert _parts(list(range(45)), 1) == [list(range(20)), list(range(20, 40)), list(range(40, 45))]
+    assert _parts(list(range(3)), 1) == [[0], [1], [2]]
+    assert _parts(list(range(45)), 2) == [list(range(20)), list(range(20, 40)), list(range(40, 45))]
     assert _parts([3, 4, 5, 6], 2) == [[3, 4], [5, 6]]
     assert _parts([19, 20], 1) == [[19], [20]]
 

@@ -8,6 +8,7 @@ the procedural town, not KITTI-360. Running it again goes on where it stopped.
 """
 
 import argparse
+import os
 import subprocess
 import sys
 import time
@@ -59,9 +60,8 @@ def main() -> None:
     start = time.monotonic()
     town, page = given.out / "town", given.out / "index.html"
     command("doctor")
-    command(
-        "town", str(town), "--scans", str(given.scans), "--seed", str(given.seed), "--layout", "kitti360", "--camera"
-    )
+    wanted = ("--scans", str(given.scans), "--seed", str(given.seed), "--layout", "kitti360")
+    command("town", str(town), *wanted, "--jobs", str(os.cpu_count() or 1))
     source = open_scans(town)
     found = there_and_back([source[i] for i in range(len(source))])
     print(found)

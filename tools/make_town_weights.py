@@ -20,7 +20,7 @@ import torch
 from lidar_synth.checkpoint import load_checkpoint, read_header, save_checkpoint
 from lidar_synth.cli.run import run
 from lidar_synth.config import DistillConfig, TrainConfig, load_config
-from lidar_synth.formats.files import write_file
+from lidar_synth.files import write_file
 
 ROOT = Path(__file__).parents[1]
 PLATEAU = 0.75

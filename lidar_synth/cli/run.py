@@ -26,7 +26,7 @@ from lidar_synth import __version__
 from lidar_synth.checkpoint import VELOCITY, Header, Part, load_checkpoint, save_checkpoint
 from lidar_synth.config import DistillConfig, Run, TrainConfig
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.formats.files import write_file
+from lidar_synth.files import write_file
 from lidar_synth.generator import Generator
 from lidar_synth.nets import build_network
 from lidar_synth.normalize import TensorFormat

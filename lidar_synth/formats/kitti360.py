@@ -29,11 +29,11 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import KITTI360 as CLASSES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.files import (
+from lidar_synth.files import (
     list_files,
     read_file,
 )
+from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES, WorldBoxes, read_boxes, write_boxes
 from lidar_synth.formats.kitti360_poses import CAMERA, read_calibration, read_poses, write_calibration, write_poses
 from lidar_synth.formats.point_labels import decode_labels, encode_labels, mismatch, write_labels

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.formats.files import numbers, unreadable, write_file
+from lidar_synth.files import numbers, unreadable, write_file
 from lidar_synth.scan import Boxes
 
 MARGIN = 100

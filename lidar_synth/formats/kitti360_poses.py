@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.files import numbers, read_matrix, read_named_matrices, write_file, write_named_matrices
 from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
-from lidar_synth.formats.files import numbers, read_matrix, read_named_matrices, write_file, write_named_matrices
 
 CAMERA = ideal_camera(552.554261, (1408, 376))
 """What ``calibration`` describes where no camera is known: image_00's size and focal length, at the sensor."""

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.files import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.files import read_text, write_file
 from lidar_synth.scan import Boxes
 
 

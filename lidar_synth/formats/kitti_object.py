@@ -18,8 +18,7 @@ from typing import Literal
 import numpy as np
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
-from lidar_synth.formats.files import (
+from lidar_synth.files import (
     list_files,
     png_size,
     read_named_matrices,
@@ -27,6 +26,7 @@ from lidar_synth.formats.files import (
     write_file,
     write_named_matrices,
 )
+from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
 from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
 from lidar_synth.formats.points import read_points, write_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose

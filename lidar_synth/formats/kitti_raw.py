@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from lidar_synth.errors import DataError
+from lidar_synth.files import list_files, png_size, read_file, read_named_matrices
 from lidar_synth.formats.calibration import Calibration, homogeneous
-from lidar_synth.formats.files import list_files, png_size, read_file, read_named_matrices
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.scan import Boxes, Scan

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.formats.files import SKIP_HINT, read_file, write_file
+from lidar_synth.files import SKIP_HINT, read_file, write_file
 from lidar_synth.scan import POINT_FIELDS, Boxes, RangeImage, Scan
 from lidar_synth.sensor import Sensor
 

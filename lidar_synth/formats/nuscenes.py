@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import NUSCENES
 from lidar_synth.errors import DataError
-from lidar_synth.formats.files import SKIP_HINT, list_files, read_text, read_values
+from lidar_synth.files import SKIP_HINT, list_files, read_text, read_values
 from lidar_synth.formats.point_labels import mismatch
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError, FileError, LibraryError
-from lidar_synth.formats.files import SKIP_HINT, read_file, write_file
+from lidar_synth.files import SKIP_HINT, read_file, write_file
 from lidar_synth.scan import Scan
 
 STORED = {"label": "u1", "raw_label": "i4", "instance": "i4", "ring": "i4", "confidence": "f4"}

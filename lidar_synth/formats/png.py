@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import COLOURS, IGNORE
 from lidar_synth.errors import DataError
+from lidar_synth.files import SKIP_HINT, list_files, read_file, write_file
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.files import SKIP_HINT, list_files, read_file, write_file
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import Picture, Writer

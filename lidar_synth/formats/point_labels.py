@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE, Taxonomy
 from lidar_synth.errors import DataError
-from lidar_synth.formats.files import read_values, write_file
+from lidar_synth.files import read_values, write_file
 from lidar_synth.scan import Scan
 
 

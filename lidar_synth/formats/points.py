@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.formats.files import SKIP_HINT, unreadable, write_file
+from lidar_synth.files import SKIP_HINT, unreadable, write_file
 from lidar_synth.scan import Scan
 
 FARTHEST = 1e5

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import SEMANTIC_KITTI
 from lidar_synth.errors import DataError
-from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
-from lidar_synth.formats.files import (
+from lidar_synth.files import (
     list_files,
     numbers,
     png_size,
@@ -30,6 +29,7 @@ from lidar_synth.formats.files import (
     write_file,
     write_named_matrices,
 )
+from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import read_points, write_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose

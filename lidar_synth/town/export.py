@@ -3,23 +3,18 @@
 The unit of work is a stretch of road, or a part of one, because its world has to be built once per process.
 """
 
-import json
-import os
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 from tqdm import tqdm
 
+from lidar_synth.convert import in_processes
 from lidar_synth.errors import ConfigError
-from lidar_synth.formats.files import read_text, write_file
+from lidar_synth.files import write_file
 from lidar_synth.formats.kitti360 import KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
-from lidar_synth.formats.writer import Writer
+from lidar_synth.formats.writer import Writer, claim
 from lidar_synth.town.town import Town
 from lidar_synth.town.world import STRETCH_FRAMES
 
@@ -87,7 +82,7 @@ def export_town(
     work = partial(_write_some, town, writer, names, camera)
     with (
         tqdm(total=len(missing), unit="scan", disable=not progress) as bar,
-        _pool(work, _parts(missing, jobs), jobs) as done,
+        in_processes(work, _parts(missing, jobs), jobs) as done,
     ):
         for count in done:
             bar.update(count)
@@ -100,25 +95,17 @@ def export_town(
 
 def _claim(out: Path, town: Town, layout: str, sequence: int, camera: bool) -> None:
     """Say in the folder what it holds; refuse one that holds something else."""
-    settings = {"layout": layout, "sequence": sequence, "seed": town.seed, "sensor": town.sensor.to_dict(),
-                "interval": town.interval, "camera": camera}  # fmt: skip
-    path = out / SETTINGS
-    if path.is_file():
-        there = json.loads(read_text(path))
-        other = {k: there.get(k) for k, v in settings.items() if there.get(k) != json.loads(json.dumps(v))}
-        if other:
-            raise ConfigError(f"{out} holds a town with {other}", f"{ {k: settings[k] for k in other} }",
-                              "Type the same options to go on with it, or another folder.")  # fmt: skip
-    else:
-        text = _README.format(layout=layout, sensor=town.sensor.name, seed=town.seed, interval=town.interval,
-                              frames=STRETCH_FRAMES, settings=SETTINGS)  # fmt: skip
+    facts = {"layout": layout, "sequence": sequence, "seed": town.seed, "interval": town.interval, "camera": camera}
+    claim(out / SETTINGS, facts | {"sensor": town.sensor.to_dict()})
+    if not (out / "README.md").exists():
+        text = _README.format(**facts, sensor=town.sensor.name, frames=STRETCH_FRAMES, settings=SETTINGS)
         write_file(out / "README.md", text.encode())
-        write_file(path, json.dumps(settings, indent=1).encode())
 
 
 def _parts(indices: list[int], jobs: int) -> list[list[int]]:
-    """The indices by stretch, in pieces small enough that every job has some."""
-    most = max(1, min(STRETCH_FRAMES, -(-len(indices) // jobs)))
+    """The indices in pieces of a stretch, small enough that every job has some; one by one for one process, which
+    keeps its stretch."""
+    most = 1 if jobs == 1 else max(1, min(STRETCH_FRAMES, -(-len(indices) // jobs)))
     parts: list[list[int]] = []
     for i in indices:
         if parts and len(parts[-1]) < most and parts[-1][-1] // STRETCH_FRAMES == i // STRETCH_FRAMES:
@@ -132,33 +119,3 @@ def _write_some(town: Town, writer: Writer, names: list[str | None], camera: boo
     for i in indices:
         writer.write(town[i], i, name=names[i], image=town.image(i) if camera else None)
     return len(indices)
-
-
-_work: partial[int] | None = None
-
-
-def _start(work: "partial[int]") -> None:
-    """Give a worker its town once, and not with every part."""
-    global _work
-    _work = work
-
-
-def _next(indices: list[int]) -> int:
-    assert _work is not None, "a worker that was not started by export_town"
-    return _work(indices)
-
-
-@contextmanager
-def _pool(work: "partial[int]", parts: list[list[int]], jobs: int) -> Iterator[Iterator[int]]:
-    """The sizes of the parts as they are done."""
-    if jobs == 1 or len(parts) < 2:
-        yield map(work, parts)
-        return
-    # One process per core does the work: threads inside numpy would only fight for the cores.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
-        try:
-            yield pool.map(_next, parts)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise

@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.formats.files import write_file
+from lidar_synth.files import write_file
 from lidar_synth.noise import gaussian, uniform
 from lidar_synth.normalize import TensorFormat
 from lidar_synth.projection import project

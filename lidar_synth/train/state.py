@@ -15,8 +15,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files import write_file
 from lidar_synth.flow import METRICS
-from lidar_synth.formats.files import write_file
 from lidar_synth.train.schedules import SCHEDULES
 
 

@@ -17,12 +17,13 @@ from lidar_synth.errors import DataError, FileError
 SKIP_HINT = "Copy the file again, or leave it out with on_bad='skip'."
 
 
-def write_file(path: Path, content: bytes | Callable[[BinaryIO], object]) -> None:
+def write_file(path: Path, content: bytes | Callable[[BinaryIO], object], *, durable: bool = False) -> None:
     """Write beside ``path``, then rename; a failure leaves what was there before.
 
     Args:
         path: where the file will stand; its folder is made.
         content: the bytes, or a function that writes them to an open binary file.
+        durable: have the bytes on the disk before the rename, so that a power cut leaves a whole file too.
 
     Raises:
         FileError: where the target cannot be written or the disk is full.
@@ -35,6 +36,9 @@ def write_file(path: Path, content: bytes | Callable[[BinaryIO], object]) -> Non
                 content(file)
             else:
                 file.write(content)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
         raise FileError(
