@@ -11,6 +11,7 @@ The folder holds::
 """
 
 import json
+import math
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -101,7 +102,7 @@ def plan_teacher(config: TrainConfig) -> Plan:
     if config.init is not None:
         start = load_checkpoint(config.init)
         _check_init(config, start.header)
-        provenance |= {"init": start.hash}
+        provenance |= {"init": start.hash, "init_provenance": start.header.provenance}
         header = replace(start.header, time_grid=uniform_grid(config.steps), provenance=provenance)
         return Plan(start.networks[VELOCITY], task, header)
     sensor = load_sensor(config.sensor)
@@ -148,7 +149,7 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
     velocity = teacher.networks[VELOCITY].requires_grad_(False)
     if config.compile:
         velocity.compile()
-    provenance = _provenance(config) | {"teacher": teacher.hash, "strategy": config.strategy}
+    provenance = _provenance(config) | {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
     grid = config.grid or uniform_grid(config.intervals)
     if config.grid is None and config.strategy == "adaptive_piecewise":
         with accelerator.main_process_first():
@@ -199,9 +200,9 @@ def _train(config: Run, plan: Plan, training: Training, accelerator: "Accelerato
         cache = cache_scans(source, sensor, tensors.channels, folder, config.data.describe())
     data = Batches(cache, tensors, config.seed, config.data.flip, config.data.roll, accelerator.device)
     log = _Log(config, training.step) if accelerator.is_main_process else None
-    end = time.monotonic() + 60 * minutes if minutes is not None else float("inf")
-    late = False
+    end = math.inf if minutes is None else time.monotonic() + 60 * minutes
     for record in steps(training, plan.task, data, accelerator):
+        # All processes stop at the same step, whose clock ever is ahead.
         late = accelerator.reduce(torch.tensor(float(time.monotonic() > end), device=accelerator.device)).item() > 0
         last = late or record.step == config.recipe.iterations
         if log is not None:

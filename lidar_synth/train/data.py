@@ -61,8 +61,7 @@ class ImageCache:
 
     def write(self, index: int, image: RangeImage) -> None:
         """Put a range image into its place."""
-        steps = np.rint(image.range * (65535 / self.sensor.range_max))
-        self.fields["range"][index] = np.where(image.mask, steps.clip(1, 65535), 0)
+        self.fields["range"][index] = np.rint(image.range * (65535 / self.sensor.range_max)).clip(max=65535)
         if "reflectance" in self.fields:
             self.fields["reflectance"][index] = np.rint(image.channels["reflectance"].clip(0, 1) * 255)
         if "label" in self.fields:
