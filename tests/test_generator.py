@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
+from layouts import formats
 from typer.testing import CliRunner
 
 import lidar_synth.generator as module
 from lidar_synth.checkpoint import VELOCITY, Header, Part, save_checkpoint
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.formats import WRITERS, open_scans
+from lidar_synth.formats import open_scans
 from lidar_synth.generator import Generator, load_generator, shipped_models
 from lidar_synth.nets import build_network
 from lidar_synth.noise import gaussian
@@ -182,7 +183,7 @@ def test_a_gpu_is_refused_where_there_is_none_and_in_a_worker(
     assert generator.scans(0, [0])
 
 
-@pytest.mark.parametrize("form", WRITERS)
+@pytest.mark.parametrize("form", formats())
 def test_sample_writes_every_format_and_goes_on(form: str, path: Path, tmp_path: Path) -> None:
     from lidar_synth.cli import app
 
