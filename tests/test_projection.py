@@ -11,7 +11,8 @@ from hypothesis.extra import numpy as hnp
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.projection import fill_points, locate, project, project_batch, unfold, unproject, unproject_batch
-from lidar_synth.projection.angles import asin, atan2, torch_asin, torch_atan2
+from lidar_synth.projection.batch import torch_asin, torch_atan2
+from lidar_synth.projection.kernels import asin, atan2
 from lidar_synth.scan import RangeImage, Scan
 from lidar_synth.sensor import Sensor, presets
 
@@ -105,6 +106,8 @@ def test_conventions() -> None:
     cell = locate(points, sensor).cell
     assert (cell % 32).tolist() == [16, 15, 23, 0, 31, 16]
     assert cell[5] // 32 < cell[0] // 32
+    for just_left_and_right_of_the_seam in ([-9, 1e-9, 0], [-9, 0, 0], [-9, -1e-9, 0]):  # +-pi in float32
+        assert locate(np.array([just_left_and_right_of_the_seam], np.float32), sensor).cell % 32 == 0
     straight_up = locate(np.array([[0, 0, 9], [0, 0, -9]], np.float32), sensor).cell
     assert (straight_up // 32).tolist() == [0, 7]
 
@@ -173,6 +176,38 @@ def test_a_known_ring_needs_no_order() -> None:
     scan.ring = rows
     mixed = np.random.default_rng(1).permutation(len(scan))
     assert np.allclose(unfold(scan[mixed]).range, image.range, rtol=3e-7)
+
+
+def test_a_table_of_beams_is_cut_halfway_between_them() -> None:
+    sensor = SMALL["table"]
+    beams = np.radians(sensor.elevations)
+    halves = (beams[1:] + beams[:-1]) / 2
+    for row, half in enumerate(halves):
+        for side, expected in ((1e-4, row), (-1e-4, row + 1)):
+            point = np.array([[np.cos(half + side), 0, np.sin(half + side)]], np.float32) * 10
+            assert locate(point, sensor).cell // 16 == expected
+
+
+def test_neighbours_are_asked_across_the_seam_but_not_beyond_the_cutoff() -> None:
+    sensor = SMALL["linear"]
+    image = np.full(sensor.shape, 30, np.float32)
+    labels = np.full(sensor.shape, 12, np.uint8)
+    image[:, -4:], labels[:, -4:] = 20, 3
+    shown = unproject(RangeImage(image, sensor)).points
+    rays = sensor.ray_directions()
+    behind_column_0 = rays[4, 0] * 50  # all neighbours differ by more than a metre: the nearest in range
+    at_the_seam = rays[4, -1] * 30.2  # hidden behind a cell at 20 m: its wall goes on in columns 0 and 1
+    crowd = rays[4, 10] * 30.9  # four of five votes are within the cutoff
+    points = np.concatenate([shown, [behind_column_0, at_the_seam, crowd]]).astype(np.float32)
+    filled = fill_points(labels, image, locate(points, sensor))
+    assert filled[-3:].tolist() == [12, 12, 12]
+    image[4, 10], image[3:6, 9], image[3:6, 11] = 28, 33, 33  # one near neighbour, many beyond the cutoff
+    labels[3:6, 9:12] = 7
+    image[2, 10], labels[2, 10] = 31, 5
+    points[-1] = rays[4, 10] * 31.1
+    shown = unproject(RangeImage(image, sensor)).points
+    filled = fill_points(labels, image, locate(np.concatenate([shown, points[-1:]]), sensor), k=5, window=5, cutoff=0.5)
+    assert filled[-1] == 5
 
 
 def test_hidden_points_ask_their_neighbours() -> None:

@@ -144,10 +144,11 @@ def test_two_processes_train_as_one(scans: Path, tmp_path: Path) -> None:
     call("train", write_config(scans, tmp_path / "one"))
     config = write_config(scans, tmp_path / "two")
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    subprocess.run(
+    done = subprocess.run(
         [*torchrun, "-m", "lidar_synth", "train", config],
-        env=os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}, check=True, capture_output=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}, capture_output=True, text=True,
     )  # fmt: skip
+    assert done.returncode == 0, done.stderr
     one, two = state(tmp_path / "one"), state(tmp_path / "two")
     for name in one:
         assert torch.allclose(one[name], two[name], atol=1e-4), name

@@ -2,10 +2,11 @@
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from lidar_synth.errors import DataError
-from lidar_synth.projection.angles import Grid, grid_of, torch_asin, torch_atan2, torch_sqrt
+from lidar_synth.projection.kernels import ASIN, ATAN, PI, PI_2, PI_4, TAN_PI_8, Grid, grid_of
 from lidar_synth.sensor import Rays, Sensor
 
 _NONE = torch.iinfo(torch.int64).max
@@ -90,3 +91,40 @@ def unproject_batch(image: torch.Tensor, sensor: Sensor, rays: Rays = "centre") 
         raise DataError(f"range images {tuple(image.shape)}", f"(B, {sensor.shape[0]}, {sensor.shape[1]})")
     directions = torch.tensor(sensor.ray_directions(rays), device=image.device).movedim(-1, 0)
     return image[:, None] * directions
+
+
+def torch_atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """``atan2`` on float32 tensors of any one shape, bit for bit."""
+    ax, ay = x.abs(), y.abs()
+    high, low = torch.maximum(ax, ay), torch.minimum(ax, ay)
+    q = low / torch.where(high > 0, high, 1.0)
+    upper = q > float(TAN_PI_8)
+    u = torch.where(upper, (q - 1) / (q + 1), q)
+    a = _polynomial(u * u, ATAN) * (u * u) * u + u
+    a = torch.where(upper, a + float(PI_4), a)
+    a = torch.where(ay > ax, float(PI_2) - a, a)
+    a = torch.where(x < 0, float(PI) - a, a)
+    return torch.where(y < 0, -a, a)
+
+
+def torch_sqrt(x: torch.Tensor) -> torch.Tensor:
+    """Square root rounded to the nearest float32, which torch's own on a CPU (MKL's) does not promise."""
+    return x.double().sqrt().float()
+
+
+def torch_asin(s: torch.Tensor) -> torch.Tensor:
+    """``asin`` on a float32 tensor of any shape, bit for bit."""
+    a = s.abs()
+    outer = a > 0.5
+    z = torch.where(outer, 0.5 * (1 - a), a * a)
+    u = torch.where(outer, torch_sqrt(z), a)
+    p = _polynomial(z, ASIN) * z * u + u
+    a = torch.where(outer, float(PI_2) - 2 * p, p)
+    return torch.where(s < 0, -a, a)
+
+
+def _polynomial(z: torch.Tensor, coefficients: tuple[np.float32, ...]) -> torch.Tensor:
+    value = torch.full_like(z, float(coefficients[0]))
+    for c in coefficients[1:]:
+        value = value * z + float(c)
+    return value
