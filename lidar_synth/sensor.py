@@ -36,7 +36,8 @@ class Sensor:
             first and the last row).
         elevations: in their place, one elevation per row, highest first; a row's edges lie halfway
             between the beams.
-        beams: where the lasers really point, one per row, if the rows only approximate it.
+        beams: where the lasers' returns from a street really appear, one per row, if the rows only approximate it.
+        heights: metres above the origin at which each laser starts; 0 by default.
         description: one line for people.
 
     Raises:
@@ -52,6 +53,7 @@ class Sensor:
     fov_down: float | None = None
     elevations: tuple[float, ...] | None = None
     beams: tuple[float, ...] | None = None
+    heights: tuple[float, ...] | None = None
     description: str = ""
 
     def __post_init__(self) -> None:
@@ -71,6 +73,12 @@ class Sensor:
             raise self._error(f"{linear}", "at least 2 rows and 90 >= fov_up > fov_down >= -90")
         if self.beams is not None and len(self.beams) != self.shape[0]:
             raise self._error(f"{len(self.beams)} beams", f"one per row ({self.shape[0]})")
+        if self.heights is not None:
+            object.__setattr__(self, "heights", tuple(float(h) for h in self.heights))
+            if len(self.heights) != self.shape[0] or not all(abs(h) < 1 for h in self.heights):
+                raise self._error(
+                    f"heights = {self.heights}", f"one per row ({self.shape[0]}), within 1 m of the origin"
+                )
         if self.columns < 2 or self.columns % 2:
             raise self._error(f"columns = {self.columns}", "an even number")
         if not 0 <= self.range_min < self.range_max < np.inf:

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.sensor import Sensor
 from lidar_synth.town.meshes import Mesh, boxes, fan, merge, tube
 from lidar_synth.town.solid import Solid
 
@@ -18,9 +18,6 @@ HEIGHT = 1.73
 """Metres of the sensor's origin above the road."""
 _ASIDE = 0.026
 """Metres from the drum's axis to the lasers on either side of it."""
-_UPPER, _LOWER = (0.209, 0.196), (0.125, 0.105)
-"""Metres of an HDL-64E's optical centres above its origin, for the upper and the lower half of its lasers; see
-the vertical offsets in the calibration table that Velodyne delivers with each sensor."""
 
 
 def body() -> Mesh:
@@ -42,14 +39,13 @@ def optics(sensor: Sensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where a sensor's lasers point and how far above its origin they start.
 
     Returns:
-        (H,) elevations in radians and (H,) heights in metres. The beams of the KITTI sensors are the elevations
-        at which their returns from a street appear, seen from the origin: a laser that starts above it points
-        further down.
+        (H,) elevations in radians and (H,) heights in metres. A sensor's beams are the elevations at which
+        returns from a street appear, seen from the origin: a laser that starts above it points further down.
     """
     seen = sensor.laser_elevations.astype(float)
-    if sensor.beams is None or sensor.beams != load_sensor("town").beams:
+    if sensor.heights is None:
         return seen, np.zeros(len(seen))
-    heights = np.r_[np.linspace(*_UPPER, 32), np.linspace(*_LOWER, 32)]
+    heights = np.asarray(sensor.heights)
     # Most returns of a beam come from the level road; things that stand on it make the usual distance shorter.
     usual = np.minimum(1 / (np.maximum(np.sin(-seen), 1e-3) / HEIGHT + 1 / 110), 20.0)
     return seen - heights / usual, heights
