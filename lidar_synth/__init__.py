@@ -10,11 +10,19 @@ __version__ = "0.1.0"
 
 _HOME = {
     "Boxes": "scan",
+    "Generator": "generator",
+    "KITTI360": "formats",
+    "KITTIObject": "formats",
+    "KITTIRaw": "formats",
     "LidarSynthError": "errors",
+    "NuScenes": "formats",
     "RangeImage": "scan",
     "Scan": "scan",
+    "SemanticKITTI": "formats",
     "Sensor": "sensor",
     "Source": "scan",
+    "Town": "town",
+    "load_generator": "generator",
     "load_sensor": "sensor",
     "open_scans": "formats",
     "project": "projection",
@@ -26,7 +34,14 @@ __all__ = ["__version__", *_HOME]
 
 if TYPE_CHECKING:
     from lidar_synth.errors import LidarSynthError as LidarSynthError
+    from lidar_synth.formats import KITTI360 as KITTI360
+    from lidar_synth.formats import KITTIObject as KITTIObject
+    from lidar_synth.formats import KITTIRaw as KITTIRaw
+    from lidar_synth.formats import NuScenes as NuScenes
+    from lidar_synth.formats import SemanticKITTI as SemanticKITTI
     from lidar_synth.formats import open_scans as open_scans
+    from lidar_synth.generator import Generator as Generator
+    from lidar_synth.generator import load_generator as load_generator
     from lidar_synth.projection import project as project
     from lidar_synth.projection import unfold as unfold
     from lidar_synth.projection import unproject as unproject
@@ -36,6 +51,7 @@ if TYPE_CHECKING:
     from lidar_synth.scan import Source as Source
     from lidar_synth.sensor import Sensor as Sensor
     from lidar_synth.sensor import load_sensor as load_sensor
+    from lidar_synth.town import Town as Town
 
 
 def __getattr__(name: str) -> Any:
