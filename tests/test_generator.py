@@ -203,3 +203,14 @@ def test_sample_writes_every_format_and_goes_on(form: str, path: Path, tmp_path:
         for a, b in zip(written, expected, strict=True):
             assert np.allclose(a.points, b.points, atol=1e-4)
             assert np.array_equal(a.label, b.label)
+
+
+def test_samples_of_another_seed_do_not_pass_for_those_that_are_there(path: Path, tmp_path: Path) -> None:
+    from lidar_synth.cli import app
+
+    call = ["sample", str(tmp_path / "out"), "--model", str(path), "--count", "1"]
+    assert CliRunner().invoke(app, [*call, "--seed", "4"]).exception is None
+    before = (tmp_path / "out" / "000000.npz").read_bytes()
+    with pytest.raises(ConfigError, match=r"'seed': 4.*'seed': 5"):
+        CliRunner().invoke(app, [*call, "--seed", "5"], catch_exceptions=False)
+    assert (tmp_path / "out" / "000000.npz").read_bytes() == before

@@ -221,6 +221,15 @@ def test_the_first_loss_is_that_of_the_metric_on_the_batch(batches: Batches, acc
         assert record.loss == pytest.approx(expected.item(), rel=1e-5)
 
 
+def test_weights_of_channels_are_those_of_their_squared_errors(batches: Batches, accelerator: Accelerator) -> None:
+    training = new_training(weights={"range": 4.0, "label": 0.5})
+    batch = batches(range(4))
+    y = (1 - batch.u.view(-1, 1, 1, 1)) * batch.y0 + batch.u.view(-1, 1, 1, 1) * batch.y1
+    error = (training.network(y, batch.u) - (batch.y1 - batch.y0)).square().mean((0, 2, 3))
+    expected = (error * torch.tensor([4, 1] + [0.5] * 5)).mean()
+    assert next(steps(training, teacher_task(), batches, accelerator)).loss == pytest.approx(expected.item(), rel=1e-5)
+
+
 def test_accumulation_changes_rounding_only(batches: Batches, accelerator: Accelerator) -> None:
     one, two = (
         [r.loss for r in steps(new_training(accumulate=n), teacher_task(), batches, accelerator)] for n in (1, 2)
@@ -308,3 +317,6 @@ def test_a_recipe_with_an_unknown_name_is_refused() -> None:
         Recipe(iterations=1, metric="l7")
     with pytest.raises(ConfigError, match="at least 1"):
         Recipe(iterations=0)
+    for weights in ({"colour": 1.0}, {"range": 0.0}):
+        with pytest.raises(ConfigError, match="numbers above 0 for some of range, reflectance, label"):
+            Recipe(iterations=1, weights=weights)

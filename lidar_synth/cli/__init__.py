@@ -12,6 +12,7 @@ import typer
 from lidar_synth import __version__
 from lidar_synth.cli.convert import convert
 from lidar_synth.cli.doctor import doctor
+from lidar_synth.cli.evaluate import evaluate
 from lidar_synth.cli.import_ import import_
 from lidar_synth.cli.sample import sample
 from lidar_synth.cli.town import town
@@ -26,6 +27,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "sample": sample,
     "train": train,
     "distill": distill,
+    "evaluate": evaluate,
     "import": import_,
     "doctor": doctor,
 }

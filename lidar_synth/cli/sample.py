@@ -31,11 +31,14 @@ def sample(
 
     from lidar_synth.formats import WRITERS
     from lidar_synth.formats.source import choose
+    from lidar_synth.formats.writer import claim
     from lidar_synth.generator import load_generator
 
     writer = choose("format", to, WRITERS)(out)
     precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
     generator = load_generator(model, device=device, dtype=precision, batch=batch)
+    settings = {"checkpoint": generator.hash, "seed": seed, "steps": steps, "solver": solver, "dtype": dtype, "to": to}
+    claim(writer.root / ".sample.json", settings)
     missing = [i for i in range(count) if not writer.complete(i)]
     with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
         for first in range(0, len(missing), generator.batch):

@@ -5,13 +5,16 @@ The caller logs, saves and stops as it likes; a ``Training`` that was saved goes
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, NamedTuple
 
+from torch import Tensor
+
 from lidar_synth.distill import STRATEGIES
 from lidar_synth.errors import DataError
-from lidar_synth.flow import METRICS, TIMESTEPS, Example, Velocity, flow_matching, velocity_loss
+from lidar_synth.flow import METRICS, TIMESTEPS, Example, Metric, Velocity, flow_matching, velocity_loss
+from lidar_synth.normalize import CHANNELS, TensorFormat
 from lidar_synth.train.data import Batch, Batches, micro_batches
 from lidar_synth.train.schedules import SCHEDULES
 from lidar_synth.train.state import Training
@@ -52,6 +55,19 @@ class Record(NamedTuple):
     teacher_evaluations: int
 
 
+def weighted(metric: Metric, weights: Mapping[str, float], tensors: TensorFormat) -> Metric:
+    """A metric of tensors whose channels are multiplied by the roots of their weights."""
+    if not weights:
+        return metric
+    roots = [weights.get(name, 1.0) ** 0.5 for name in tensors.channels for _ in range(CHANNELS[name])]
+
+    def of_roots(a: Tensor, b: Tensor) -> Tensor:
+        root = a.new_tensor(roots).view(1, -1, 1, 1)
+        return metric(root * a, root * b)
+
+    return of_roots
+
+
 def steps(training: Training, task: Task, batches: Batches, accelerator: "Accelerator") -> Iterator[Record]:
     """Train to the end of the recipe, step by step.
 
@@ -68,7 +84,8 @@ def steps(training: Training, task: Task, batches: Batches, accelerator: "Accele
         DataError: where the loss or its gradient is not finite; ``training`` is left as it was before that step.
     """
     recipe = training.recipe
-    metric, schedule = METRICS[recipe.metric], SCHEDULES[recipe.schedule]
+    metric = weighted(METRICS[recipe.metric], recipe.weights, batches.tensors)
+    schedule = SCHEDULES[recipe.schedule]
     network, optimizer = accelerator.prepare(training.network, training.optimizer)
     training.network.train()
     while training.step < recipe.iterations:

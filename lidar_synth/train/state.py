@@ -5,7 +5,8 @@ averaged weights, the optimiser's moments and the step. All else follows from th
 """
 
 import copy
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
 from lidar_synth.flow import METRICS
+from lidar_synth.normalize import CHANNELS
 from lidar_synth.train.schedules import SCHEDULES
 
 
@@ -29,6 +31,8 @@ class Recipe:
         batch: samples of a step, over all processes and micro-batches.
         accumulate: micro-batches of a step.
         metric: a name of ``METRICS``.
+        weights: {channel: weight} of squared errors, 1 where none is given: labels are five channels of seven, but
+            no more than a seventh of what matters.
         rate: the learning rate (AdamW) at the top of the schedule.
         betas, weight_decay: AdamW's.
         schedule: a name of ``SCHEDULES``.
@@ -47,6 +51,7 @@ class Recipe:
     batch: int = 8
     accumulate: int = 1
     metric: str = "squared_l2"
+    weights: Mapping[str, float] = field(default_factory=dict)
     rate: float = 1e-4
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 0.01
@@ -60,6 +65,8 @@ class Recipe:
         for key, table in (("metric", METRICS), ("schedule", SCHEDULES)):
             if getattr(self, key) not in table:
                 raise ConfigError(f"{key} {getattr(self, key)!r}", f"one of {', '.join(table)}")
+        if set(self.weights) - set(CHANNELS) or not all(weight > 0 for weight in self.weights.values()):
+            raise ConfigError(f"weights {dict(self.weights)}", f"numbers above 0 for some of {', '.join(CHANNELS)}")
         if min(self.iterations, self.batch, self.accumulate, self.ema_every) < 1 or not self.rate > 0:
             raise ConfigError(f"{self}", "iterations, batch, accumulate, ema_every of at least 1 and a rate above 0")
 
