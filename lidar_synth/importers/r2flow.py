@@ -139,7 +139,8 @@ def _sensor(data: Mapping[str, Any]) -> Sensor:
     rows, columns = data["resolution"]
     sensor = replace(sensor, columns=columns, range_min=data["min_depth"], range_max=data["max_depth"])
     if rows != sensor.shape[0]:
-        sensor = replace(sensor, rows=rows, fov_up=sensor.up, fov_down=sensor.down, elevations=None, beams=None)
+        linear = {"rows": rows, "fov_up": sensor.up, "fov_down": sensor.down, "elevations": None}
+        sensor = replace(sensor, **linear, beams=None, heights=None)
     return sensor
 
 
