@@ -15,6 +15,7 @@ A block is four 32-bit words; element ``e`` of a scan (row-major) comes from wor
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -85,6 +86,21 @@ def uniform(
     words, count = _words(seed, indices, shape, device, _UNIFORM)
     # 23 bits: the half after a 24th would round to 1.
     return _samples(((words >> 9).float() + 0.5) * 2.0**-23, shape, count, device)
+
+
+def keyed_rng(*key: int) -> np.random.Generator:
+    """A numpy generator that is a function of its key, such as (seed, epoch, position), and of nothing else.
+
+    Args:
+        key: integers, 0 <= k < 2^64. Keys that differ, also in length, give independent numbers.
+
+    Raises:
+        ConfigError: on an integer out of range.
+    """
+    if any(not 0 <= k < 2**64 for k in key):
+        raise ConfigError(f"the key {key} of a generator", "integers, 0 <= k < 2^64")
+    # Two words for each, and their number first: numpy's seed sequence takes (1,) and (1, 0) for the same.
+    return np.random.default_rng([len(key), *(word for k in key for word in (k & _WORD, k >> 32))])
 
 
 def philox(counter: Tensor, seed: int) -> Tensor:

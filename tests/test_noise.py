@@ -10,7 +10,7 @@ from hypothesis import given
 from scipy import stats
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.noise import gaussian, philox, uniform
+from lidar_synth.noise import gaussian, keyed_rng, philox, uniform
 
 WORD = st.integers(0, 2**32 - 1)
 
@@ -142,3 +142,23 @@ def test_dtypes() -> None:
 def test_out_of_range(seed: int, indices: list[int], shape: tuple[int, ...], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         gaussian(seed, indices, shape)
+
+
+@given(st.lists(st.integers(0, 2**64 - 1), max_size=4), st.lists(st.integers(0, 2**64 - 1), max_size=4))
+def test_numpy_generators_are_functions_of_their_key(a: list[int], b: list[int]) -> None:
+    def first(key: list[int]) -> int:
+        return int(keyed_rng(*key).integers(2**63))
+
+    assert first(a) == first(a)
+    assert (first(a) == first(b)) == (a == b)
+    assert len({first([*a, *zeros]) for zeros in ([], [0], [0, 0])}) == 3
+
+
+def test_keys_of_large_numbers_do_not_run_together() -> None:
+    assert keyed_rng(0, 1 + (5 << 32)).random() != keyed_rng(1 << 32, 5).random()
+
+
+@pytest.mark.parametrize("key", [(-1,), (0, 2**64)])
+def test_a_key_out_of_range_is_refused(key: tuple[int, ...]) -> None:
+    with pytest.raises(ConfigError, match="2\\^64"):
+        keyed_rng(*key)
