@@ -1,0 +1,112 @@
+"""Training the range-view segmenter, and judging by it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_scan
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import DataError
+from lidar_synth.metrics.segmentation import Images, Judge, class_ious, confusion, load_judge, mean_iou
+from lidar_synth.nets.segmenter import RangeSegmenter, segmenter_input
+from lidar_synth.projection import project
+from lidar_synth.sensor import presets
+from lidar_synth.train.segmentation import train_segmenter
+
+HEIGHT = torch.linspace(0.05, -0.4, 16)[:, None].expand(16, 32)
+
+
+def batches(count: int, seed: int = 0) -> list[Images]:
+    """Scans whose label is the reflectance: two classes; every fourth column is ignored."""
+    draw = torch.Generator().manual_seed(seed)
+    made = []
+    for _ in range(count):
+        reflectance = torch.rand(2, 16, 32, generator=draw)
+        label = torch.where(reflectance > 0.5, 8, 12).to(torch.uint8)
+        label[..., ::4] = IGNORE
+        made.append(
+            {"range": 5 + 20 * torch.rand(2, 16, 32, generator=draw), "reflectance": reflectance, "label": label}
+        )
+    return made
+
+
+def test_it_learns_and_the_confusion_says_so() -> None:
+    torch.manual_seed(0)
+    network = RangeSegmenter(widths=(8, 8, 8))
+    untrained = mean_iou(confusion(network.eval(), batches(4, 1), HEIGHT))
+    losses = train_segmenter(network, batches(80), HEIGHT, 80, rate=2e-2, progress=False)
+    table = confusion(network, batches(4, 1), HEIGHT)
+    assert np.mean(losses[-5:]) < 0.5 * losses[0]
+    assert table.sum() == 4 * 2 * 16 * 24, "ignored cells are counted"
+    assert mean_iou(table) > max(0.8, untrained)
+
+
+def test_ious_by_hand() -> None:
+    table = np.zeros((19, 19), np.int64)
+    table[0, 0], table[0, 1], table[1, 1], table[1, 2] = 6, 2, 3, 1
+    ious = class_ious(table)
+    assert ious[0] == 6 / 8 and ious[1] == 3 / 6 and ious[2] == 0
+    assert np.isnan(ious[3:]).all()
+    assert mean_iou(table) == (6 / 8 + 3 / 6) / 2, "a class that is said but never labelled counts by its mistakes"
+
+
+def test_what_cannot_be_trained_on_is_refused() -> None:
+    network = RangeSegmenter(widths=(8, 8, 8))
+    empty = [{**b, "label": torch.full_like(b["label"], IGNORE)} for b in batches(1)]
+    with pytest.raises(DataError, match="without one valid label"):
+        train_segmenter(network, empty, HEIGHT, 1, progress=False)
+    with pytest.raises(DataError, match="2 batches for 3 steps"):
+        train_segmenter(network, batches(2), HEIGHT, 3, progress=False)
+    with pytest.raises(DataError, match="no labelled cell"):
+        mean_iou(confusion(network, empty, HEIGHT))
+
+
+@pytest.fixture
+def judge() -> Judge:
+    torch.manual_seed(0)
+    return Judge(RangeSegmenter().eval(), presets()["town"], {"data": "none"})
+
+
+def test_a_judge_sees_a_scan_as_the_network_sees_its_image(judge: Judge) -> None:
+    scan = random_scan(presets()["town"], 3000, seed=0)
+    image = project(scan)
+    height = torch.from_numpy(np.sin(presets()["town"].ray_angles()[0]))
+    inputs = segmenter_input(
+        torch.from_numpy(image.range)[None], torch.from_numpy(image.channels["reflectance"])[None], height
+    )
+    with torch.inference_mode():
+        assert np.allclose(judge.features([scan]), judge.network.features(inputs).numpy())
+        said = judge.network(inputs)[0].argmax(0).numpy()
+    label = image.channels["label"]
+    table = judge.agreement([scan])
+    assert table.sum() == (label != IGNORE).sum() > 0
+    assert np.trace(table) == (said == label)[label != IGNORE].sum()
+
+
+def test_a_judge_is_kept_whole(judge: Judge, tmp_path: Path) -> None:
+    judge.save(tmp_path / "a.safetensors")
+    again = load_judge(tmp_path / "a.safetensors")
+    assert (again.sensor, again.provenance) == (judge.sensor, judge.provenance)
+    scan = random_scan(presets()["town"], 3000, seed=0)
+    assert np.array_equal(again.features([scan]), judge.features([scan]))
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b.replace(b"segmenter/1", b"segmenter/2")]
+)
+def test_a_damaged_judge_is_refused(judge: Judge, tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    path = tmp_path / "a.safetensors"
+    judge.save(path)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(DataError, match=r"no segmenter of this version"):
+        load_judge(path)
+
+
+def test_scans_without_labels_cannot_be_judged_for_them(judge: Judge) -> None:
+    scan = replace(random_scan(presets()["town"], 300, seed=0), label=None)
+    with pytest.raises(DataError, match="without labels"):
+        judge.agreement([scan])
