@@ -1,6 +1,7 @@
 """``lidar-synth evaluate`` on scans on disk."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,9 +9,12 @@ from conftest import random_scan
 from typer.testing import CliRunner
 
 from lidar_synth.cli import app
+from lidar_synth.cli.sample import NOTE
+from lidar_synth.errors import ConfigError
 from lidar_synth.formats import WRITERS
 from lidar_synth.metrics import PROTOCOLS
 from lidar_synth.sensor import presets
+from lidar_synth.town.export import SETTINGS
 
 
 @pytest.fixture(scope="module")
@@ -39,3 +43,25 @@ def test_every_figure_names_its_protocol_and_its_sets(folders: tuple[Path, Path]
 def test_an_unknown_protocol_is_a_wrong_call(folders: tuple[Path, Path]) -> None:
     result = CliRunner().invoke(app, ["evaluate", *map(str, folders), "--protocol", "frid"])
     assert result.exit_code == 2
+
+
+def trained_on(folder: Path, data: dict[str, object]) -> None:
+    (folder / NOTE).write_text(json.dumps({"seed": 0, "trained_on": data}))
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_what_the_model_was_trained_on_is_no_reference(folders: tuple[Path, Path], tmp_path: Path, same: bool) -> None:
+    real, fake = (shutil.copytree(folder, tmp_path / folder.name) for folder in folders)
+    call = ["evaluate", str(real), str(fake), "--protocol", "town", "--json"]
+    trained_on(fake, {"path": f"{real.parent}/../{tmp_path.name}/real", "split": None if same else "train"})
+    by_path = CliRunner().invoke(app, call)
+    trained_on(fake, {"town": 3000, "seed": 5})
+    (real / SETTINGS).write_text(json.dumps({"seed": 5 if same else 6}))
+    by_town = CliRunner().invoke(app, call)
+    for result in (by_path, by_town):
+        if same:
+            assert isinstance(result.exception, ConfigError), result.output
+            assert "not trained on" in str(result.exception)
+        else:
+            assert result.exception is None, result.output
+    assert CliRunner().invoke(app, [*call, "--training-data"]).exit_code == 0

@@ -1,6 +1,7 @@
 """``lidar-synth evaluate``: one set of scans beside another."""
 
 import json
+import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -14,27 +15,57 @@ def evaluate(
     protocol: Annotated[str, typer.Option(help="r2flow | lidm | town: whose definitions")],
     split: Annotated[str | None, typer.Option(help="split of REAL, r2flow/test for instance")] = None,
     sensor: Annotated[str | None, typer.Option(help="sensor of both: a preset or a YAML file")] = None,
+    segmenter: Annotated[bool, typer.Option(help="also by the features of the segmenter that knows the town")] = False,
+    training_data: Annotated[bool, typer.Option(help="compare even with what the model was trained on")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the figures as JSON")] = False,
 ) -> None:
-    """Says how far two sets of scans lie apart from above: Jensen-Shannon distance and MMD.
+    """Says how far two sets of scans lie apart: Jensen-Shannon distance and MMD from above, features on request.
 
     The same names mean different things in different papers: figures of two protocols are not comparable, and a
-    reference that the model was trained on flatters it.
+    reference that the model was trained on flatters it and is refused.
 
     \b
     Examples:
       lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test
-      lidar-synth evaluate town samples --protocol town --json
+      lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
     """
     from lidar_synth.formats import open_scans
     from lidar_synth.metrics import PROTOCOLS
     from lidar_synth.metrics import evaluate as compare
+    from lidar_synth.metrics.segmentation import load_judge
 
     if protocol not in PROTOCOLS:
         raise typer.BadParameter(f"{protocol!r} is none of {', '.join(PROTOCOLS)}", param_hint="--protocol")
+    if not training_data:
+        _refuse_training_data(real, split, fake)
     sources = open_scans(real, sensor=sensor, split=split), open_scans(fake, sensor=sensor)
-    scores = compare(*sources, protocol, progress=not as_json)
+    extractors = {"the town segmenter": load_judge().features} if segmenter else {}
+    scores = compare(*sources, protocol, extractors, progress=not as_json)
     if as_json:
         typer.echo(json.dumps([asdict(score) for score in scores], indent=2))
     else:
         typer.echo("\n".join(map(str, scores)))
+
+
+def _refuse_training_data(real: Path, split: str | None, fake: Path) -> None:
+    """Where generated scans say what their model was trained on, that is no reference."""
+    from lidar_synth.cli.sample import NOTE
+    from lidar_synth.errors import ConfigError
+    from lidar_synth.files import read_text
+    from lidar_synth.town.export import SETTINGS
+
+    note, town = fake / NOTE, real / SETTINGS
+    if not note.is_file():
+        return
+    trained = json.loads(read_text(note)).get("trained_on")
+    if not isinstance(trained, dict):
+        return
+    if path := trained.get("path"):
+        same = Path(os.path.expandvars(path)).resolve() == real.resolve() and trained.get("split") == split
+    else:
+        same = town.is_file() and json.loads(read_text(town)).get("seed") == trained.get("seed")
+    if same:
+        raise ConfigError(
+            f"{real} as a reference for {fake}", "scans that the model was not trained on",
+            "Another split, or a town of another --seed; --training-data to compare nevertheless.",
+        )  # fmt: skip

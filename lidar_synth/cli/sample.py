@@ -5,6 +5,9 @@ from typing import Annotated
 
 import typer
 
+NOTE = ".sample.json"
+"""What stands beside generated scans: how they were made, and what the model was trained on."""
+
 
 def sample(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
@@ -38,7 +41,7 @@ def sample(
     precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
     generator = load_generator(model, device=device, dtype=precision, batch=batch)
     settings = {"checkpoint": generator.hash, "seed": seed, "steps": steps, "solver": solver, "dtype": dtype, "to": to}
-    claim(writer.root / ".sample.json", settings)
+    claim(writer.root / NOTE, settings | {"trained_on": generator.header.provenance["data"]})
     missing = [i for i in range(count) if not writer.complete(i)]
     with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
         for first in range(0, len(missing), generator.batch):

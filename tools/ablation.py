@@ -1,0 +1,73 @@
+"""Strategies of distillation beside each other, at one budget of network evaluations (the paper's Table 4).
+
+    python tools/ablation.py TEACHER WORK [--evaluations 20000] [--count 256] [KEY=VALUE ...]
+
+Every strategy gets a student from the same teacher, the same noise and data, and as many evaluations of the network,
+the teacher's included: a sample costs its strategy the teacher's steps and one evaluation by the student. KEY=VALUE
+changes configs/town_student.yaml for all of them. Students of an earlier call are used again. Figures as in
+tools/model_card.py; the time grid is the selected one for adaptive_piecewise and uniform for the others.
+"""
+
+import argparse
+from pathlib import Path
+
+from model_card import REFERENCE, generate, header, row, town
+
+from lidar_synth.checkpoint import read_header
+from lidar_synth.cli.run import checkpoint_path, run
+from lidar_synth.config import DistillConfig, load_config
+from lidar_synth.distill import STRATEGIES
+from lidar_synth.metrics.segmentation import load_judge
+
+ROOT = Path(__file__).parents[1]
+WHOLE = ("reflow", "timestep_distillation")
+"""Strategies whose teacher runs from noise to data for every sample."""
+
+
+def student(strategy: str, teacher: Path, work: Path, evaluations: int, overrides: list[str]) -> tuple[Path, str]:
+    """The checkpoint of one strategy, and what it was given."""
+
+    def configured(*more: str) -> DistillConfig:
+        path = ROOT / "configs" / "town_student.yaml"
+        own = (
+            f"output={work / strategy}",
+            f"data.cache={work / 'cache'}",
+            f"teacher={teacher}",
+            f"strategy={strategy}",
+        )
+        return load_config(DistillConfig, path, [*overrides, *own, *more])
+
+    plain = configured()
+    steps = plain.steps * (plain.intervals if strategy in WHOLE else 1)
+    iterations = evaluations // ((steps + 1) * plain.recipe.batch)
+    config = configured(f"steps={steps}", f"recipe.iterations={iterations}")
+    path = checkpoint_path(config)
+    if not path.exists() or read_header(path)[0].provenance.get("iterations") != iterations:
+        path = run(config, resume=True)
+    return path, f"{steps} teacher steps, {iterations} iterations of {plain.recipe.batch}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("teacher", type=Path)
+    parser.add_argument("work", type=Path, help="folder of the students")
+    parser.add_argument("--evaluations", type=int, default=20_000, help="of the network, for each strategy")
+    parser.add_argument("--count", type=int, default=256, help="scans to measure on")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
+    given = parser.parse_args()
+
+    judge, reference = load_judge(), town(REFERENCE, given.count)
+    lines = [
+        row(f"teacher, {steps} steps", reference, generate(str(given.teacher), steps, given.count), judge)
+        for steps in (50, 4)
+    ]
+    for strategy in STRATEGIES:
+        path, what = student(strategy, given.teacher, given.work, given.evaluations, given.overrides)
+        scans = generate(str(path), None, given.count)
+        lines.append(row(f"{strategy}, 4 steps ({what})", reference, scans, judge))
+    print(f"{given.evaluations} evaluations for each strategy, {given.count} scans\n\n{header(reference, judge)}")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

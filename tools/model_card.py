@@ -1,0 +1,97 @@
+"""The figures and the pictures of docs/models.md: how near generated scans come to scans of the town.
+
+    python tools/model_card.py NAME=MODEL[:STEPS] ... [--count 512] [--pictures OUT]
+
+    python tools/model_card.py "student, 4 steps=town" "teacher, 50 steps=RUN/town_teacher.safetensors:50" \\
+        "teacher, 4 steps=RUN/town_teacher.safetensors:4" --pictures docs/models
+
+Every model makes scans from the same noise. They stand beside scans of a town that no model was trained on (seed 1);
+the first row is a third town (seed 2), which is as near as different streets of one kind come.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from lidar_synth.generator import load_generator
+from lidar_synth.metrics import evaluate
+from lidar_synth.metrics.segmentation import Judge, load_judge, mean_iou
+from lidar_synth.scan import Scan, Source
+from lidar_synth.town import Town
+from lidar_synth.viz import write_view
+
+REFERENCE, OTHER = 1, 2
+"""Seeds of the towns to compare with."""
+SEED = 1
+"""Of the noise."""
+TILES = 16
+
+
+def generate(model: str, steps: int | None, count: int) -> list[Scan]:
+    """Scans of one model."""
+    generator = load_generator(model)
+    return [generator.scans(SEED, [i], steps=steps)[0] for i in tqdm(range(count), desc=Path(model).stem, unit="scan")]
+
+
+def town(seed: int, count: int) -> list[Scan]:
+    """Scans of one town, a second apart."""
+    source = Town(seed, scans=count, interval=1.0)
+    return [source[i] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
+
+
+def row(name: str, reference: Source, scans: Sequence[Scan], judge: Judge) -> str:
+    """A line of the table."""
+    scores = evaluate(reference, scans, "town", {"the town segmenter": judge.features})
+    values = [f"{score.value:.4g}" for score in scores]
+    agreement = mean_iou(judge.agreement(scans)) if scans[0].label is not None else float("nan")
+    return f"| {name} | {' | '.join(values)} | {100 * agreement:.1f} |"
+
+
+def header(reference: Source, judge: Judge) -> str:
+    """The table's head, in the order of ``row``."""
+    names = [
+        s.metric
+        for s in evaluate(reference[:2], reference[2:4], "town", {"the town segmenter": judge.features}, progress=False)
+    ]
+    return f"| scans | {' | '.join(names)} | mIoU with the town segmenter, % |\n|---|{'---:|' * (len(names) + 1)}"
+
+
+def picture(path: Path, scans: Sequence[Scan], title: str) -> None:
+    """A sheet of scans as a PNG of few colours: small enough for a repository."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_view(path, list(scans), title=title)
+    image = Image.open(path).convert("RGB")
+    width = 1600
+    image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+    image.quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
+    parser.add_argument("--count", type=int, default=512, help="scans of every row")
+    parser.add_argument("--pictures", type=Path, help="folder for a sheet of the first model and one of the town")
+    given = parser.parse_args()
+
+    judge = load_judge()
+    reference = town(REFERENCE, given.count)
+    lines = [row("another town", reference, town(OTHER, given.count), judge)]
+    for i, text in enumerate(given.models):
+        name, model = text.split("=", 1)
+        model, _, steps = model.partition(":")
+        scans = generate(model, int(steps) if steps else None, given.count)
+        lines.append(row(name, reference, scans, judge))
+        if i == 0 and given.pictures:
+            picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans that were not chosen")
+            apart = np.linspace(0, given.count - 1, TILES).astype(int)
+            picture(given.pictures / "town.png", [reference[k] for k in apart], f"{TILES} scans of the town")
+    print(f"{given.count} scans a row, {given.count} of the town\n\n{header(reference, judge)}")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
