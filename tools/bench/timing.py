@@ -10,16 +10,21 @@ import numpy as np
 from tqdm import tqdm
 
 
-def time_in_turns(calls: Mapping[str, Callable[[], object]], rounds: int = 60) -> dict[str, float]:
-    """Median seconds of each call; the calls take turns, so that a noisy machine is noisy for all of them."""
+def time_in_turns(
+    calls: Mapping[str, Callable[[], object]], rounds: int = 60, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, float]:
+    """Median seconds of each call; the calls take turns, so that a noisy machine is noisy for all of them.
+
+    On a machine that is busy with other things, ``clock=time.process_time`` counts this process's work only.
+    """
     for call in calls.values():
         call()
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in tqdm(range(rounds), desc="timing", leave=False):
         for name, call in calls.items():
-            start = time.perf_counter()
+            start = clock()
             call()
-            seconds[name].append(time.perf_counter() - start)
+            seconds[name].append(clock() - start)
     return {name: median(values) for name, values in seconds.items()}
 
 

@@ -1,0 +1,34 @@
+"""Real and synthetic scans in one torch dataset, at an exact ratio that nothing changes.
+
+The plan of an epoch (plan.py) is a pure function of seed and epoch; datasets, batch sampler and stream follow it.
+"""
+
+from lidar_synth.mixing.batches import MixedBatches
+from lidar_synth.mixing.collate import Collate
+from lidar_synth.mixing.items import Item, to_item
+from lidar_synth.mixing.plan import Mixture, Part, Plan, plan
+from lidar_synth.mixing.scans import MixedScans
+from lidar_synth.mixing.schedules import Linear, make_schedule
+from lidar_synth.mixing.sources import Sources
+from lidar_synth.mixing.stream import MixedStream
+from lidar_synth.mixing.synthetic import Generated, Held, Synthetic, make_synthetic
+
+__all__ = [
+    "Collate",
+    "Generated",
+    "Held",
+    "Item",
+    "Linear",
+    "MixedBatches",
+    "MixedScans",
+    "MixedStream",
+    "Mixture",
+    "Part",
+    "Plan",
+    "Sources",
+    "Synthetic",
+    "make_schedule",
+    "make_synthetic",
+    "plan",
+    "to_item",
+]

@@ -1,0 +1,160 @@
+"""Who takes which positions: an epoch cut into steps, a step into one batch for each rank.
+
+Steps follow one another along the plan, so that what is left after any of them is the rest of the plan, whatever the
+number of ranks and workers that go on with it.
+"""
+
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
+from typing import Any, Protocol
+
+from torch.utils.data import Sampler
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.mixing.state import checked_state, place
+
+
+class Epochs(Protocol):
+    """What a batch sampler needs to know of a dataset."""
+
+    @property
+    def seed(self) -> int: ...
+
+    @property
+    def epoch(self) -> int: ...
+
+    def set_epoch(self, epoch: int) -> None: ...
+
+    def expect(self, epoch: int, positions: Iterable[int]) -> None: ...
+
+    def length(self, epoch: int) -> int: ...
+
+    def __len__(self) -> int: ...
+
+
+def cut_steps(
+    start: int, end: int, batch_size: int, world_size: int = 1, drop_last: bool = False, join: bool = True
+) -> list[range]:
+    """The positions start .. end - 1 in steps of all ranks together.
+
+    Each step holds ``batch_size`` samples for each rank; what is left at the end makes a smaller step, or, where that
+    would leave ranks without a sample, joins the last one: so all ranks take the same number of steps, and none of
+    them waits for ever for another. With ``drop_last`` what is left is left out; without ``join`` it joins nothing.
+    """
+    size = batch_size * world_size
+    whole = max(end - start, 0) // size
+    steps = [range(start + i * size, start + (i + 1) * size) for i in range(whole)]
+    rest = range(start + whole * size, end)
+    if drop_last or not rest:
+        return steps
+    if join and steps and len(rest) < world_size:
+        return [*steps[:-1], range(steps[-1].start, end)]
+    return [*steps, rest]
+
+
+def rank_share(step: range, rank: int, world_size: int) -> range:
+    """A rank's positions of a step: one piece, so that a balanced plan is balanced for each rank; sizes differ by one
+    at most."""
+    size, larger = divmod(len(step), world_size)
+    start = step.start + rank * size + min(rank, larger)
+    return range(start, start + size + (rank < larger))
+
+
+def go_to(dataset: Epochs, epoch: int, position: int) -> None:
+    """Set the epoch of a state that was loaded.
+
+    A ``StatefulDataLoader`` loads when it begins to iterate, thus after ``set_epoch``: from the end of one epoch a
+    trainer has gone on to the next by then, and stays there.
+    """
+    if not (dataset.epoch == epoch + 1 and position >= dataset.length(epoch)):
+        dataset.set_epoch(epoch)
+
+
+class MixedBatches(Sampler[list[int]]):
+    """A batch sampler along the plan, for one rank or several, that can go on from any step.
+
+    Give it to a ``DataLoader`` as ``batch_sampler``. Over all ranks every position is given once. Where a library
+    divides batch samplers among ranks itself (Accelerate's ``prepare``), use ``rank=0, world_size=1``.
+
+    Args:
+        dataset: a ``MixedScans``.
+        batch_size: samples of a batch, on each rank.
+        rank, world_size: see ``place``.
+        drop_last: leave out what does not fill a batch on every rank.
+
+    Raises:
+        ConfigError: on a batch size below 1 or a rank out of range.
+    """
+
+    def __init__(
+        self,
+        dataset: Epochs,
+        batch_size: int,
+        *,
+        rank: int | None = None,
+        world_size: int | None = None,
+        drop_last: bool = False,
+    ) -> None:
+        if batch_size < 1:
+            raise ConfigError(f"batch_size={batch_size}", "at least 1")
+        self.dataset, self.batch_size, self.drop_last = dataset, batch_size, drop_last
+        self.rank, self.world_size = place(rank, world_size)
+        self._start = (0, 0)  # epoch and position where a state said to go on
+        self._drawn = (0, 0)  # epoch, and batches taken of it
+
+    def __len__(self) -> int:
+        """Batches that iterating gives."""
+        return len(self._steps())
+
+    def __iter__(self) -> Iterator[list[int]]:
+        steps, epoch = self._steps(), self.dataset.epoch
+        if steps and len(steps[-1]) < self.world_size:
+            warnings.warn(f"{len(steps[-1])} samples left for {self.world_size} ranks: some get none", stacklevel=2)
+        shares = [rank_share(step, self.rank, self.world_size) for step in steps]
+        self.dataset.expect(epoch, chain.from_iterable(shares))
+        for number, share in enumerate(filter(len, shares), 1):
+            self._drawn = (epoch, number)
+            yield list(share)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch, before iterating; see ``MixedScans.set_epoch``."""
+        self.dataset.set_epoch(epoch)
+
+    def state_dict(self, done: int | None = None) -> dict[str, int]:
+        """{seed, epoch, position}: where to go on, whatever the number of ranks and workers then.
+
+        Args:
+            done: batches that this rank has trained on since it began to iterate. By default those that were taken
+                from this sampler: right without workers and in torchdata's ``StatefulDataLoader``; in a
+                ``DataLoader`` with workers it runs ahead by what is prefetched.
+
+        Raises:
+            ConfigError: on more batches than there are.
+        """
+        steps, epoch = self._steps(), self.dataset.epoch
+        drawn = self._drawn[1] if self._drawn[0] == epoch else 0
+        if not 0 <= (number := drawn if done is None else done) <= len(steps):
+            raise ConfigError(f"{number} batches done of {len(steps)}", "a number of batches of this epoch")
+        if number < len(steps):
+            position = steps[number].start
+        elif done is None:
+            # Not the next epoch yet: whoever resumes here still has to see this one end.
+            position = len(self.dataset)
+        else:
+            epoch, position = epoch + 1, 0
+        return {"seed": self.dataset.seed, "epoch": epoch, "position": position}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where a state says; the dataset's epoch is set too. Another epoch begins at its beginning.
+
+        Raises:
+            ConfigError: on a state that is none, or another seed's.
+        """
+        self._start = checked_state(state, self.dataset.seed)
+        self._drawn = (0, 0)
+        go_to(self.dataset, *self._start)
+
+    def _steps(self) -> list[range]:
+        start = self._start[1] if self._start[0] == self.dataset.epoch else 0
+        return cut_steps(start, len(self.dataset), self.batch_size, self.world_size, self.drop_last)

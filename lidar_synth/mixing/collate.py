@@ -1,0 +1,135 @@
+"""Batches of plain PyTorch items: points one after another with offsets, padded, or as range images."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.mixing.items import Item
+from lidar_synth.projection import project
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor
+
+Form = Literal["offsets", "padded", "range"]
+"""How a batch holds its scans, see ``Collate``."""
+
+Unlabelled = Literal["error", "allow"]
+"""What happens to a batch without one valid label: it is refused, or handed out."""
+
+
+@dataclass(frozen=True)
+class Collate:
+    """Makes a batch of B items (a ``collate_fn``).
+
+    Every batch has ``boxes`` (ΣM, 7) float32 with ``box_offsets`` (B + 1,) int64, ``names`` (B tuples), ``domain``
+    (B,) int64, ``id`` (B names), and by form:
+
+    - ``offsets``: ``points`` (ΣN, 4) float32, ``label`` (ΣN,) int64, ``confidence`` (ΣN,) float32 of all scans one
+      after another, ``offsets`` (B + 1,) int64: scan b is ``points[offsets[b]:offsets[b + 1]]``.
+    - ``padded``: ``points`` (B, N, 4), ``label`` (B, N), ``confidence`` (B, N), ``mask`` (B, N) bool where a point
+      is; elsewhere 0, label 255.
+    - ``range``: ``range`` (B, H, W) float32 metres, 0 = no return, ``reflectance``, ``label`` int64, ``confidence``
+      (B, H, W) of the nearest returns, ``mask`` (B, H, W) bool where there is one.
+
+    Args:
+        form: one of these.
+        sensor: whose grid range images have.
+        unlabelled: what to do with a batch without one valid label and without a box. A mean over no label is NaN,
+            which one optimiser step spreads over all weights.
+
+    Raises:
+        ConfigError: on another form, or no sensor for range images.
+    """
+
+    form: Form = "offsets"
+    sensor: Sensor | None = None
+    unlabelled: Unlabelled = "error"
+
+    def __post_init__(self) -> None:
+        for name, kind in (("form", Form), ("unlabelled", Unlabelled)):
+            if getattr(self, name) not in get_args(kind):
+                raise ConfigError(f"{name}={getattr(self, name)!r} of batches", f"one of {get_args(kind)}")
+        if self.form == "range" and self.sensor is None:
+            raise ConfigError("range images without a sensor", "a sensor, whose grid they have")
+
+    def __call__(self, items: Sequence[Item]) -> dict[str, Any]:
+        """The batch.
+
+        Raises:
+            DataError: where no item has a valid label or a box.
+        """
+        boxes = [item["boxes"] for item in items]
+        batch = _FORMS[self.form](items, self.sensor) | {
+            "boxes": torch.cat(boxes),
+            "box_offsets": _offsets(boxes),
+            "names": [item["names"] for item in items],
+            "domain": torch.tensor([item["domain"] for item in items]),
+            "id": [item["id"] for item in items],
+        }
+        if self.unlabelled == "error" and not len(batch["boxes"]) and not bool((batch["label"] != IGNORE).any()):
+            raise DataError(
+                f"a batch without one valid label or box (scans {batch['id'][:4]})",
+                "at least one, or the loss is NaN",
+                "Use larger batches with balanced=True, so that each holds labelled scans; labels='generated' or "
+                "another policy that gives labels; labels='none' for an unlabelled pool; or unlabelled='allow' and "
+                "skip such batches in the training loop.",
+            )
+        return batch
+
+
+def _offset_points(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Tensor]:
+    points, label, confidence = _columns(items)
+    return {
+        "points": torch.cat(points),
+        "label": torch.cat(label),
+        "confidence": torch.cat(confidence),
+        "offsets": _offsets(points),
+    }
+
+
+def _padded_points(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Tensor]:
+    points, label, confidence = _columns(items)
+    return {
+        "points": pad_sequence(points, batch_first=True),
+        "label": pad_sequence(label, batch_first=True, padding_value=IGNORE),
+        "confidence": pad_sequence(confidence, batch_first=True),
+        "mask": pad_sequence([torch.ones(len(p), dtype=torch.bool) for p in points], batch_first=True),
+    }
+
+
+def _range_images(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Tensor]:
+    assert sensor is not None
+    images = []
+    for item in items:
+        points = item["points"].numpy()
+        scan = Scan(
+            points[:, :3], np.ascontiguousarray(points[:, 3]), sensor,
+            label=item["label"].numpy().astype(np.uint8), confidence=item["confidence"].numpy(), id=item["id"],
+        )  # fmt: skip
+        images.append(project(scan))
+    distance = torch.from_numpy(np.stack([image.range for image in images]))
+    names = ("reflectance", "label", "confidence")
+    channels = {n: torch.from_numpy(np.stack([image.channels[n] for image in images])) for n in names}
+    return {"range": distance, **channels, "label": channels["label"].long(), "mask": distance > 0}
+
+
+_FORMS: dict[str, Callable[[Sequence[Item], Sensor | None], dict[str, Any]]] = {
+    "offsets": _offset_points,
+    "padded": _padded_points,
+    "range": _range_images,
+}
+
+
+def _columns(items: Sequence[Item]) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    return [i["points"] for i in items], [i["label"] for i in items], [i["confidence"] for i in items]
+
+
+def _offsets(parts: Sequence[Tensor]) -> Tensor:
+    """(B + 1,) int64, where each part begins and the last one ends."""
+    return torch.tensor([0, *(len(part) for part in parts)]).cumsum(0)

@@ -1,0 +1,69 @@
+"""The plain PyTorch item: what a sample is where no trainer wants another shape."""
+
+from typing import Any, TypedDict
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.errors import DataError
+from lidar_synth.scan import Scan
+
+
+class Item(TypedDict):
+    """One sample; the same keys in every one, and memory of its own.
+
+    Keys:
+        points: (N, 4) float32 x, y, z in metres, sensor frame, and reflectance in [0, 1].
+        label: (N,) int64 train ids 0..18, 255 = ignore, also where the scan has no labels.
+        confidence: (N,) float32 in [0, 1], trust in ``label``; without one of the scan's own, 1 where there is a label.
+        boxes: (M, 7) float32 x, y, z of the centre of gravity, l, w, h in metres, yaw in radians; M = 0 without boxes.
+        names: M class names as KITTI spells them.
+        domain: 0 real, 1 synthetic.
+        id: the scan's name.
+    """
+
+    points: Tensor
+    label: Tensor
+    confidence: Tensor
+    boxes: Tensor
+    names: tuple[str, ...]
+    domain: int
+    id: str
+
+
+def to_item(scan: Scan, rng: np.random.Generator) -> Item:
+    """A scan as a plain PyTorch item; nothing is drawn.
+
+    Args:
+        scan: N points.
+        rng: not used; every ``to_sample(scan, rng)`` gets one.
+
+    Raises:
+        DataError: on a label that is no train id.
+    """
+    points = np.empty((len(scan), 4), np.float32)
+    for column, values in enumerate((*scan.points.T, scan.reflectance)):  # numpy is slow at rows of three
+        points[:, column] = values
+    if scan.label is None:
+        label = np.full(len(scan), IGNORE, np.int64)
+    else:
+        label = scan.label.astype(np.int64)
+        wrong = (scan.label >= len(NAMES)) & (scan.label != IGNORE)
+        if wrong.any():
+            raise DataError(f"scan {scan.id!r}: labels {np.unique(label[wrong])[:8].tolist()}",
+                            f"train ids 0..{len(NAMES) - 1}, or {IGNORE} = ignore",
+                            "Map the dataset's own ids when they are read (Taxonomy.decode).")  # fmt: skip
+    given = scan.confidence
+    confidence = (label != IGNORE).astype(np.float32) if given is None else np.array(given, np.float32)
+    boxes: Any = np.empty((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()
+    return {
+        "points": torch.from_numpy(points),
+        "label": torch.from_numpy(label),
+        "confidence": torch.from_numpy(confidence),
+        "boxes": torch.from_numpy(boxes),
+        "names": () if scan.boxes is None else scan.boxes.names,
+        "domain": scan.domain,
+        "id": scan.id,
+    }

@@ -1,0 +1,249 @@
+"""``MixedScans``: real and synthetic scans in one map-style dataset."""
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from torch.utils.data import Dataset, default_collate, get_worker_info
+
+from lidar_synth.labels import LabelPolicy, make_policy
+from lidar_synth.mixing.batches import MixedBatches
+from lidar_synth.mixing.collate import Collate, Form, Unlabelled
+from lidar_synth.mixing.items import to_item
+from lidar_synth.mixing.plan import EpochSize, Mixture, Part, Plan, plan, quotas
+from lidar_synth.mixing.schedules import Schedule, make_schedule
+from lidar_synth.mixing.sources import check_together, each, identity_of
+from lidar_synth.mixing.state import shared_integers
+from lidar_synth.mixing.synthetic import make_synthetic
+from lidar_synth.noise import keyed_rng
+from lidar_synth.scan import REAL, SYNTHETIC, Scan
+
+log = logging.getLogger(__name__)
+
+Ratio = float | Sequence[float] | Mapping[int, float] | Schedule
+"""The share of synthetic samples in [0, 1], see ``make_schedule``."""
+
+ToSample = Callable[[Scan, np.random.Generator], Any]
+"""Makes a sample of a scan; the generator is keyed by (seed, epoch, position)."""
+
+
+class MixedScans(Dataset[Any]):
+    """Real scans as they are and synthetic scans among them, at an exact ratio.
+
+    What stands where in an epoch is a pure function of the arguments and the epoch (plan.py), already shuffled: go
+    through it in order (a ``DataLoader`` without ``shuffle``) or by ``batches``, which also serves several ranks. Any
+    other sampler works too. Call ``set_epoch`` before each epoch; otherwise the same scans come again.
+
+    Args:
+        real: indexable source of ``Scan``, or ``Sources`` of several; None with ratio 1.
+        synth: a generator, a bank, a rolling bank, scans by index, or ``Sources`` of several.
+        ratio: share of synthetic samples in [0, 1]: a number, a list with one for each epoch, ``{epoch: share}``,
+            ``Linear(first, last, epochs)`` or a function of the epoch.
+        labels: label policy of the synthetic scans: a name of ``lidar_synth.labels.POLICIES`` or a function.
+        seed: of the order, of everything that is drawn for a sample, and of a generator's scans.
+        label_options: of the policy.
+        epoch_size: ``"add"`` gives every real scan once and adds synthetic ones; ``"replace"`` keeps the number of
+            real scans as the length; a number is the length.
+        reuse: how often a synthetic scan is given, each time augmented anew.
+        balanced: spread synthetic samples evenly, so that every batch in order holds its exact share (up to one
+            sample where that is no whole number).
+        augment: ``(scan, rng) -> scan`` for synthetic scans, after the label policy.
+        augment_real: also for real scans, which otherwise pass untouched, bit for bit.
+        to_sample: ``(scan, rng) -> sample``; by default the plain PyTorch item (items.py).
+        collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"`` (collate.py), or
+            a function of its own.
+        unlabelled: ``"error"`` refuses a batch without one valid label, ``"allow"`` hands it out, as
+            ``labels="none"`` always does.
+        real_as_is: real samples are no ``Scan`` but what a trainer wants already; see ``wrap``.
+
+    Attributes:
+        collate: the ``collate_fn``.
+        mixture: what the plan follows from.
+        real, synthetic: the sources, in the plan's order.
+
+    Raises:
+        ConfigError: on a ratio outside [0, 1], sources of different sensors or classes, a policy that a source
+            cannot serve, or sizes that cannot be kept.
+        DataError: without real scans, unless ratio is 1.
+    """
+
+    def __init__(
+        self,
+        real: Any,
+        synth: Any = None,
+        ratio: Ratio = 0.25,
+        labels: str | LabelPolicy = "generated",
+        seed: int = 0,
+        *,
+        label_options: Mapping[str, Any] | None = None,
+        epoch_size: EpochSize = "add",
+        reuse: int = 1,
+        balanced: bool = False,
+        augment: LabelPolicy | None = None,
+        augment_real: bool = False,
+        to_sample: ToSample = to_item,
+        collate: Form | Callable[[Any], Any] = "offsets",
+        unlabelled: Unlabelled = "error",
+        real_as_is: bool = False,
+    ) -> None:
+        reals = each(real)
+        synthetics = [(make_synthetic(source, seed), weight) for source, weight in each(synth)]
+        self.real = tuple(source for source, _ in reals)
+        self.synthetic = tuple(source for source, _ in synthetics)
+        self.mixture = Mixture(
+            tuple(Part(len(source), weight, identity_of(source)) for source, weight in reals),
+            tuple(Part(source.length, weight, source.identity) for source, weight in synthetics),
+            make_schedule(ratio), seed, epoch_size, reuse, balanced,
+        )  # fmt: skip
+        sources = self.synthetic if real_as_is else self.real + self.synthetic
+        sensors = check_together(sources)
+        scans = None if real_as_is else real
+        options = dict(label_options or {})
+        self._policies = [make_policy(labels, real=scans, fields=s.fields, **options) for s in self.synthetic]
+        self._augment, self._augment_real = augment, augment_real
+        self._to_sample, self._real_as_is = to_sample, real_as_is
+        if isinstance(collate, str):
+            collate = Collate(collate, sensors[0] if sensors else None, "allow" if labels == "none" else unlabelled)
+        self.collate: Callable[[Any], Any] = collate
+        self._epoch = shared_integers(0)
+        self._planned: tuple[int, Plan] | None = None
+        self.set_epoch(0)
+
+    @classmethod
+    def wrap(
+        cls,
+        dataset: Any,
+        synth: Any,
+        ratio: Ratio = 0.25,
+        *,
+        to_sample: ToSample,
+        collate: Callable[[Any], Any] = default_collate,
+        **options: Any,
+    ) -> "MixedScans":
+        """A trainer's own map-style dataset with synthetic samples among its own.
+
+        Its samples pass through as they are and nothing is added to them: ``domain(i)`` tells which are synthetic.
+        What else the trainer asks its dataset for (class names, a collate function) comes from the wrapped one.
+
+        Args:
+            dataset: has ``__len__`` and ``__getitem__``; or ``Sources`` of several.
+            synth, ratio: as above.
+            to_sample: ``(scan, rng) -> sample`` makes of a synthetic scan what ``dataset`` makes of a real one.
+            collate: the trainer's own.
+            options: the others as above. A label policy that draws from real scans has to be made beforehand, by
+                ``make_policy(..., real=scans)``.
+
+        Raises:
+            ConfigError, DataError: as above.
+        """
+        return cls(dataset, synth, ratio, to_sample=to_sample, collate=collate, real_as_is=True, **options)
+
+    def __getattr__(self, name: str) -> Any:
+        # Only for names that are not found here. Double underscores ask what an object can do (copy, __getitems__).
+        state = self.__dict__
+        if name.startswith("__") or not state.get("_real_as_is") or len(state["real"]) != 1:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return getattr(state["real"][0], name)
+
+    @property
+    def seed(self) -> int:
+        """The mixture's."""
+        return self.mixture.seed
+
+    @property
+    def epoch(self) -> int:
+        """The epoch that indexing refers to."""
+        return int(self._epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch, before a ``DataLoader`` begins to iterate; its workers are told, persistent ones too.
+
+        Raises:
+            ConfigError: on an epoch for which there is no ratio.
+        """
+        quotas(self.mixture, epoch)
+        self._epoch.fill_(epoch)
+        if get_worker_info() is None:
+            for source in self.synthetic:
+                if hasattr(source, "set_epoch"):
+                    source.set_epoch(epoch)
+            self.expect(epoch)
+
+    def plan(self, epoch: int | None = None) -> Plan:
+        """The plan of an epoch, by default of the current one; its hash is logged once in the main process."""
+        epoch = self.epoch if epoch is None else epoch
+        if self._planned is None or self._planned[0] != epoch:
+            self._planned = (epoch, plan(self.mixture, epoch))
+            if get_worker_info() is None:
+                made = self._planned[1]
+                log.info(
+                    "epoch %d: %d samples, %d of them synthetic, plan %s",
+                    epoch, len(made), int(made.domain.sum()), made.hash[:16],
+                )  # fmt: skip
+        return self._planned[1]
+
+    def expect(self, epoch: int, positions: Iterable[int] | None = None) -> None:
+        """Tell synthetic sources that work ahead what will be asked for.
+
+        Args:
+            epoch: of the plan.
+            positions: in order; by default all.
+        """
+        if any(hasattr(source, "expect") for source in self.synthetic):
+            made = self.plan(epoch)
+            asked = np.arange(len(made)) if positions is None else np.fromiter(positions, np.int64)
+            for number, source in enumerate(self.synthetic, made.reals):
+                if hasattr(source, "expect"):
+                    source.expect(made.index[asked[made.source[asked] == number]].tolist())
+
+    def length(self, epoch: int) -> int:
+        """Samples of an epoch."""
+        return sum(quotas(self.mixture, epoch))
+
+    def __len__(self) -> int:
+        return self.length(self.epoch)
+
+    def __getitem__(self, index: int) -> Any:
+        epoch = self.epoch
+        length = len(self.plan(epoch))
+        if not -length <= index < length:
+            raise IndexError(f"sample {index} of {length}")
+        return self.sample(epoch, int(index) % length)
+
+    def domain(self, index: int) -> int:
+        """0 where a real sample stands in the current epoch, 1 where a synthetic one does."""
+        made = self.plan()
+        return SYNTHETIC if made.source[index] >= made.reals else REAL
+
+    def sample(self, epoch: int, position: int) -> Any:
+        """What stands at a position of an epoch, 0 <= position < length; ``self[i]`` is ``sample(epoch, i)``."""
+        made = self.plan(epoch)
+        source, index = int(made.source[position]), int(made.index[position])
+        if source >= made.reals:
+            return self.finish(self.synthetic[source - made.reals][index], epoch, position)
+        real = self.real[source][index]
+        if self._real_as_is:
+            return real
+        rng = keyed_rng(self.seed, epoch, position)
+        if self._augment is not None and self._augment_real:
+            real = self._augment(real, rng)
+        return self._to_sample(real, rng)
+
+    def finish(self, scan: Scan, epoch: int, position: int) -> Any:
+        """The sample of a synthetic scan at its position: label policy, augmentation, ``to_sample``.
+
+        For those who fetch the scan elsewhere, such as in the main process on a GPU.
+        """
+        made = self.plan(epoch)
+        rng = keyed_rng(self.seed, epoch, position)
+        scan = self._policies[int(made.source[position]) - made.reals](scan, rng)
+        if self._augment is not None:
+            scan = self._augment(scan, rng)
+        return self._to_sample(scan, rng)
+
+    def batches(
+        self, batch_size: int, *, rank: int | None = None, world_size: int | None = None, drop_last: bool = False
+    ) -> MixedBatches:
+        """A ``batch_sampler`` along the plan, for one rank or several; see ``MixedBatches``."""
+        return MixedBatches(self, batch_size, rank=rank, world_size=world_size, drop_last=drop_last)

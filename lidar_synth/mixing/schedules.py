@@ -1,0 +1,125 @@
+"""The share of synthetic samples, epoch by epoch.
+
+A schedule is a function from the epoch to a share in [0, 1]. Those here say from which epoch on they stay the same,
+so that what came before an epoch can be counted without visiting every earlier one.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from lidar_synth.errors import ConfigError
+
+Schedule = Callable[[int], float]
+"""Epoch, from 0, to the share of synthetic samples in [0, 1]."""
+
+_FINEST = 10**6  # largest denominator of a share: products with positions stay within 64 bits
+
+
+@dataclass(frozen=True)
+class Steps:
+    """A share from each of some epochs on.
+
+    Args:
+        shares: (epoch, share) pairs, by epoch, the first at 0.
+        length: epochs that there are; None = the last share holds for ever.
+    """
+
+    shares: tuple[tuple[int, float], ...]
+    length: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.shares or self.shares[0][0] != 0:
+            raise ConfigError(f"a ratio schedule {self.shares}", "a ratio from epoch 0 on", "Write {0: 0.5, 10: 0.25}.")
+        for epoch, value in self.shares:
+            _checked(value, epoch)
+
+    @property
+    def settled(self) -> int:
+        """The epoch from which on the share stays the same."""
+        return self.shares[-1][0]
+
+    def __call__(self, epoch: int) -> float:
+        if self.length is not None and epoch >= self.length:
+            raise ConfigError(
+                f"epoch {epoch} of a ratio schedule for {self.length} epochs",
+                "a ratio for every epoch",
+                "Make the list longer, or give {epoch: ratio}, whose last ratio holds for ever.",
+            )
+        return next(value for first, value in reversed(self.shares) if first <= epoch)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A share that changes evenly from epoch to epoch, then stays.
+
+    Args:
+        first: share in epoch 0.
+        last: share from epoch ``epochs - 1`` on.
+        epochs: how many the way takes, at least 2.
+    """
+
+    first: float
+    last: float
+    epochs: int
+
+    def __post_init__(self) -> None:
+        _checked(self.first, 0)
+        _checked(self.last, self.epochs - 1)
+        if self.epochs < 2:
+            raise ConfigError(f"a linear schedule over {self.epochs} epochs", "at least 2")
+
+    @property
+    def settled(self) -> int:
+        """The epoch from which on the share stays the same."""
+        return self.epochs - 1
+
+    def __call__(self, epoch: int) -> float:
+        way = min(epoch / (self.epochs - 1), 1.0)
+        return self.first * (1 - way) + self.last * way
+
+
+def make_schedule(ratio: float | Sequence[float] | Mapping[int, float] | Schedule) -> Schedule:
+    """A schedule from what users write.
+
+    Args:
+        ratio: one share for all epochs; a list with one for each; ``{epoch: share}``, each from its epoch on;
+            ``Linear(first, last, epochs)``; or any function of the epoch.
+
+    Raises:
+        ConfigError: on a share outside [0, 1], or none for epoch 0.
+    """
+    if callable(ratio):
+        return ratio
+    if isinstance(ratio, Mapping):
+        return Steps(tuple(sorted(ratio.items())))
+    if isinstance(ratio, Sequence) and not isinstance(ratio, str):
+        return Steps(tuple(enumerate(ratio)), length=len(ratio))
+    return Steps(((0, ratio),))
+
+
+def share_of(schedule: Schedule, epoch: int) -> Fraction:
+    """The share of synthetic samples in an epoch; 0.1 is one tenth, not the float beside it.
+
+    Raises:
+        ConfigError: on a share outside [0, 1], a negative epoch, or one after the schedule's end.
+    """
+    if epoch < 0:
+        raise ConfigError(f"epoch {epoch}", "0 or more")
+    return _checked(schedule(epoch), epoch)
+
+
+def settled(schedule: Schedule) -> int | None:
+    """The epoch from which on a schedule stays the same; None where it does not say."""
+    return getattr(schedule, "settled", None)
+
+
+def _checked(value: Any, epoch: int) -> Fraction:
+    try:
+        # The comparison is false for NaN too.
+        if 0 <= value <= 1:
+            return Fraction(repr(float(value))).limit_denominator(_FINEST)
+    except TypeError:
+        pass
+    raise ConfigError(f"ratio {value!r} in epoch {epoch}", "the share of synthetic samples, a number from 0 to 1")

@@ -1,0 +1,116 @@
+"""Several sources as one, and whether sources may be mixed at all."""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.classes import NAMES
+from lidar_synth.errors import ConfigError
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor
+
+
+class Sources:
+    """Several real or several synthetic sources, to be given in the place of one.
+
+    Args:
+        sources: in order.
+        weights: one for each; how many samples of an epoch a source gives is proportional to its weight. By default
+            real sources count by their lengths and synthetic ones all the same.
+
+    Raises:
+        ConfigError: without a source, or on another number of weights.
+    """
+
+    def __init__(self, *sources: Any, weights: Sequence[float] | None = None) -> None:
+        if not sources or (weights is not None and len(weights) != len(sources)):
+            raise ConfigError(
+                f"{len(sources)} sources with weights {weights}", "sources, and a weight for each or none"
+            )
+        self.sources = sources
+        self.weights: tuple[float | None, ...] = (None,) * len(sources) if weights is None else tuple(weights)
+
+    def __len__(self) -> int:
+        return sum(map(len, self.sources))
+
+    def __getitem__(self, index: int) -> Any:
+        """The scan at ``index``, one source after another."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"scan {index} of {len(self)}")
+        for source in self.sources:
+            if index < len(source):
+                return source[index]
+            index -= len(source)
+        raise AssertionError
+
+
+def each(source: Any) -> tuple[tuple[Any, float | None], ...]:
+    """(source, weight) of what a user gives as one argument; none for None."""
+    if source is None:
+        return ()
+    if isinstance(source, Sources):
+        return tuple(zip(source.sources, source.weights, strict=True))
+    return ((source, None),)
+
+
+def identity_of(source: Any) -> str:
+    """What tells a source from others: its own word, or its class, its length and the names of its scans."""
+    if own := getattr(source, "identity", ""):
+        return str(own)
+    names = "\n".join(map(str, getattr(source, "ids", ())))
+    return f"{type(source).__name__}:{len(source)}:{hashlib.sha256(names.encode()).hexdigest()[:16]}"
+
+
+def sensor_of(source: Any) -> Sensor:
+    """The sensor of a source of scans, from its first scan where it does not say.
+
+    Raises:
+        ConfigError: where its samples are no scans.
+    """
+    sensor = getattr(source, "sensor", None)
+    if isinstance(sensor, Sensor):
+        return sensor
+    first = source[0]
+    if not isinstance(first, Scan):
+        raise ConfigError(
+            f"real samples of the type {type(first).__name__}",
+            "scans",
+            "MixedScans.wrap(dataset, synth, to_sample=...) takes a trainer's own dataset.",
+        )
+    return first.sensor
+
+
+def check_together(sources: Sequence[Any]) -> list[Sensor]:
+    """The sensors of sources of scans, whose samples have to belong in one training set.
+
+    Sensors agree when their rows and columns look in the same directions; range limits and names may differ. A
+    source can say by ``classes`` (names by train id) what its labels mean; by default it is SemanticKITTI's 19.
+
+    Raises:
+        ConfigError: on another grid or other classes.
+    """
+    sensors = [sensor_of(source) for source in sources]
+    for sensor in sensors[1:]:
+        if sensor.shape != sensors[0].shape or not np.array_equal(sensor.edges, sensors[0].edges):
+            raise ConfigError(
+                f"sources of the sensors {_grid(sensors[0])} and {_grid(sensor)}",
+                "one grid for all real and synthetic scans",
+                "Open the real scans with the generator's sensor (sensor=generator.sensor), or take a model or bank "
+                "of theirs.",
+            )
+    for source in sources:
+        classes = tuple(getattr(source, "classes", NAMES))
+        if classes != NAMES:
+            raise ConfigError(
+                f"a source whose labels mean {classes[:4]}... ({type(source).__name__})",
+                f"SemanticKITTI's {len(NAMES)} train ids, {NAMES[:4]}...",
+                "Map its labels when they are read (Taxonomy.decode), then leave out its attribute 'classes'.",
+            )
+    return sensors
+
+
+def _grid(sensor: Sensor) -> str:
+    rows, columns = sensor.shape
+    return f"{sensor.name!r} ({rows} x {columns}, {sensor.down:.1f} to {sensor.up:.1f} degrees)"

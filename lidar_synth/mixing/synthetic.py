@@ -1,0 +1,157 @@
+"""Where synthetic scans come from: one interface for generation on the CPU, banks and held scans."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Protocol, runtime_checkable
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.generator import Generator
+from lidar_synth.mixing.sources import identity_of
+from lidar_synth.scan import SYNTHETIC, Scan, Source
+from lidar_synth.sensor import Sensor
+
+
+@runtime_checkable
+class Synthetic(Protocol):
+    """A source of synthetic scans by number.
+
+    One that works ahead may also have ``set_epoch(epoch)`` and ``expect(numbers)``, the numbers that this process and
+    its workers will ask for next, in order; ``MixedScans`` calls them.
+
+    Attributes:
+        sensor: whose scans they are.
+        fields: which of ``POINT_FIELDS`` they carry.
+        length: how many there are, numbers 0 .. length - 1; None = endless.
+        identity: what its scans follow from, such as checkpoint and seed; goes into the plan's hash.
+    """
+
+    @property
+    def sensor(self) -> Sensor: ...
+
+    @property
+    def fields(self) -> frozenset[str]: ...
+
+    @property
+    def length(self) -> int | None: ...
+
+    @property
+    def identity(self) -> str: ...
+
+    def __getitem__(self, number: int, /) -> Scan:
+        """The scan, of domain ``SYNTHETIC``; a function of the number alone."""
+        ...
+
+
+class Generated:
+    """Scans made when they are asked for, in the process that asks: on the CPU also in DataLoader workers.
+
+    Args:
+        generator: what makes them. One on a GPU serves the main process only; a worker that asks it gets an error
+            that names the three ways to have a GPU's scans.
+        seed: of the scans; the number of a scan is its index.
+        condition: for a conditional model, what conditions scan n: entry n modulo their number of an indexable source,
+            such as the real scans (``Generator.scans`` tells what it takes).
+        cache: how many of the latest scans each process keeps in memory (about 1 MB each at 64 x 1024), which saves
+            time where one process is asked for a scan again (``reuse``).
+        sampling: steps, solver and guidance, as for ``Generator.scans``.
+
+    Raises:
+        ConfigError: on a negative cache, or a conditional model without conditions.
+    """
+
+    length: None = None
+
+    def __init__(
+        self, generator: Generator, seed: int = 0, *, condition: Any = None, cache: int = 0, **sampling: Any
+    ) -> None:
+        if cache < 0:
+            raise ConfigError(f"cache={cache}", "a number of scans")
+        if (condition is None) != (generator.condition is None):
+            raise ConfigError(
+                f"{'no conditions' if condition is None else 'conditions'} for {generator.name!r}",
+                f"a source of conditions ({generator.condition})" if generator.condition else "none",
+                "Generated(generator, condition=real) conditions it on the scans of a source.",
+            )
+        self.generator, self.seed, self.condition = generator, seed, condition
+        self._sampling, self._cache = sampling, cache
+        self._kept: OrderedDict[int, Scan] = OrderedDict()
+
+    @property
+    def sensor(self) -> Sensor:
+        """The generator's."""
+        return self.generator.sensor
+
+    @property
+    def fields(self) -> frozenset[str]:
+        """What the model makes beside the points."""
+        return self.generator.fields | {"reflectance"}
+
+    @property
+    def identity(self) -> str:
+        """The checkpoint, the seed, the conditions and how it is sampled."""
+        model = self.generator.hash or self.generator.name
+        options = {k: v for k, v in sorted(self._sampling.items()) if v is not None}
+        conditions = "" if self.condition is None else identity_of(self.condition)
+        return f"generated:{model}:{self.seed}:{options}:{conditions}"
+
+    def __getitem__(self, number: int) -> Scan:
+        if number in self._kept:
+            self._kept.move_to_end(number)
+            return self._kept[number]
+        [scan] = self.scans([number])
+        if self._cache:
+            self._kept[number] = scan
+            if len(self._kept) > self._cache:
+                self._kept.popitem(last=False)
+        return scan
+
+    def scans(self, numbers: Sequence[int]) -> list[Scan]:
+        """Several at once, as a GPU wants them."""
+        condition = None if self.condition is None else [self.condition[n % len(self.condition)] for n in numbers]
+        return self.generator.scans(self.seed, numbers, condition, **self._sampling)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_kept": OrderedDict()}
+
+
+class Held:
+    """Scans that are there already (a folder that ``lidar-synth sample`` wrote, a town) as synthetic ones.
+
+    Args:
+        source: of the scans; those of its fields count that its first scan has.
+    """
+
+    def __init__(self, source: Source) -> None:
+        first = source[0]
+        self.sensor: Sensor = getattr(source, "sensor", first.sensor)
+        self.fields = frozenset(first.fields())
+        self.length: int | None = len(source)
+        self.identity = identity_of(source)
+        self._source = source
+
+    def __getitem__(self, number: int) -> Scan:
+        return replace(self._source[number], domain=SYNTHETIC)
+
+
+def make_synthetic(source: Any, seed: int = 0) -> Synthetic:
+    """A synthetic source from what users give: a generator, a bank or another ``Synthetic``, or held scans.
+
+    Args:
+        source: one of these.
+        seed: of the scans, where a generator makes them.
+
+    Raises:
+        ConfigError: on anything else.
+    """
+    if isinstance(source, Generator):
+        return Generated(source, seed)
+    if isinstance(source, Synthetic):
+        return source
+    if isinstance(source, Source) and len(source) and isinstance(source[0], Scan):
+        return Held(source)
+    raise ConfigError(
+        f"{type(source).__name__} as a source of synthetic scans",
+        "a generator, a bank, a rolling bank, or scans by index",
+        "load_generator('town') makes a generator of the shipped model.",
+    )

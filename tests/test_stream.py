@@ -1,0 +1,298 @@
+"""``MixedStream``: the plan's order for every number of workers, with an end or without, and going on from a state."""
+
+import copy
+from collections.abc import Iterator
+from itertools import islice
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from mixtures import Endless, Scans
+from torch.utils.data import DataLoader
+
+import lidar_synth.mixing.stream as module
+from lidar_synth.errors import ConfigError
+from lidar_synth.mixing import MixedScans, MixedStream
+from lidar_synth.scan import Scan
+
+WORKERS = [0, 1, 2, 4]
+
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
+
+
+def name(scan: Scan, rng: np.random.Generator) -> str:
+    return f"{scan.id}/{rng.random()}"
+
+
+def mixed(real: int = 9, **options: Any) -> MixedScans:
+    """15 samples an epoch."""
+    return MixedScans(
+        Scans("r", real), Endless(), 0.4, to_sample=lambda scan, rng: f"{scan.id}/{rng.random()}", **options
+    )
+
+
+def sequence(epochs: int = 6) -> list[str]:
+    """What stands in the plan, epoch after epoch."""
+    scans = mixed()
+    return [scans.sample(epoch, i) for epoch in range(epochs) for i in range(15)]
+
+
+def load(stream: MixedStream, workers: int, **options: Any) -> DataLoader[Any]:
+    return DataLoader(stream, stream.batch_size, num_workers=workers, collate_fn=list, **options)
+
+
+def cut(samples: list[str], size: int) -> list[list[str]]:
+    return [samples[i : i + size] for i in range(0, len(samples), size)]
+
+
+@pytest.mark.parametrize("persistent", [False, True])
+@pytest.mark.parametrize("workers", WORKERS)
+def test_the_batches_of_an_epoch(workers: int, persistent: bool) -> None:
+    stream = MixedStream(mixed(), batch_size=4, endless=False)
+    loader = load(stream, workers, persistent_workers=persistent and workers > 0)
+    for epoch in (0, 2, 1):
+        stream.set_epoch(epoch)
+        assert list(loader) == cut(sequence()[15 * epoch : 15 * epoch + 15], 4)
+
+
+@pytest.mark.parametrize("workers", WORKERS)
+def test_without_end_epochs_follow_one_another(workers: int) -> None:
+    stream = MixedStream(mixed(), batch_size=4)
+    assert list(islice(load(stream, workers), 12)) == cut(sequence()[:48], 4)
+    stream.set_epoch(3)
+    assert list(islice(load(stream, workers), 5)) == cut(sequence()[45:65], 4)
+
+
+@pytest.mark.parametrize("endless", [False, True])
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_ranks_and_workers_divide_the_stream(ranks: int, endless: bool) -> None:
+    given: list[str] = []
+    for rank in range(ranks):
+        stream = MixedStream(mixed(), batch_size=2, endless=endless, rank=rank, world_size=ranks)
+        # 30 samples, whole steps for 2 and 3 ranks, are two epochs
+        given += [x for batch in islice(load(stream, rank), 12 // ranks if endless else None) for x in batch]
+    assert sorted(given) == sorted(sequence()[: 24 if endless else 15])
+
+
+def test_the_last_samples_may_be_left_out() -> None:
+    given = []
+    for rank in range(2):
+        stream = MixedStream(mixed(), batch_size=2, endless=False, drop_last=True, rank=rank, world_size=2)
+        given.append(list(load(stream, 0)))
+    assert [len(batches) for batches in given] == [3, 3]
+    assert sorted(x for batches in given for batch in batches for x in batch) == sorted(sequence()[:12])
+
+
+def test_what_is_left_stays_a_batch_of_its_own() -> None:
+    given = [MixedStream(mixed(), batch_size=7, endless=False, rank=rank, world_size=2) for rank in range(2)]
+    assert [[len(batch) for batch in load(stream, 0)] for stream in given] == [[7, 1], [7]]
+    assert given[0].state_dict(1) == {"seed": 0, "epoch": 0, "position": 14}
+    assert given[0].state_dict(2) == {"seed": 0, "epoch": 1, "position": 0}
+
+
+@pytest.mark.parametrize("endless", [False, True])
+@pytest.mark.parametrize("done", range(5))
+@pytest.mark.parametrize(("before", "after"), [((1, 0), (2, 1)), ((2, 2), (1, 0)), ((2, 1), (3, 2)), ((3, 0), (1, 2))])
+def test_a_state_fits_any_number_of_ranks_and_workers(
+    before: tuple[int, int], after: tuple[int, int], done: int, endless: bool
+) -> None:
+    seen, states = [], []
+    for rank in range(before[0]):
+        stream = MixedStream(mixed(), batch_size=2, endless=endless, rank=rank, world_size=before[0])
+        iterator = iter(load(stream, before[1]))
+        batches = list(islice(iterator, done))
+        if len(batches) < done:
+            return
+        seen += [x for batch in batches for x in batch]
+        states.append(stream.state_dict(done))
+    assert states == [states[0]] * before[0]
+    assert set(states[0]) == {"seed", "epoch", "position"}
+    rest = []
+    for rank in range(after[0]):
+        stream = MixedStream(mixed(), batch_size=3, endless=endless, rank=rank, world_size=after[0])
+        stream.load_state_dict(states[0])
+        rest += [x for batch in islice(load(stream, after[1]), 24 // 3 // after[0] if endless else None) for x in batch]
+    length = len(seen) + 24 // (3 * after[0]) * 3 * after[0] if endless else 15
+    if states[0]["epoch"] == 1 and not endless:
+        assert sorted(rest) == sorted(sequence()[15:30])
+    else:
+        assert sorted(seen + rest) == sorted(sequence()[:length])
+
+
+@pytest.mark.parametrize("endless", [False, True])
+@pytest.mark.parametrize("given", range(15))
+def test_without_workers_the_stream_knows_where_it_is(given: int, endless: bool) -> None:
+    stream = MixedStream(mixed(), batch_size=4, endless=endless)
+    iterator = iter(stream)
+    seen = list(islice(iterator, given))
+    state = stream.state_dict()
+    again = MixedStream(mixed(), batch_size=4, endless=endless)
+    again.load_state_dict(state)
+    assert seen + list(islice(again, 15 - given)) == sequence()[:15]
+    assert ("given" in state) == (given % 4 > 0)
+
+
+def test_after_the_end_comes_the_next_epoch() -> None:
+    stream = MixedStream(mixed(), batch_size=4, endless=False)
+    assert len(list(stream)) == 15
+    assert stream.state_dict(4) == {"seed": 0, "epoch": 1, "position": 0}
+    assert stream.state_dict() == {"seed": 0, "epoch": 0, "position": 15}
+    assert list(stream) == sequence()[:15]  # until set_epoch says otherwise
+    stream.load_state_dict({"seed": 0, "epoch": 1, "position": 5})
+    stream.set_epoch(1)
+    assert list(stream) == sequence()[20:30]
+    stream.scans.set_epoch(2)
+    assert stream.state_dict() == {"seed": 0, "epoch": 2, "position": 0}
+    assert list(stream) == sequence()[30:45]
+
+
+def test_an_epochs_end_that_is_loaded_after_the_next_has_begun() -> None:
+    """As ``StatefulDataLoader`` does it, which loads when it begins to iterate."""
+    end = {"seed": 0, "epoch": 0, "position": 15}
+    for make in (lambda: MixedStream(mixed(), batch_size=4, endless=False), lambda: mixed().batches(4)):
+        resumed = make()
+        resumed.load_state_dict(end)
+        assert list(resumed) == []
+        resumed = make()
+        resumed.set_epoch(1)
+        resumed.load_state_dict(end)
+        assert resumed.state_dict() == {"seed": 0, "epoch": 1, "position": 0}
+        assert len(list(resumed)) == (15 if isinstance(resumed, MixedStream) else 4)
+
+
+def test_a_workers_state_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = MixedStream(mixed(), batch_size=4, endless=False)
+    stream.set_epoch(3)
+    monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=1, num_workers=2))
+    list(stream)
+    state = stream.state_dict()
+    stream.set_epoch(4)
+    stream.load_state_dict(state)
+    assert list(stream) == []
+    assert stream.scans.epoch == 4
+    assert list(stream) == sequence()[64:68] + sequence()[72:75]
+
+
+def test_persistent_workers_hear_of_a_state() -> None:
+    stream = MixedStream(mixed(), batch_size=4, endless=False)
+    loader = load(stream, 2, persistent_workers=True)
+    assert len(list(loader)) == 4
+    stream.load_state_dict({"seed": 0, "epoch": 2, "position": 7})
+    assert list(loader) == cut(sequence()[37:45], 4)
+
+
+class Worker:
+    """A worker as ``StatefulDataLoader`` drives it: a copy of the dataset whose state is taken after each batch."""
+
+    def __init__(self, stream: MixedStream, id: int, workers: int, state: dict[str, int] | None) -> None:
+        self.info = SimpleNamespace(id=id, num_workers=workers)
+        self.stream = copy.deepcopy(stream)
+        with self:
+            if state is not None:
+                self.stream.load_state_dict(state)
+            self.samples = iter(self.stream)
+            self.state = self.stream.state_dict()
+
+    def __enter__(self) -> None:
+        module.get_worker_info = lambda: self.info  # type: ignore[assignment]
+
+    def __exit__(self, *_: object) -> None:
+        module.get_worker_info = lambda: None  # type: ignore[assignment]
+
+    def batch(self) -> list[str]:
+        with self:
+            samples = list(islice(self.samples, self.stream.batch_size))
+            self.state = self.stream.state_dict()
+            return samples
+
+
+def driven(workers: list[Worker], turn: int = 0) -> Iterator[list[str]]:
+    """Batches in the workers' turns until all have ended."""
+    running = set(range(len(workers)))
+    while running:
+        for worker in [w for w in range(turn, len(workers)) if w in running]:
+            if batch := workers[worker].batch():
+                yield batch
+            else:
+                running.discard(worker)
+        turn = 0
+
+
+@pytest.mark.parametrize("endless", [False, True])
+@pytest.mark.parametrize("workers", [1, 2, 3])
+@pytest.mark.parametrize("done", range(6))
+def test_workers_with_a_state_each(workers: int, done: int, endless: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """torchdata's protocol without torchdata."""
+    monkeypatch.setattr(module, "get_worker_info", lambda: None)
+    stream = MixedStream(mixed(), batch_size=3, endless=endless)
+    expected = cut(sequence()[: 30 if endless else 15], 3)
+    first = [Worker(stream, w, workers, None) for w in range(workers)]
+    seen = list(islice(driven(first), done))
+    again = [Worker(stream, w, workers, first[w].state) for w in range(workers)]
+    rest = islice(driven(again, done % workers), 10 - done if endless else None)
+    assert seen + list(rest) == expected
+
+
+@pytest.mark.parametrize("endless", [False, True])
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("done", [0, 1, 3])
+def test_torchdata(workers: int, done: int, endless: bool) -> None:
+    """Both the stream and the batch sampler under ``StatefulDataLoader``, with what workers prefetched thrown away."""
+    torchdata = pytest.importorskip("torchdata.stateful_dataloader")
+
+    def streamed() -> Any:
+        stream = MixedStream(mixed(), batch_size=4, endless=endless)
+        return torchdata.StatefulDataLoader(stream, 4, num_workers=workers, collate_fn=list)
+
+    def sampled() -> Any:
+        scans = mixed()
+        return torchdata.StatefulDataLoader(scans, batch_sampler=scans.batches(4), num_workers=workers, collate_fn=list)
+
+    for make in (streamed, sampled):
+        loader = make()
+        seen = list(islice(loader, done))
+        state = loader.state_dict()
+        again = make()
+        again.load_state_dict(state)
+        count = 10 - done if endless and make is streamed else None
+        total = 40 if count else 15
+        assert seen + list(islice(again, count)) == cut(sequence()[:total], 4)
+
+
+def test_what_a_stream_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match="batch_size=0"):
+        MixedStream(mixed(), batch_size=0)
+    stream = MixedStream(mixed(), batch_size=4, endless=False)
+    with pytest.raises(ConfigError, match="5 batches done of 4"):
+        stream.state_dict(5)
+    with pytest.raises(ConfigError, match="the state of seed 3"):
+        stream.load_state_dict({"seed": 3, "epoch": 0, "position": 0})
+    next(iter(stream))
+    state = stream.state_dict()
+    monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=0, num_workers=2))
+    stream.load_state_dict(state)
+    with pytest.raises(ConfigError, match=r"'workers': 1.*'workers': 2.*state_dict\(done=...\)"):
+        iter(stream)
+
+
+class Ahead(Endless):
+    """A source that works ahead."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[list[int]] = []
+
+    def expect(self, numbers: list[int]) -> None:
+        self.told.append(list(numbers))
+
+
+def test_a_source_that_works_ahead_is_told_this_ranks_share() -> None:
+    source = Ahead()
+    scans = MixedScans(Scans("r", 6), source, 0.5)
+    asked = [[int(scans.sample(e, i)["id"][1:]) if scans.plan(e).domain[i] else -1 for i in range(12)] for e in (0, 1)]
+    stream = MixedStream(scans, batch_size=2, rank=1, world_size=2)
+    source.told.clear()
+    list(islice(stream, 8))
+    mine = [2, 3, 6, 7, 10, 11]
+    assert source.told == [[epoch[i] for i in mine if epoch[i] >= 0] for epoch in asked]
