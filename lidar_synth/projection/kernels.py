@@ -191,12 +191,11 @@ def gather(values, index, empty, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(error_model="numpy", cache=True)
-def along_rays(image, directions, points, index):  # type: ignore[no-untyped-def]
-    """Points (N, 3) of the returns in image (H*W,) along directions (H*W, 3), and their cells (N,)."""
+def along_rays(image, directions, points):  # type: ignore[no-untyped-def]
+    """Points (N, 3) of the returns in image (H*W,) along directions (H*W, 3)."""
     n = 0
     for c in range(len(image)):
         if image[c] > 0:
             for k in range(3):
                 points[n, k] = image[c] * directions[c, k]
-            index[n] = c
             n += 1

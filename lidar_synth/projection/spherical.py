@@ -123,11 +123,11 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
     if not (np.isfinite(image.range).all() and (image.range >= 0).all()):
         raise DataError(f"range image of sensor {image.sensor.name!r} with negative or non-finite range", "metres")
     flat = np.ascontiguousarray(image.range, np.float32).reshape(-1)
-    count = int(np.count_nonzero(flat))
-    points, index = np.empty((count, 3), np.float32), np.empty(count, np.int32)
-    along_rays(flat, image.sensor.ray_directions(rays).reshape(-1, 3), points, index)
-    fields: dict[str, Any] = {name: v.reshape(-1)[index] for name, v in image.channels.items() if name in POINT_FIELDS}
-    fields.setdefault("reflectance", np.zeros(count, np.float32))
+    seen = flat > 0
+    points = np.empty((np.count_nonzero(seen), 3), np.float32)
+    along_rays(flat, image.sensor.ray_directions(rays).reshape(-1, 3), points)
+    fields: dict[str, Any] = {name: v.reshape(-1)[seen] for name, v in image.channels.items() if name in POINT_FIELDS}
+    fields.setdefault("reflectance", np.zeros(len(points), np.float32))
     return Scan(points, sensor=image.sensor, **fields)
 
 
