@@ -1,0 +1,169 @@
+"""A bank of objects: what stood in the boxes of many scans, as a plain ``.npz``.
+
+Arrays of the file (numpy's format, never pickled), M objects of P points in all::
+
+    format                       "lidar-synth-objects/1"
+    sensor                       JSON, the keys of sensors.yaml: who saw them
+    scan                         (M,) text, id of the scan that an object comes from
+    number                       (M,) int32, its box's place in that scan
+    ground                       (M,) float32, metres: height of the ground under it, in that scan's frame
+    box_values, box_names ...    the fields of ``Boxes``, in that scan's frame
+    start                        (M + 1,) int64, object i has the points start[i] to start[i + 1]
+    points                       (P, 3) float32, metres from the box's centre, axes of the sensor
+    reflectance, label           (P,) float32 in [0, 1]; (P,) uint8 train ids
+"""
+
+import json
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from lidar_synth.errors import DataError
+from lidar_synth.files import read_file, write_file
+from lidar_synth.labels.boxes import joined
+from lidar_synth.labels.objects import Object, objects_of
+from lidar_synth.scan import Boxes, Scan, Source
+from lidar_synth.sensor import Sensor
+
+FORMAT = "lidar-synth-objects/1"
+
+
+@dataclass(frozen=True, repr=False)
+class ObjectBank:
+    """Objects of many scans; see the module for the arrays.
+
+    Raises:
+        DataError: on shapes that do not fit together.
+    """
+
+    sensor: Sensor
+    boxes: Boxes
+    scan: NDArray[np.str_]
+    number: NDArray[np.int32]
+    ground: NDArray[np.float32]
+    start: NDArray[np.int64]
+    points: NDArray[np.float32]
+    reflectance: NDArray[np.float32]
+    label: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        count, total = len(self.boxes), len(self.points)
+        rising = len(self.start) == count + 1 and self.start[0] == 0 and self.start[-1] == total
+        if not (rising and (np.diff(self.start) > 0).all()) or self.points.shape != (total, 3):
+            raise DataError(f"{count} objects, {total} points, starts {self.start.shape}", "starts of all objects")
+        for name, size in {
+            "scan": count,
+            "number": count,
+            "ground": count,
+            "reflectance": total,
+            "label": total,
+        }.items():
+            if getattr(self, name).shape != (size,):
+                raise DataError(f"objects: {name} has shape {getattr(self, name).shape}", f"({size},)")
+
+    @classmethod
+    def from_scans(cls, source: Source, scans: Iterable[int] | None = None, least: int = 5) -> "ObjectBank":
+        """The objects in the boxes of a source's scans.
+
+        Args:
+            source: whose scans; those without boxes are left out.
+            scans: their indices; all by default.
+            least: points that an object needs.
+
+        Raises:
+            DataError: where there is no object in any of them, or the scans are of several sensors.
+        """
+        found: list[tuple[int, Object]] = []
+        chosen = range(len(source)) if scans is None else list(scans)
+        for index in tqdm(chosen, "collecting objects", unit="scan", leave=False, disable=None):
+            scan = source[index]
+            if scan.boxes is not None:
+                found += objects_of(scan, least).items()
+        if not found:
+            raise DataError(
+                f"no box with {least} points in {len(chosen)} scans", "scans with boxes, such as KITTI's or the town's"
+            )
+        if len(sensors := {o.scan.sensor for _, o in found}) > 1:
+            raise DataError(f"objects of the sensors {sorted(s.name for s in sensors)}", "one sensor")
+        return cls._of(found)
+
+    @classmethod
+    def _of(cls, found: list[tuple[int, Object]]) -> "ObjectBank":
+        parts = [o.scan for _, o in found]
+        return cls(
+            sensor=parts[0].sensor,
+            boxes=joined([p.boxes for p in parts if p.boxes is not None]),
+            scan=np.array([p.id for p in parts], np.str_),
+            number=np.array([n for n, _ in found], np.int32),
+            ground=np.array([o.ground for _, o in found], np.float32),
+            start=np.cumsum([0, *map(len, parts)], dtype=np.int64),
+            points=np.concatenate([o.scan.points - o.box[:3] for _, o in found]),
+            reflectance=np.concatenate([p.reflectance for p in parts]),
+            label=np.concatenate([p.fields()["label"] for p in parts]),
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> "ObjectBank":
+        """The bank in a file.
+
+        Raises:
+            FileError: where it cannot be read.
+            DataError: where it is no bank of objects, or damaged.
+        """
+        path = Path(path)
+        content = BytesIO(read_file(path))
+        try:
+            with np.load(content, allow_pickle=False) as loaded:
+                arrays: dict[str, Any] = {name: loaded[name] for name in loaded.files}
+            if str(arrays.pop("format")) != FORMAT:
+                raise ValueError("another format")
+            sensor = Sensor.from_dict(json.loads(str(arrays.pop("sensor"))))
+            boxes = {f.name: arrays.pop(f"box_{f.name}") for f in fields(Boxes)}
+            boxes["names"] = tuple(boxes["names"].tolist())
+            return cls(sensor=sensor, boxes=Boxes(**boxes), **arrays)
+        except (ValueError, TypeError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+            raise DataError(f"{path}: {error}", f"a bank of objects ({FORMAT})") from error
+
+    def save(self, path: str | Path) -> None:
+        """Writes the bank to a file; ``load`` is the inverse.
+
+        Raises:
+            FileError: where it cannot be written.
+        """
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sensor", "boxes")}
+        arrays |= {f"box_{f.name}": np.asarray(getattr(self.boxes, f.name)) for f in fields(Boxes)}
+        arrays |= {"format": np.array(FORMAT), "sensor": np.array(json.dumps(self.sensor.to_dict()))}
+        write_file(Path(path), lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def __repr__(self) -> str:
+        return f"ObjectBank({len(self)} objects, {len(self.points)} points, {self.sensor.name})"
+
+    def __getitem__(self, index: int) -> Object:
+        """Object ``index`` where it was seen."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"object {index} of {len(self)}")
+        box, part = self.boxes[[index]], slice(self.start[index], self.start[index + 1])
+        scan = Scan(
+            self.points[part] + box.values[0, :3],
+            self.reflectance[part].copy(),
+            self.sensor,
+            label=self.label[part].copy(),
+            boxes=box,
+            id=str(self.scan[index]),
+        )
+        return Object(scan, float(self.ground[index]))
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """(M,) points of each object."""
+        return np.diff(self.start)

@@ -1,0 +1,92 @@
+"""Boxes in motion: a box's own frame, boxes that move, meet, overlap."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.scan import Boxes
+
+_CORNERS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
+
+
+def box_frame(points: NDArray[np.float32], box: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 3) points along, across and above the centre of one box (7,), metres."""
+    offset = points - box[:3]
+    c, s = np.cos(box[6]), np.sin(box[6])
+    return np.stack([offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s, offset[:, 2]], 1)
+
+
+def grown(box: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(7,) the box about the same centre, large enough for the points (N, 3) with a millimetre to spare, so that it
+    still holds them when both are moved in float32."""
+    held = 2 * (np.abs(box_frame(points, box)).max(0, initial=0) + 1e-3)
+    return np.concatenate([box[:3], np.maximum(box[3:6], held), box[6:]], dtype=np.float32)
+
+
+def moved(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
+    """Boxes elsewhere: their place in the camera's image is not known any more; yaws are brought into [-pi, pi)."""
+    values = values.astype(np.float32)
+    values[:, 6] = (values[:, 6] + np.pi) % (2 * np.pi) - np.pi
+    return Boxes(values, boxes.names, occlusion=boxes.occlusion.copy(), instance=boxes.instance.copy())
+
+
+def turned(boxes: Boxes, angle: float) -> Boxes:
+    """Boxes turned about the sensor, counter-clockwise by an angle in radians."""
+    values = boxes.values.copy()
+    values[:, :2] = turned_points(values[:, :2], angle)
+    values[:, 6] += angle
+    return moved(boxes, values)
+
+
+def turned_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
+    """(N, 2 or 3) points turned about the sensor, counter-clockwise by an angle in radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    out = points.copy()
+    out[:, 0], out[:, 1] = points[:, 0] * c - points[:, 1] * s, points[:, 0] * s + points[:, 1] * c
+    return out
+
+
+def joined(several: Sequence[Boxes]) -> Boxes:
+    """All boxes in one, in this order."""
+    names = tuple(name for boxes in several for name in boxes.names)
+    arrays = {f.name: np.concatenate([getattr(b, f.name) for b in several]) for f in fields(Boxes) if f.name != "names"}
+    return Boxes(names=names, **arrays)
+
+
+def overlapping(box: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(M,) which of the others (M, 7) stand on some of the same ground as a box (7,).
+
+    Two rectangles are apart where a side of one of them separates their corners.
+    """
+    far: NDArray[np.bool_] = (
+        np.hypot(*(others[:, :2] - box[:2]).T) > (np.hypot(*others[:, 3:5].T) + np.hypot(*box[3:5])) / 2
+    )
+    if far.all():
+        return ~far
+    corners = _footprints(np.concatenate([box[None], others]))
+    own, other = corners[0], corners[1:]
+    axes = np.stack([corners[:, 0] - corners[:, 1], corners[:, 1] - corners[:, 2]], 1)
+    ours = np.concatenate([np.broadcast_to(axes[0], (len(others), 2, 2)), axes[1:]], 1)
+    a, b = ours @ own.T, ours @ other.transpose(0, 2, 1)
+    apart = (a.max(2) < b.min(2)) | (b.max(2) < a.min(2))
+    return np.asarray(~apart.any(1))
+
+
+def _footprints(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(M, 4, 2) corners on the ground."""
+    local = _CORNERS * values[:, None, 3:5]
+    c, s = np.cos(values[:, 6:]), np.sin(values[:, 6:])
+    x, y = local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c
+    return np.asarray(np.stack([x, y], -1) + values[:, None, :2], np.float32)
+
+
+def widened(values: NDArray[np.float32], margin: float) -> NDArray[np.float32]:
+    """Boxes (..., 7) with a margin in metres on each of their four sides."""
+    return values + np.array([0, 0, 0, 2 * margin, 2 * margin, 0, 0], np.float32)
+
+
+def unseen(boxes: Boxes) -> Boxes:
+    """Boxes moved up or down where they stand: the camera sees them at another height, under the same angle."""
+    return replace(boxes, image_box=np.full((len(boxes), 4), -1, np.float32), dont_care=np.zeros((0, 4), np.float32))

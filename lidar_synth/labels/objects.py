@@ -1,0 +1,133 @@
+"""Objects cut out of scans, to be set into others."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.errors import DataError
+from lidar_synth.labels.boxes import grown, turned, turned_points
+from lidar_synth.labels.ground import GROUND, ground_under
+from lidar_synth.scan import Boxes, Scan
+
+LABELS = {
+    "Car": TRAIN_ID["car"], "Van": TRAIN_ID["car"], "Truck": TRAIN_ID["truck"], "Pedestrian": TRAIN_ID["person"],
+    "Person_sitting": TRAIN_ID["person"], "Cyclist": TRAIN_ID["bicyclist"], "Tram": TRAIN_ID["other-vehicle"],
+}  # fmt: skip
+"""Train id of a box's points where the scan has no labels; another name's are ignored (KITTI's ``Misc``)."""
+
+THINGS = len(("car", "bicycle", "motorcycle", "truck", "other-vehicle", "person", "bicyclist", "motorcyclist"))
+"""Train ids below this one have instances."""
+
+LOWEST = 0.1
+"""Metres over the ground from which on a return in a box is the object's, where nobody says which are."""
+
+NOISE = 0.15
+"""Metres by which returns of an instance may miss its box."""
+
+
+class Object(NamedTuple):
+    """One object where it was seen.
+
+    Args:
+        scan: its points with reflectance and label, and its one box.
+        ground: height of the ground under it, metres above the sensor's origin.
+    """
+
+    scan: Scan
+    ground: float
+
+    @property
+    def box(self) -> NDArray[np.float32]:
+        """(7,) its box."""
+        values: NDArray[np.float32] = self.scan.boxes.values[0]  # type: ignore[union-attr]
+        return values
+
+    def turned(self, angle: float) -> "Object":
+        """The object seen in another direction: turned about the sensor, counter-clockwise, radians."""
+        assert self.scan.boxes is not None
+        points = turned_points(self.scan.points, angle)
+        return self._replace(scan=replace(self.scan, points=points, boxes=turned(self.scan.boxes, angle)))
+
+
+def objects_of(scan: Scan, least: int = 5) -> dict[int, Object]:
+    """The objects of a scan's boxes, by the number of the box.
+
+    Where boxes and points have instances, an object is its instance, and a box that the sensor's noise or a tilt
+    sticks out of is grown by some centimetres, so that it holds all of its points. Elsewhere it is what stands in its
+    box above the ground.
+
+    Args:
+        scan: with boxes.
+        least: points that an object needs.
+
+    Raises:
+        DataError: where the scan has no boxes.
+    """
+    if scan.boxes is None:
+        raise DataError(f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects")
+    found = {}
+    for number in range(len(scan.boxes)):
+        cut = _cut(scan, scan.boxes[[number]])
+        if cut is not None and len(cut.scan) >= least:
+            found[number] = cut
+    return found
+
+
+def instances_of(scan: Scan, least: int = 5) -> list[Object]:
+    """The objects of a scan that knows instances and no boxes; their boxes are no more than their extent.
+
+    Raises:
+        DataError: where it has no instances or no labels.
+    """
+    if scan.instance is None or scan.label is None:
+        raise DataError(f"scan {scan.id!r} has no instances", "labels and instances, as in SemanticKITTI")
+    things = np.flatnonzero((scan.instance > 0) & (scan.label < THINGS))
+    keys = scan.instance[things].astype(np.int64) * THINGS + scan.label[things]
+    which = np.unique(keys, return_inverse=True)[1]
+    found = []
+    for part in np.split(things[np.argsort(which, kind="stable")], np.cumsum(np.bincount(which))[:-1]):
+        if len(part) >= least:
+            low, high = scan.points[part].min(0), scan.points[part].max(0)
+            box = grown(np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32), scan.points[part])
+            found.append(_object(scan, part, Boxes(box, ("Misc",))))
+    return found
+
+
+def _cut(scan: Scan, box: Boxes) -> Object | None:
+    """The object of one box; None where there is nothing in it."""
+    if scan.instance is not None and box.instance[0] > 0:
+        wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
+        inside = Boxes(wide, box.names).contain(scan.points)[0] & (scan.instance == box.instance[0])
+    else:
+        inside = _standing(scan, box)
+    mine = np.flatnonzero(inside)
+    return (
+        _object(scan, mine, replace(box, values=grown(box.values[0], scan.points[mine])[None])) if len(mine) else None
+    )
+
+
+def _standing(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
+    """(N,) the points in a box that are not its ground."""
+    inside: NDArray[np.bool_] = box.contain(scan.points)[0]
+    ground = ground_under(scan, box.values[0])
+    if ground is not None:
+        inside[inside] = ground.above(scan.points[inside], box.values[0]) > LOWEST
+    return inside if scan.label is None else inside & ~GROUND[scan.label]
+
+
+def _object(scan: Scan, mine: NDArray[np.intp], box: Boxes) -> Object:
+    [values] = box.values
+    ground = ground_under(scan, values)
+    label = LABELS.get(box.names[0], IGNORE)
+    part = Scan(
+        scan.points[mine],
+        scan.reflectance[mine],
+        scan.sensor,
+        label=np.full(len(mine), label, np.uint8) if scan.label is None else scan.label[mine],
+        boxes=replace(box, dont_care=np.zeros((0, 4), np.float32)),
+        id=scan.id,
+    )
+    return Object(part, float(values[2] - values[5] / 2) if ground is None else ground.height)

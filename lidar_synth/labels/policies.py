@@ -1,0 +1,75 @@
+"""The label policies by name. A policy is ``(scan, rng) -> scan``, a function of its two arguments alone."""
+
+from collections.abc import Callable
+from inspect import signature
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.labels.mix import laser, objects, polar
+from lidar_synth.labels.own import condition, generated, ignored, unlabelled
+from lidar_synth.labels.pseudo import pseudo
+from lidar_synth.scan import Scan, Source
+
+LabelPolicy = Callable[[Scan, np.random.Generator], Scan]
+"""What decides on the labels of a synthetic scan; it never changes the scan that it is given."""
+
+KINDS: dict[str, Callable[..., LabelPolicy]] = {"objects": objects, "polar": polar, "laser": laser}
+"""Kinds of ``mix``, built as policies are."""
+
+
+def mix(real: Source | None, fields: frozenset[str], kind: str = "objects", **options: Any) -> LabelPolicy:
+    """``mix``: parts of real scans, with their labels, set into the synthetic one.
+
+    Raises:
+        ConfigError: on an unknown kind or option, or one that the sources cannot serve.
+    """
+    if kind not in KINDS:
+        raise ConfigError(f"labels='mix', kind={kind!r}", f"one of {', '.join(map(repr, KINDS))}")
+    return _build(KINDS[kind], f"labels='mix', kind={kind!r}", real, fields, options)
+
+
+POLICIES: dict[str, Callable[..., LabelPolicy]] = {
+    "none": unlabelled,
+    "ignore": ignored,
+    "generated": generated,
+    "condition": condition,
+    "pseudo": pseudo,
+    "mix": mix,
+}
+"""Builders by name: ``(real, fields, **options) -> LabelPolicy``."""
+
+
+def make_policy(
+    labels: str | LabelPolicy, *, real: Source | None = None, fields: frozenset[str] = frozenset(), **options: Any
+) -> LabelPolicy:
+    """A label policy by name.
+
+    Args:
+        labels: a name of ``POLICIES``, or a policy as it is.
+        real: the real labelled scans, for policies that draw from them.
+        fields: which of ``POINT_FIELDS`` the synthetic scans carry.
+        options: of the policy.
+
+    Raises:
+        ConfigError: on an unknown name or option, or a policy that the sources cannot serve.
+    """
+    if not isinstance(labels, str):
+        if options:
+            raise ConfigError(f"options {sorted(options)} for a policy that is a function", "a policy's name")
+        return labels
+    if labels not in POLICIES:
+        raise ConfigError(f"labels={labels!r}", f"one of {', '.join(map(repr, POLICIES))}, or a function (scan, rng)")
+    return _build(POLICIES[labels], f"labels={labels!r}", real, fields, options)
+
+
+def _build(
+    build: Callable[..., LabelPolicy], where: str, real: Source | None, fields: frozenset[str], options: dict[str, Any]
+) -> LabelPolicy:
+    try:
+        signature(build).bind(real, fields, **options)
+    except TypeError as error:
+        known = list(signature(build).parameters)[2:]
+        raise ConfigError(f"{where}: {error}", f"options {known}" if known else "no options") from error
+    return build(real, fields, **options)

@@ -1,0 +1,70 @@
+"""``pseudo``: labels by a teacher that looks at the finished scan."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.labels.own import checked_share, trusted
+from lidar_synth.scan import Scan, Source
+
+Teacher = Callable[[Scan], Any]
+"""``scan -> (labels (N,) train ids, confidence (N,) in [0, 1])`` or ``scan -> scan`` with labels."""
+
+
+@dataclass(frozen=True)
+class Pseudo:
+    """A teacher's labels, ignored below a confidence.
+
+    Args:
+        teacher: any callable; in DataLoader workers that are spawned it has to be picklable.
+        threshold: least confidence, 0 to 1.
+    """
+
+    teacher: Teacher
+    threshold: float
+
+    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        """The scan with the teacher's labels.
+
+        Raises:
+            DataError: on an answer that is not one label and one confidence per point.
+        """
+        answer = self.teacher(scan)
+        if isinstance(answer, Scan):
+            answer = (answer.label, answer.confidence)
+        if not isinstance(answer, tuple) or len(answer) != 2 or answer[0] is None:
+            raise DataError(
+                f"the teacher's answer {type(answer).__name__} for scan {scan.id!r}",
+                "(labels, confidence), (N,) each, or a scan with labels",
+            )
+        label, confidence = (None if values is None else np.asarray(values) for values in answer)
+        assert label is not None
+        bad = label.shape != (len(scan),) or ((label != IGNORE) & ((label < 0) | (label >= len(NAMES)))).any()
+        if confidence is not None:
+            bad = bad or confidence.shape != label.shape or not ((confidence >= 0) & (confidence <= 1)).all()
+            confidence = confidence.astype(np.float32)
+        if bad:
+            raise DataError(
+                f"the teacher's labels of scan {scan.id!r}, {label.shape} for {len(scan)} points",
+                "train ids 0..18 or 255 and confidences in [0, 1], one of each per point",
+            )
+        return trusted(scan, label.astype(np.uint8), confidence, self.threshold)
+
+
+def pseudo(
+    real: Source | None, fields: frozenset[str], teacher: Teacher | None = None, threshold: float = 0.9
+) -> Pseudo:
+    """``pseudo``: what a teacher says, where it is sure.
+
+    Raises:
+        ConfigError: without a teacher, or on a threshold outside [0, 1].
+    """
+    if not callable(teacher):
+        raise ConfigError(
+            f"labels='pseudo' with teacher={teacher!r}", "a function scan -> (labels, confidence), or scan -> scan"
+        )
+    return Pseudo(teacher, checked_share("threshold", threshold))

@@ -1,0 +1,142 @@
+"""Who hides whom: what a sensor sees in each cell of its range image while objects are set in front of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import DataError
+from lidar_synth.labels.ground import FLOOR, GROUND
+from lidar_synth.labels.objects import Object
+from lidar_synth.projection import locate
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor
+
+
+@dataclass
+class Part:
+    """The returns of the scan or of one object.
+
+    Args:
+        cell: (N,) row * W + column; -1 outside the sensor's range limits.
+        range: (N,) metres.
+        seen: (N,) which of them are still seen.
+        total: how many would be if nothing else were there.
+    """
+
+    cell: NDArray[np.int32]
+    range: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+    total: int
+
+    @property
+    def share(self) -> float:
+        """Of what would be seen, what is."""
+        return float(self.seen.sum() / max(self.total, 1))
+
+
+class View:
+    """The range image of a scan into which objects come, best from near to far.
+
+    Args:
+        scan: N points.
+
+    Attributes:
+        parts: what is seen of the scan and of each object that was added.
+    """
+
+    def __init__(self, scan: Scan) -> None:
+        self.sensor = scan.sensor
+        cell, distance, point = locate(scan.points, scan.sensor)
+        self.parts = [Part(cell, distance, np.ones(len(scan), bool), len(scan))]
+        empty = point < 0
+        self._front = np.full(point.shape, np.inf, np.float32)
+        self._height = np.zeros(point.shape, np.float32)
+        height = scan.points[:, 2]
+        if scan.label is not None:  # what is known not to be ground hides also where it is low
+            height = np.where(GROUND[scan.label] | (scan.label == IGNORE), height, np.float32(np.inf))
+        self._front[~empty], self._height[~empty] = distance[point[~empty]], height[point[~empty]]
+        _close_gaps(self._front, self._height)
+
+    def add(self, placed: Object, least: int) -> bool:
+        """Sets an object into the view; False, and nothing changes, where fewer than ``least`` of it are seen."""
+        cell, distance, shown = locate(placed.scan.points, self.sensor)
+        nearest = shown[shown >= 0]
+        row, column = np.divmod(cell[nearest], self.sensor.columns)
+        # A ground return at the height of the object's floor lies in front of what it stands on, not of the object.
+        stands = self._height[row, column] > placed.ground + FLOOR
+        seen = ~(stands & (self._front[row, column] < distance[nearest]))
+        if seen.sum() < least:
+            return False
+        outline = _outline(row, column, distance[nearest], self.sensor.columns)
+        limit = np.full(self.sensor.shape, np.inf, np.float32)
+        limit[outline[0], outline[1]] = outline[2]
+        limit[row[seen], column[seen]] = 0  # not even the ground just in front of it shares a cell with it
+        for part in self.parts:
+            part.seen &= (part.range <= limit.reshape(-1)[part.cell]) | (part.cell < 0)
+        self._stand(*outline, top=placed.box[2] + placed.box[5] / 2)
+        visible = np.zeros(len(cell), bool)
+        visible[nearest[seen]] = True
+        self.parts.append(Part(cell, distance, visible, len(nearest)))
+        return True
+
+    def _stand(
+        self, row: NDArray[np.intp], column: NDArray[np.intp], depth: NDArray[np.float32], top: np.float32
+    ) -> None:
+        nearer = depth < self._front[row, column]
+        self._front[row[nearer], column[nearer]] = depth[nearer]
+        self._height[row[nearer], column[nearer]] = top
+
+
+def refuse_coarser(given: Sensor, wanted: Sensor) -> None:
+    """What a sensor saw can be thinned to the grid of another, not filled up.
+
+    Raises:
+        DataError: where the given sensor has fewer rows per degree, or fewer columns, than the one that is wanted.
+    """
+    rows = [s.shape[0] / (s.up - s.down) for s in (given, wanted)]
+    if rows[0] < 0.9 * rows[1] or given.columns < 0.9 * wanted.columns:
+        raise DataError(
+            f"returns of sensor {given.name!r} for a scan of {wanted.name!r}",
+            "those of a sensor with at least as many beams and columns",
+        )
+
+
+def _close_gaps(front: NDArray[np.float32], height: NDArray[np.float32]) -> None:
+    """Gives an empty cell (inf) between two returns, above and below or left and right, the farther of them."""
+    for axis in (0, 1):
+        before, after = np.roll(front, 1, axis), np.roll(front, -1, axis)
+        if axis == 0:
+            before[0], after[-1] = np.inf, np.inf
+        farther = np.maximum(before, after)
+        gap = np.isinf(front) & np.isfinite(farther)
+        heights = np.where(before >= after, np.roll(height, 1, axis), np.roll(height, -1, axis))
+        front[gap], height[gap] = farther[gap], heights[gap]
+
+
+def _outline(
+    row: NDArray[np.intp], column: NDArray[np.intp], depth: NDArray[np.float32], columns: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+    """All cells between an object's upper and lower returns, in the columns between its outermost ones.
+
+    Args:
+        row, column, depth: (n,) where its returns are, and their range.
+        columns: of a turn.
+
+    Returns:
+        (m,) rows and columns, and the range of the object's nearest return in the column; in a column without one,
+        between those of the columns beside.
+    """
+    middle = column[0]
+    offset = (column - middle + columns // 2) % columns - columns // 2
+    order = np.lexsort((row, offset))
+    known, first = np.unique(offset[order], return_index=True)
+    top, bottom = row[order][first], np.maximum.reduceat(row[order], first)
+    near = np.minimum.reduceat(depth[order], first)
+    across = np.arange(known[0], known[-1] + 1)
+    upper = np.rint(np.interp(across, known, top)).astype(np.intp)
+    heights = np.rint(np.interp(across, known, bottom)).astype(np.intp) - upper + 1
+    within = np.arange(heights.sum()) - np.repeat(np.cumsum(heights) - heights, heights)
+    nearest = np.repeat(np.interp(across, known, near).astype(np.float32), heights)
+    return np.repeat(upper, heights) + within, np.repeat((across + middle) % columns, heights), nearest

@@ -1,0 +1,341 @@
+"""Label policies: each on the town's scans, whose labels and boxes are exact, and on real ones."""
+
+import pickle
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from worlds import CAR, ROAD, SENSOR, car, cast, wall
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.formats import KITTI360, KITTIObject, SemanticKITTI
+from lidar_synth.labels import KINDS, POLICIES, ObjectBank, make_policy, swap_bands, swap_sector, thinned
+from lidar_synth.noise import keyed_rng
+from lidar_synth.projection import locate, project, unproject
+from lidar_synth.scan import REAL, SYNTHETIC, Boxes, Scan, Source
+from lidar_synth.sensor import presets
+from lidar_synth.town import Town
+
+FIELDS = frozenset({"reflectance", "label", "confidence"})
+
+
+def teacher(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+    """Road below, building above; sure of what is near."""
+    label = np.where(scan.points[:, 2] < -1.5, ROAD, 12)
+    return label, 1 / (1 + np.abs(scan.points[:, 0]) / 10)
+
+
+CALLS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "ignore": {},
+    "generated": {"threshold": 0.5},
+    "condition": {},
+    "pseudo": {"teacher": teacher},
+    "mix": {"count": 6, "turn": 180.0},
+    "mix polar": {"kind": "polar"},
+    "mix laser": {"kind": "laser"},
+}
+
+
+@pytest.fixture(scope="module")
+def real() -> list[Scan]:
+    """Labelled scans in the place of real ones."""
+    town = Town(2, scans=60)
+    return [replace(town[i], domain=REAL) for i in (3, 44)]
+
+
+@pytest.fixture(scope="module")
+def synthetic() -> Scan:
+    """What a model gives: one return per cell at its centre, label and confidence, no boxes."""
+    scan = unproject(project(Town(5, scans=30)[21], channels=["reflectance", "label"]))
+    confidence = keyed_rng(1).random(len(scan)).astype(np.float32)
+    return replace(scan, confidence=confidence, id="model/0/7", domain=SYNTHETIC)
+
+
+def arrays(scan: Scan) -> dict[str, np.ndarray]:
+    """All that a scan holds."""
+    held = {"points": scan.points, **scan.fields()}
+    if scan.boxes is not None:
+        held |= {f.name: np.asarray(getattr(scan.boxes, f.name)) for f in fields(Boxes)}
+    return held
+
+
+def same(a: Scan, b: Scan) -> bool:
+    """Bit for bit."""
+    left, right = arrays(a), arrays(b)
+    return left.keys() == right.keys() and all(np.array_equal(left[n], right[n]) for n in left)
+
+
+def call(name: str) -> tuple[str, dict[str, Any]]:
+    return name.split()[0], CALLS[name]
+
+
+def test_every_policy_and_kind_is_called_here() -> None:
+    assert {name.split()[0] for name in CALLS} == set(POLICIES)
+    assert {"objects", *(c["kind"] for c in CALLS.values() if "kind" in c)} == set(KINDS)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_policy_is_a_function_of_scan_and_generator(name: str, synthetic: Scan, real: list[Scan]) -> None:
+    policy_name, options = call(name)
+    before = [{n: a.copy() for n, a in arrays(s).items()} for s in (synthetic, *real)]
+    policy = make_policy(policy_name, real=real, fields=FIELDS, **options)
+    first, again = policy(synthetic, keyed_rng(4, 1)), policy(synthetic, keyed_rng(4, 1))
+    copied = pickle.loads(pickle.dumps(policy))(synthetic, keyed_rng(4, 1))  # as spawned workers get it
+    assert same(first, again) and same(first, copied)
+    other = policy(synthetic, keyed_rng(4, 2))
+    assert same(first, other) == (policy_name != "mix")
+    for scan, held in zip((synthetic, *real), before, strict=True):
+        assert all(np.array_equal(a, held[n]) for n, a in arrays(scan).items())
+    assert (first.domain, first.id, first.sensor) == (SYNTHETIC, "model/0/7", synthetic.sensor)
+    assert first.fields().keys() == other.fields().keys()
+    assert (first.boxes is None) == (other.boxes is None)
+    for field_name, values in first.fields().items():
+        assert values.dtype == {"label": np.uint8, "instance": np.int32}.get(field_name, np.float32)
+    if first.label is not None:
+        assert first.confidence is not None
+        assert ((first.label < 19) | (first.label == IGNORE)).all()
+        assert (first.confidence >= 0).all() and (first.confidence <= 1).all()
+
+
+def test_none_and_ignore_leave_no_label(synthetic: Scan) -> None:
+    scan = replace(synthetic, boxes=cast([car(9, 0)]).boxes, instance=np.ones(len(synthetic), np.int32))
+    none = make_policy("none")(scan, keyed_rng(0))
+    assert none.fields().keys() == {"reflectance"} and none.boxes is None
+    ignored = make_policy("ignore")(scan, keyed_rng(0))
+    assert ignored.label is not None and ignored.confidence is not None and ignored.boxes is None
+    assert (ignored.label == IGNORE).all() and (ignored.confidence == 0).all()
+
+
+def test_generated_labels_need_confidence(synthetic: Scan) -> None:
+    assert synthetic.label is not None and synthetic.confidence is not None
+    kept = make_policy("generated", fields=FIELDS)(synthetic, keyed_rng(0))
+    assert np.array_equal(kept.label, synthetic.label) and np.array_equal(kept.confidence, synthetic.confidence)
+    sure = make_policy("generated", fields=FIELDS, threshold=0.7)(synthetic, keyed_rng(0))
+    assert np.array_equal(sure.label, np.where(synthetic.confidence >= 0.7, synthetic.label, IGNORE))
+    plain = make_policy("generated", fields=frozenset({"label"}))(replace(synthetic, confidence=None), keyed_rng(0))
+    assert np.array_equal(plain.confidence, (synthetic.label != IGNORE).astype(np.float32))
+
+
+def test_labels_of_a_condition_are_certain(synthetic: Scan) -> None:
+    scan = make_policy("condition", fields=FIELDS)(synthetic, keyed_rng(0))
+    assert np.array_equal(scan.label, synthetic.label)
+    assert np.array_equal(scan.confidence, (synthetic.label != IGNORE).astype(np.float32))
+
+
+def test_a_files_own_labels_never_outlive_a_policy(real: list[Scan]) -> None:
+    for name, options in (("generated", {}), ("condition", {}), ("ignore", {}), ("none", {})):
+        assert make_policy(name, fields=FIELDS, **options)(real[0], keyed_rng(0)).raw_label is None
+
+
+def test_pseudo_labels_are_the_teachers_where_it_is_sure(synthetic: Scan) -> None:
+    label, confidence = teacher(synthetic)
+    scan = make_policy("pseudo", teacher=teacher, threshold=0.6)(synthetic, keyed_rng(0))
+    assert np.array_equal(scan.label, np.where(confidence.astype(np.float32) >= 0.6, label, IGNORE))
+    assert scan.confidence is not None and np.allclose(scan.confidence, confidence)
+
+    def whole(scan: Scan) -> Scan:
+        return replace(scan, label=np.full(len(scan), ROAD, np.uint8), confidence=None)
+
+    certain = make_policy("pseudo", teacher=whole)(synthetic, keyed_rng(0))
+    assert (certain.label == ROAD).all() and (certain.confidence == 1).all()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda s: None,
+        lambda s: replace(s, label=None),
+        lambda s: (np.zeros(len(s), int),),
+        lambda s: (np.zeros(len(s) - 1, int), None),
+        lambda s: (np.full(len(s), 19), None),
+        lambda s: (np.full(len(s), -1), None),
+        lambda s: (np.zeros(len(s), int), np.full(len(s), 1.5)),
+        lambda s: (np.zeros(len(s), int), np.full(len(s), np.nan)),
+        lambda s: (np.zeros(len(s), int), np.ones(3)),
+    ],
+)
+def test_a_teacher_that_answers_nonsense_is_refused(answer: Callable[[Scan], Any], synthetic: Scan) -> None:
+    with pytest.raises(DataError, match="the teacher's"):
+        make_policy("pseudo", teacher=answer)(synthetic, keyed_rng(0))
+
+
+def test_a_sector_is_the_others_and_the_rest_is_kept() -> None:
+    ours, theirs = cast([], [wall(20, 0, 1.5, 60)]), cast([], [wall(-10, 8, 0.3, 30)])
+    theirs = replace(theirs, reflectance=theirs.reflectance + np.float32(0.01))
+    for start, width in ((100, 300), (900, 400), (0, 1024), (5, 0)):
+        mixed = swap_sector(ours, theirs, start, width)
+        inside = np.zeros(1024, bool)
+        inside[(start + np.arange(width)) % 1024] = True
+        a, b, got = project(ours), project(theirs), project(mixed)
+        for name in ("range", "label", "reflectance"):
+            values = [i.range if name == "range" else i.channels[name] for i in (a, b, got)]
+            assert np.allclose(values[2], np.where(inside, values[1], values[0]), atol=1e-4)
+        assert len(mixed) == got.mask.sum() and mixed.domain == SYNTHETIC
+
+
+def test_objects_that_the_edge_of_a_sector_cuts_leave() -> None:
+    ours = cast([car(0, 10), car(10, 0.5), car(12, -12)])
+    theirs = cast([car(0, -9), car(10, 0, np.pi / 2), car(-8, -5)])
+    mixed = swap_sector(ours, theirs, 512, 512)  # the right half is theirs; the edges are straight ahead and behind
+    assert mixed.boxes is not None and mixed.instance is not None and mixed.label is not None
+    assert np.allclose(mixed.boxes.values[:, :2], [[0, 10], [0, -9], [-8, -5]])
+    assert mixed.boxes.instance.tolist() == [1, 2, 3]
+    for box, instance in zip(mixed.boxes.values, mixed.boxes.instance, strict=True):
+        grown = Boxes(box + np.array([0, 0, 0, 0.01, 0.01, 0.01, 0], np.float32), ("Car",))
+        own = mixed.instance == instance
+        assert own.any() and np.array_equal(grown.contain(mixed.points)[0] & (mixed.label == CAR), own)
+    assert ((mixed.label == CAR) == (mixed.instance > 0)).all()
+    cars = mixed.points[mixed.label == CAR]
+    assert not ((cars[:, 0] > 5) & (abs(cars[:, 1]) < 3)).any()  # nor is half a car left
+
+
+def test_boxes_of_two_scans_never_share_a_place() -> None:
+    ours, theirs = cast([car(3, 10.0)]), cast([car(-3, 10.2)])
+    edge = int(locate(np.array([[0, 10, 0]], np.float32), SENSOR).cell[0] % 1024)
+    mixed = swap_sector(ours, theirs, edge - 512, 512)
+    assert mixed.boxes is not None and len(mixed.boxes) == 2
+    ours.boxes.values[0, 3] = theirs.boxes.values[0, 3] = 7  # overlapping boxes, each with its own returns
+    mixed = swap_sector(ours, theirs, edge - 512, 512)
+    assert mixed.boxes is not None and mixed.boxes.values[:, 0].tolist() == [3]
+    assert mixed.instance.max() == 1
+
+
+def test_bands_alternate_from_top_to_bottom() -> None:
+    ours, theirs = cast([car(9, 2)]), cast([], [wall(8, 0, 1.5, 30)])
+    for bands, odd in ((2, False), (3, True), (6, False), (64, True)):
+        mixed = swap_bands(ours, theirs, bands, odd)
+        mine = (np.arange(64) * bands // 64) % 2 == odd
+        expected = np.where(mine[:, None], project(ours).range, project(theirs).range)
+        assert np.allclose(project(mixed).range, expected, atol=1e-4)
+        assert mixed.boxes is None and mixed.instance is not None
+
+
+def test_a_partner_is_thinned_to_the_grid() -> None:
+    scan = Town(1, scans=1)[0]
+    thin = thinned(scan, SENSOR)
+    assert len(thin) == project(scan).mask.sum() < len(scan)
+    assert np.array_equal(project(thin).range, project(scan).range)
+    with pytest.raises(DataError, match="returns of sensor 'town' for a scan of 'os1_128'"):
+        thinned(scan, presets()["os1_128"])
+
+
+def test_mixed_in_labels_are_certain_and_the_rest_keeps_its_own(synthetic: Scan, real: list[Scan]) -> None:
+    policy = make_policy("mix", real=real, fields=FIELDS, kind="laser", bands=[4], threshold=0.5)
+    mixed = policy(synthetic, keyed_rng(3))
+    own = np.isin(mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel())
+    assert mixed.confidence is not None and mixed.label is not None and 0.2 < own.mean() < 0.8
+    assert (mixed.confidence[~own] == (mixed.label[~own] != IGNORE)).all()
+    assert ((mixed.confidence[own] >= 0.5) | (mixed.label[own] == IGNORE)).all()
+    unlabelled = replace(synthetic, label=None, confidence=None)
+    policy = make_policy("mix", real=real, fields=frozenset({"reflectance"}), kind="laser")
+    mixed = policy(unlabelled, keyed_rng(3))
+    own = np.isin(mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel())
+    assert (mixed.label[own] == IGNORE).all() and (mixed.label[~own] != IGNORE).mean() > 0.9
+
+
+def test_polar_turns_objects_about_the_sensor() -> None:
+    real = [cast([car(9, 0), car(14, -6)])]
+    policy = make_policy("mix", real=real, fields=FIELDS, kind="polar", width=0)
+    mixed = policy(cast(), keyed_rng(1))
+    assert mixed.boxes is not None
+    assert np.allclose(np.hypot(*mixed.boxes.values[:, :2].T), [9, np.hypot(14, 6)], atol=1e-3)
+    assert abs(np.arctan2(*mixed.boxes.values[0, 1::-1])) > 0.05
+    bare = [replace(real[0], boxes=None)]
+    mixed = make_policy("mix", real=bare, fields=FIELDS, kind="polar", width=0)(cast(), keyed_rng(1))
+    assert (mixed.label == CAR).sum() > 500 and mixed.boxes is None
+
+
+def test_objects_by_name_and_in_place_of_the_scans_own() -> None:
+    scan = cast([car(8, 6), car(-9, 5)])
+    scan.boxes = Boxes(scan.boxes.values, ("Car", "Van"), instance=scan.boxes.instance)
+    bank = ObjectBank.from_scans([scan])
+    host = replace(cast([car(20, 0)]), boxes=None)
+    mixed = make_policy("mix", fields=FIELDS, objects=bank, count={"Van": 3})(host, keyed_rng(0))
+    assert mixed.boxes is not None and mixed.boxes.names == ("Van",)
+    assert (mixed.label == CAR).sum() == (host.label == CAR).sum() + bank.counts[1]
+    clear = make_policy("mix", fields=FIELDS, objects=bank, clear=True)(host, keyed_rng(0))
+    assert clear.boxes is not None and sorted(clear.boxes.names) == ["Car", "Van"]
+    assert clear.boxes.contain(clear.points[clear.label == CAR]).any(0).all()
+
+
+def refusals() -> list[tuple[str, dict[str, Any], str]]:
+    """Policies that these sources cannot serve, and what the error says."""
+    bare, labelled = [replace(cast(), label=None, boxes=None)], [replace(cast(), boxes=None, instance=None)]
+    plain = frozenset({"reflectance"})
+    return [
+        ("generated", {"fields": plain}, "labels='generated', but the synthetic scans carry.*Use labels='none'"),
+        ("generated", {"fields": frozenset({"label"}), "threshold": 0.5}, "without confidence"),
+        ("generated", {"threshold": 1.5}, "threshold 1.5; expected a number from 0 to 1"),
+        ("condition", {"fields": plain}, "labels='condition', but the synthetic scans carry"),
+        ("pseudo", {}, "teacher=None; expected a function"),
+        ("pseudo", {"teacher": teacher, "threshold": -1}, "threshold -1"),
+        ("none", {"threshold": 0.5}, "labels='none'.*'threshold'; expected no options"),
+        ("generated", {"treshold": 0.5}, "'treshold'; expected options"),
+        ("best", {}, "labels='best'; expected one of 'none', 'ignore'"),
+        ("mix", {"kind": "cut"}, "kind='cut'; expected one of 'objects', 'polar', 'laser'"),
+        ("mix", {}, "no box with 5 points in 0 scans"),
+        ("mix", {"real": bare}, "no box with 5 points in 1 scans.*ObjectBank.from_scans"),
+        ("mix", {"real": [cast([car(8, 2)])], "count": {"Tram": 1}}, "names and points"),
+        ("mix", {"real": [cast([car(8, 2)])], "count": 0}, "count=0"),
+        ("mix", {"real": [cast([car(8, 2)])], "clear": True, "fields": plain}, "clear=True"),
+        ("mix", {"real": bare, "kind": "polar"}, "kind='polar', with scans without labels"),
+        ("mix", {"real": [], "kind": "laser"}, "kind='laser', with none"),
+        ("mix", {"kind": "laser"}, "kind='laser', with none"),
+        ("mix", {"real": labelled, "kind": "polar"}, "neither boxes nor instances"),
+        ("mix", {"real": labelled, "kind": "polar", "width": 400}, "width=400"),
+        ("mix", {"real": labelled, "kind": "laser", "bands": [1]}, r"bands=\[1\]"),
+    ]
+
+
+@pytest.mark.parametrize(("name", "options", "message"), refusals(), ids=lambda v: v if isinstance(v, str) else "")
+def test_what_the_sources_cannot_serve_is_refused(name: str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make_policy(name, **({"fields": FIELDS} | options))
+
+
+def test_scans_that_break_their_promise_are_refused(synthetic: Scan) -> None:
+    with pytest.raises(DataError, match="'model/0/7' has no labels"):
+        make_policy("generated", fields=FIELDS)(replace(synthetic, label=None), keyed_rng(0))
+    real = [cast(), replace(cast(id="second"), label=None)]
+    policy = make_policy("mix", real=real, fields=FIELDS, kind="laser")
+    with pytest.raises(DataError, match="scan 'second' has no labels"):
+        for seed in range(9):
+            policy(synthetic, keyed_rng(seed))
+
+
+def test_a_policy_of_ones_own_is_taken_as_it_is(synthetic: Scan) -> None:
+    def own(scan: Scan, rng: np.random.Generator) -> Scan:
+        return scan
+
+    assert make_policy(own) is own
+    with pytest.raises(ConfigError, match="a policy that is a function"):
+        make_policy(own, threshold=0.5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_real_scans_as_the_labelled_side(kind: str, real_scans: Path, synthetic: Scan) -> None:
+    source: Source = SemanticKITTI(real_scans / "semantic_kitti", split="train")
+    if kind == "objects":
+        source = KITTIObject(real_scans / "kitti_object")
+    policy = make_policy("mix", real=source, fields=FIELDS, kind=kind)
+    for seed in range(3):
+        mixed = policy(synthetic, keyed_rng(seed))
+        assert mixed.domain == SYNTHETIC and mixed.label is not None and mixed.confidence is not None
+        own = np.isin(mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel())
+        assert (~own).sum() > (50 if kind == "objects" else 5000) and own.sum() > 5000
+        assert (mixed.confidence[~own & (mixed.label != IGNORE)] == 1).all()
+        cells = locate(mixed.points, mixed.sensor).cell
+        assert (np.bincount(cells[cells >= 0]) <= 1).all()  # as the model's own scans: one return per cell
+        assert (mixed.boxes is not None) == (kind == "objects")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_real_scans_that_cannot_serve(kind: str, real_scans: Path) -> None:
+    source = KITTI360(real_scans / "kitti360") if kind == "objects" else KITTIObject(real_scans / "kitti_object")
+    with pytest.raises(ConfigError, match=f"kind='{kind}'"):
+        make_policy("mix", real=source, fields=FIELDS, kind=kind)

@@ -1,0 +1,421 @@
+"""Objects set into scans: what a sensor would have seen if they had been there, and nothing else."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import assume, example, given, settings
+from worlds import CAR, HEIGHT, SENSOR, WALL, car, cast, wall
+
+from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.errors import DataError, FileError
+from lidar_synth.formats import KITTIObject, SemanticKITTI
+from lidar_synth.labels import Object, ObjectBank, instances_of, objects_of, paste
+from lidar_synth.labels.boxes import box_frame, grown, joined, overlapping, turned
+from lidar_synth.labels.ground import FLOOR, ground_under
+from lidar_synth.labels.pasting import LIFT
+from lidar_synth.projection import locate, project
+from lidar_synth.scan import SYNTHETIC, Boxes, Scan
+from lidar_synth.sensor import presets
+from lidar_synth.town import Town
+
+places = st.tuples(st.floats(5, 30), st.floats(-180, 180), st.floats(-3.1, 3.1))
+
+
+def at(place: tuple[float, float, float], ground: float = -HEIGHT) -> np.ndarray:
+    """A car at a distance, in a direction (degrees), with a yaw."""
+    distance, direction, yaw = place
+    return car(distance * np.cos(np.radians(direction)), distance * np.sin(np.radians(direction)), yaw, ground)
+
+
+def seen(box: np.ndarray, ground: float = -HEIGHT) -> Object:
+    """A car as the sensor sees it alone in the world."""
+    [found] = objects_of(cast([box], ground=ground)).values()
+    return found
+
+
+def assert_nothing_shares_a_ray(scan: Scan, first: int) -> None:
+    """Brute force over the instances from ``first`` on: a box holds its object and, else, ground only;
+    no other return lies behind the outline of an object, nor in a cell that shows it."""
+    assert scan.boxes is not None and scan.instance is not None
+    height, width = scan.sensor.shape
+    x, y, z = scan.points.astype(np.float64).T
+    distance = np.sqrt(x * x + y * y + z * z)
+    column = np.floor((1 - np.arctan2(y, x) / np.pi) / 2 * width).astype(int) % width
+    edges = scan.sensor.edges.astype(np.float64)
+    row = np.clip(np.searchsorted(-edges, -np.arcsin(z / distance), side="right") - 1, 0, height - 1)
+    for box, instance in zip(scan.boxes.values, scan.boxes.instance, strict=True):
+        if instance < first:
+            continue
+        own = scan.instance == instance
+        one = Boxes(box, ("Car",))
+        assert one.contain(scan.points[own]).all() and own.any()
+        assert own[one.contain(scan.points, above_floor=2 * FLOOR)[0]].all()
+        for c in np.unique(column[own]):
+            mine, others = own & (column == c), ~own & (column == c)
+            assert not set(row[mine]) & set(row[others])
+            between = others & (row > row[mine].min()) & (row < row[mine].max())
+            assert (distance[between] <= distance[mine].min() + 1e-3).all()
+
+
+@settings(max_examples=25, deadline=None)
+@example((22.0, 0.0, 1.0), [(20.0, 1.0)])  # the foot of a wall in the cells where the car meets the ground
+@given(places, st.lists(st.tuples(st.floats(4, 40), st.floats(-180, 180)), max_size=3))
+def test_a_pasted_car_is_what_the_sensor_would_have_seen(
+    place: tuple[float, float, float], walls: list[tuple[float, float]]
+) -> None:
+    box = at(place)
+    around = [wall(d * np.cos(np.radians(a)), d * np.sin(np.radians(a)), np.radians(a) + 1.2) for d, a in walls]
+    empty, true = cast([], around), cast([box], around)
+    pasted = paste(empty, [seen(box)])
+    assume(pasted.boxes is not None and len(pasted.boxes) == 1)
+    expected, got = project(true), project(pasted)
+    assert len(pasted) == len(true)
+    assert np.allclose(expected.range, got.range, atol=1e-4)
+    for name in ("label", "instance"):
+        assert np.array_equal(expected.channels[name], got.channels[name])
+    assert np.allclose(pasted.boxes.values, box, atol=5e-3)
+    assert_nothing_shares_a_ray(pasted, 1)
+
+
+def test_most_places_are_taken() -> None:
+    """The property above must not hold for want of cars."""
+    rng = np.random.default_rng(0)
+    placed = 0
+    for _ in range(20):
+        box = at((rng.uniform(5, 30), rng.uniform(-180, 180), rng.uniform(-3, 3)))
+        placed += len(paste(cast(), [seen(box)]).boxes or ())
+    assert placed == 20
+
+
+@pytest.mark.parametrize("x", [-8.0, 8.0])
+def test_a_car_across_the_seam_is_whole(x: float) -> None:
+    pasted = paste(cast(), [seen(car(x, 0, 1.0))])
+    assert len(pasted) == len(cast([car(x, 0, 1.0)]))
+    assert_nothing_shares_a_ray(pasted, 1)
+
+
+@pytest.mark.parametrize("ground", [-2.3, -1.5])
+@pytest.mark.parametrize("labelled", [True, False])
+def test_it_stands_on_the_ground_that_is_there(ground: float, labelled: bool) -> None:
+    host = cast(ground=ground)
+    host = host if labelled else replace(host, label=None, instance=None)
+    candidate = seen(car(22, 5, 0.4))
+    pasted = paste(host, [candidate])
+    assert pasted.boxes is not None and pasted.instance is not None
+    lowered = candidate.scan.points + np.array([0, 0, pasted.boxes.values[0, 2] - candidate.box[2]], np.float32)
+    cells = np.unique(locate(lowered, SENSOR).cell)
+    assert (pasted.instance == 1).sum() == len(cells)  # the ground before it hides not even its lowest row
+    assert pasted.boxes.values[0, 2] - pasted.boxes.values[0, 5] / 2 == pytest.approx(ground, abs=0.02)
+    assert_nothing_shares_a_ray(pasted, 1)
+
+
+def test_it_stands_on_a_slope() -> None:
+    host = cast()
+    rise = 0.15
+    host.points[:, 2] += rise * host.points[:, 0]
+    pasted = paste(host, [seen(car(5, 2))])
+    assert pasted.boxes is not None
+    assert pasted.boxes.values[0, 2] - 0.8 == pytest.approx(rise * 5 - HEIGHT, abs=0.03)
+
+
+def test_where_it_cannot_stand_it_does_not() -> None:
+    candidate = seen(car(12, 0))
+    for host in (
+        cast([], [wall(12, 0.5)]),  # a wall through it
+        cast([], [wall(13.5, 0, np.pi / 2, 1)]),  # a post in its rear
+        cast([], [wall(6, 0, np.pi / 2, 40)]),  # behind a long wall
+        cast([car(12, 1.5)]),  # beside a car, nearer than anybody parks
+        cast(ground=-HEIGHT - LIFT - 0.2),  # on ground so low that it would be seen from above
+        cast()[cast().points[:, 0] < 5],  # on ground that nobody has seen
+        cast()[:0],
+    ):
+        pasted = paste(host, [candidate])
+        assert np.array_equal(pasted.points, host.points)
+        assert pasted.boxes is not None and len(pasted.boxes) == len(host.boxes or ())
+
+
+def test_what_stands_in_front_hides_it() -> None:
+    """A narrow wall covers part of the car, and the car nothing of the wall."""
+    alone = seen(car(15, 0, np.pi / 2))
+    shares = {}
+    for width in (0.2, 1.0, 1.6):
+        front = wall(9, 0, np.pi / 2, width)
+        pasted = paste(cast([], [front]), [alone])
+        true = cast([car(15, 0, np.pi / 2)], [front])
+        assert pasted.boxes is not None and pasted.label is not None and true.label is not None
+        assert (pasted.label == WALL).sum() == (true.label == WALL).sum()
+        assert (pasted.label == CAR).sum() == (true.label == CAR).sum()
+        shares[width] = (pasted.label == CAR).sum() / len(alone.scan)
+        expected = -1 if shares[width] >= 0.8 else 1 if shares[width] >= 0.45 else 2
+        assert pasted.boxes.occlusion.tolist() == [expected]
+    assert shares[0.2] > 0.8 > shares[1.0] > 0.45 > shares[1.6] > 0.1
+    wide = paste(cast([], [wall(9, 0, np.pi / 2, 3)]), [alone])
+    assert wide.boxes is not None and not len(wide.boxes)  # hidden
+    assert np.array_equal(wide.points, cast([], [wall(9, 0, np.pi / 2, 3)]).points)
+    none = paste(replace(cast(), boxes=None), [])
+    assert none.boxes is not None and len(none.boxes) == 0  # a detector's sample has boxes, be there any or not
+
+
+def test_gaps_in_what_stands_in_front_show_nothing_of_it() -> None:
+    host, alone = cast([], [wall(9, 0, np.pi / 2, 1.6)]), seen(car(15, 0, np.pi / 2))
+    label = project(host).label
+    assert label is not None
+    rows = np.arange(64)[:, None]
+    inner = (label == WALL) & (np.roll(label, 1, 0) == WALL) & (np.roll(label, -1, 0) == WALL) & (rows % 2 == 0)
+    perforated = host[~inner.reshape(-1)[locate(host.points, SENSOR).cell]]
+    assert len(host) - len(perforated) > 200
+    whole, pierced = (paste(h, [alone]).label for h in (host, perforated))
+    assert whole is not None and pierced is not None
+    assert (whole == CAR).sum() == (pierced == CAR).sum() > 100
+
+
+def test_what_it_hides_goes_with_its_box() -> None:
+    behind, beside, farther = car(22, 0.2), car(10, 12, 1.0), car(20, 4.0)
+    host = cast([behind, beside, farther])
+    host.boxes = replace(host.boxes, occlusion=np.array([0, 0, 0]))
+    pasted = paste(host, [seen(car(12, 0, np.pi / 2))])
+    assert pasted.boxes is not None and pasted.instance is not None
+    assert pasted.boxes.instance.tolist() == [2, 3, 4]
+    assert not (pasted.instance == 1).any()
+    assert pasted.boxes.occlusion[0] == 0
+    truth = cast([behind, beside, farther, car(12, 0, np.pi / 2)])
+    assert truth.instance is not None and host.instance is not None
+    assert 0 < (truth.instance == 3).sum() < (host.instance == 3).sum()
+    left = (truth.instance == 3).sum()
+    assert (pasted.instance == 3).sum() == left
+    strict = paste(host, [seen(car(12, 0, np.pi / 2))], least=left + 1)
+    assert strict.boxes is not None and np.allclose(strict.boxes.values[:, 0], [10, 12])
+    assert (strict.label == CAR).sum() == (pasted.label == CAR).sum() - left
+    assert_nothing_shares_a_ray(pasted, 4)
+
+
+def test_several_hide_each_other_whatever_their_order() -> None:
+    cars = [car(9, 0), car(15, 0.8), car(22, 3, 0.3), car(-9, 4, 2.0)]
+    candidates = [seen(c) for c in cars]
+    truth = cast(cars)
+    for order in ([0, 1, 2, 3], [3, 2, 1, 0], [2, 0, 3, 1]):
+        pasted = paste(cast(), [candidates[i] for i in order])
+        assert len(pasted) == len(truth)
+        assert np.allclose(project(pasted).range, project(truth).range, atol=1e-4)
+        assert pasted.boxes is not None
+        assert np.allclose(pasted.boxes.values[:, 0], [9, -9, 15, 22], atol=0.01)  # from near to far
+        assert_nothing_shares_a_ray(pasted, 1)
+    twice = paste(cast(), [candidates[0], candidates[0].turned(0.05), candidates[3]], count=2)
+    assert twice.boxes is not None and len(twice.boxes) == 2  # the second found no place
+
+
+def test_gaps_in_an_object_show_nothing_behind_it() -> None:
+    whole = seen(car(10, 3, 0.7))
+    rng = np.random.default_rng(0)
+    holes = whole._replace(scan=whole.scan[rng.random(len(whole.scan)) < 0.4])
+    background = cast([], [wall(25, 6, 1.0, 30)])
+    full = project(paste(background, [whole]))
+    pasted = paste(background, [holes])
+    assert_nothing_shares_a_ray(pasted, 1)
+    assert ((full.label == CAR) & (project(pasted).range == 0)).sum() > 300
+    across = np.arctan2(whole.scan.points[:, 1], whole.scan.points[:, 0])
+    post = np.abs(across - np.median(across)) < 0.03  # what stood before it when it was recorded
+    stripe = paste(background, [whole._replace(scan=whole.scan[~post])])
+    closed = project(stripe).range[(full.label == CAR) & (project(stripe).label != CAR)]
+    assert len(closed) > 100 and (closed == 0).mean() > 0.97
+
+
+def test_fields_of_a_scan_with_pasted_objects() -> None:
+    host = cast([], [wall(20, 0)])
+    host = replace(host, ring=np.zeros(len(host), np.int16), pose=np.eye(4), domain=0, confidence=None)
+    candidate = seen(car(8, 5))
+    camera = {"truncation": [0.2], "alpha": [1.0], "image_box": [[1, 2, 3, 4]], "occlusion": [1]}
+    known = replace(candidate.scan.boxes, **{k: np.array(v) for k, v in camera.items()})
+    candidate = candidate._replace(scan=replace(candidate.scan, boxes=known))
+    pasted = paste(host, [candidate])
+    assert set(pasted.fields()) == {"reflectance", "label", "instance", "confidence", "ring"}
+    new = slice(-len(candidate.scan), None)
+    assert pasted.boxes is not None and pasted.confidence is not None and pasted.instance is not None
+    assert (pasted.confidence[new] == 1).all() and (pasted.instance[new] == 1).all()
+    assert np.array_equal(pasted.reflectance[new], candidate.scan.reflectance)
+    assert (pasted.domain, pasted.id, pasted.raw_label) == (SYNTHETIC, host.id, None)
+    lasers = np.degrees(SENSOR.laser_elevations[pasted.ring[new]])
+    tilt = np.degrees(np.arcsin(pasted.points[new, 2] / np.linalg.norm(pasted.points[new], axis=1)))
+    assert np.abs(lasers - tilt).max() < 0.45
+    boxes = pasted.boxes
+    assert (boxes.occlusion.tolist(), boxes.image_box.tolist()) == ([1], [[-1] * 4])
+    assert (boxes.truncation[0], boxes.alpha[0]) == (np.float32(0.2), 1)
+    about = paste(host, [candidate.turned(0.2)]).boxes
+    assert about is not None
+    assert (about.truncation[0], about.alpha[0]) == (-1, -10)  # in another direction the camera saw nothing of it
+
+
+def test_nothing_that_is_given_is_changed() -> None:
+    host, candidate = cast([car(20, 0)]), seen(car(8, 5))
+    for array in (host.points, *host.fields().values(), host.boxes.values, candidate.scan.points, candidate.box):
+        array.setflags(write=False)
+    assert len(paste(host, [candidate])) != len(host)
+
+
+def test_a_coarser_sensor_cannot_lend_objects() -> None:
+    coarse = presets()["hdl32e_nuscenes"]
+    [found] = objects_of(cast([car(8, 3)], sensor=coarse)).values()
+    with pytest.raises(DataError, match="returns of sensor 'hdl32e_nuscenes' for a scan of 'town'"):
+        paste(cast(), [found])
+    fine = paste(cast(sensor=coarse), [seen(car(8, 3))])
+    assert fine.boxes is not None and len(fine.boxes) == 1
+    assert_nothing_shares_a_ray(fine, 1)
+
+
+@pytest.fixture(scope="module")
+def town() -> Town:
+    return Town(3, scans=60)
+
+
+@pytest.fixture(scope="module")
+def scans(town: Town) -> list[Scan]:
+    return [town[i] for i in (0, 25, 45)]
+
+
+@pytest.fixture(scope="module")
+def bank(scans: list[Scan]) -> ObjectBank:
+    return ObjectBank.from_scans(scans, least=8)
+
+
+def test_objects_are_their_instances(scans: list[Scan], bank: ObjectBank) -> None:
+    """The town's boxes are so tight that noise sticks out of them: they grow by a little, and hold nearly all of it."""
+    assert len(bank) > 20 and (bank.counts >= 8).all()
+    for index in range(len(bank)):
+        found = bank[index]
+        [scan] = [s for s in scans if s.id == found.scan.id]
+        assert scan.boxes is not None and scan.instance is not None and found.scan.boxes is not None
+        box = scan.boxes.values[bank.number[index]]
+        instance = scan.instance == scan.boxes.instance[bank.number[index]]
+        assert found.scan.boxes.contain(found.scan.points).all()
+        assert (found.box[3:6] >= box[3:6]).all() and (found.box[3:6] - box[3:6]).max() < 0.35
+        assert np.isin(found.scan.points[:, 0].round(3), scan.points[instance][:, 0].round(3)).all()
+        assert len(found.scan) >= 0.7 * instance.sum()
+
+
+def test_a_bank_survives_the_disk(bank: ObjectBank, tmp_path: Path) -> None:
+    bank.save(tmp_path / "objects.npz")
+    again = ObjectBank.load(tmp_path / "objects.npz")
+    assert repr(again) == repr(bank) and again.sensor == bank.sensor and again.boxes.names == bank.boxes.names
+    for name in ("scan", "number", "ground", "start", "points", "reflectance", "label"):
+        a, b = getattr(again, name), getattr(bank, name)
+        assert a.dtype == b.dtype and np.array_equal(a, b)
+    assert np.array_equal(again.boxes.occlusion, bank.boxes.occlusion)
+    content = (tmp_path / "objects.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
+    np.savez(tmp_path / "other.npz", points=np.zeros(3))
+    for name in ("cut", "other"):
+        with pytest.raises(DataError, match=rf"{name}\.npz.*a bank of objects \(lidar-synth-objects/1\)"):
+            ObjectBank.load(tmp_path / f"{name}.npz")
+    with pytest.raises(FileError, match="nowhere"):
+        ObjectBank.load(tmp_path / "nowhere.npz")
+    with pytest.raises(DataError, match="label has shape"):
+        replace(bank, label=bank.label[1:])
+    with pytest.raises(IndexError, match=f"object {len(bank)} of"):
+        bank[len(bank)]
+
+
+def test_a_bank_needs_boxes_and_one_sensor() -> None:
+    with pytest.raises(DataError, match="no box with 5 points in 1 scans"):
+        ObjectBank.from_scans([cast()])
+    with pytest.raises(DataError, match="has no boxes"):
+        objects_of(replace(cast(), boxes=None))
+    mixed = [cast([car(8, 3)]), cast([car(8, 3)], sensor=presets()["os1_128"])]
+    with pytest.raises(DataError, match=r"sensors \['os1_128', 'town'\]"):
+        ObjectBank.from_scans(mixed)
+
+
+def test_without_instances_an_object_is_what_stands_in_its_box() -> None:
+    scan = cast([car(9, 3)])
+    scan.boxes.values[0, 3:6] += 0.4  # as people draw them, with some road
+    for bare in (replace(scan, instance=None), replace(scan, instance=None, label=None)):
+        [found] = objects_of(bare).values()
+        assert (found.scan.label == CAR).all()
+        above = scan.points[scan.instance == 1][:, 2] > -HEIGHT + 0.1
+        assert len(found.scan) == pytest.approx(above.sum(), rel=0.02)
+        assert found.ground == pytest.approx(-HEIGHT, abs=0.02)
+    scan.boxes = Boxes(scan.boxes.values, ("Misc",))
+    [found] = objects_of(replace(scan, label=None)).values()
+    assert (found.scan.label == IGNORE).all()
+
+
+def test_instances_serve_where_there_are_no_boxes() -> None:
+    scan = replace(cast([car(9, 3), car(14, -5), car(40, 20)]), boxes=None)
+    found = instances_of(scan, least=20)
+    assert [len(o.scan) for o in found] == [(scan.instance == i).sum() for i in (1, 2, 3)]
+    pasted = paste(cast(), [o.turned(1.0) for o in found])
+    assert pasted.boxes is not None and len(pasted.boxes) == 3
+    assert_nothing_shares_a_ray(pasted, 1)
+    assert instances_of(cast()) == []
+    with pytest.raises(DataError, match="has no instances"):
+        instances_of(replace(scan, instance=None))
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_town_objects_in_a_town_scan(town: Town, bank: ObjectBank, bare: bool) -> None:
+    host = town[32]
+    if bare:
+        host = replace(host, label=None, instance=None, boxes=None, raw_label=None, ring=None)
+    rng = np.random.default_rng(5)
+    first = 1 if host.boxes is None else int(max(host.instance.max(), host.boxes.instance.max())) + 1
+    angles = rng.uniform(-np.pi, np.pi, len(bank))
+    pasted = paste(host, [bank[i].turned(a) for i, a in zip(rng.permutation(len(bank)), angles, strict=True)], count=12)
+    assert pasted.boxes is not None and (pasted.boxes.instance >= first).sum() >= 4
+    assert_nothing_shares_a_ray(pasted, first)
+    new = pasted.boxes[pasted.boxes.instance >= first]
+    for box in new.values:
+        ground = ground_under(host, box)
+        assert ground is not None and abs(box[2] - box[5] / 2 - ground.height) < 0.35
+
+
+def test_real_objects_in_town_scans(real_scans: Path, town: Town) -> None:
+    bank = ObjectBank.from_scans(KITTIObject(real_scans / "kitti_object", "trainval"))
+    assert set(bank.boxes.names) >= {"Car", "Pedestrian", "Cyclist", "Van", "Truck"}
+    assert set(bank.label.tolist()) <= {TRAIN_ID[n] for n in ("car", "truck", "person", "bicyclist")} | {IGNORE}
+    placed = 0
+    for index in (5, 32):
+        host = replace(town[index], boxes=None, instance=None, raw_label=None, ring=None)
+        rng = np.random.default_rng(index)
+        pasted = paste(host, [bank[i].turned(rng.uniform(-3, 3)) for i in rng.permutation(len(bank))])
+        assert pasted.boxes is not None
+        assert_nothing_shares_a_ray(pasted, 1)
+        placed += len(pasted.boxes)
+    assert placed >= 5
+
+
+def test_real_instances_in_town_scans(real_scans: Path, town: Town) -> None:
+    scan = SemanticKITTI(real_scans / "semantic_kitti", split="train")[0]
+    pasted = paste(replace(town[5], boxes=None), [o.turned(0.5) for o in instances_of(scan, 20)])
+    assert pasted.boxes is not None and len(pasted.boxes) >= 2
+    assert_nothing_shares_a_ray(pasted, int(town[5].instance.max()) + 1)
+
+
+@given(st.integers(0, 200))
+def test_boxes_overlap_where_a_point_lies_in_both(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = np.c_[
+        rng.uniform(-4, 4, (5, 2)), np.zeros(5), rng.uniform(1, 6, (5, 2)), np.ones(5), rng.uniform(-4, 4, 5)
+    ]
+    values = values.astype(np.float32)
+    grid = np.stack(np.meshgrid(np.linspace(-8, 8, 161), np.linspace(-8, 8, 161)), -1).reshape(-1, 2)
+    inside = Boxes(values, ("Car",) * 5).contain(np.c_[grid, np.zeros(len(grid))].astype(np.float32))
+    both = (inside[0] & inside[1:]).any(1)
+    found = overlapping(values[0], values[1:])
+    assert (both <= found).all()
+    smaller = values[1:] - np.array([0, 0, 0, 0.4, 0.4, 0, 0], np.float32)
+    assert (overlapping(values[0], smaller) <= both).all()  # a corner may lie between the grid's points
+
+
+def test_boxes_grow_no_more_than_they_have_to() -> None:
+    box = car(5, 5, 0.5)
+    corners = Boxes(box, ("Car",)).corners()[0]
+    assert np.allclose(grown(box, corners[:0]), box)
+    out = box[:3] + (corners - box[:3]) * np.float32(1.02)
+    larger = grown(box, out)
+    assert Boxes(larger, ("Car",)).contain(out).all()
+    assert np.allclose(larger[3:6], 1.02 * box[3:6] + 0.002, atol=1e-4)
+    assert np.allclose(np.abs(box_frame(corners, box)), box[3:6] / 2, atol=1e-5)
+    two = joined([Boxes(box, ("Car",)), turned(Boxes(box, ("Van",)), 0.3)])
+    assert two.names == ("Car", "Van") and two.values[1, 6] == pytest.approx(0.8)
