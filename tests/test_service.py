@@ -1,0 +1,435 @@
+"""Generation beside the trainer: the scans that the plan says, in every order, from every process and in every way."""
+
+import os
+import pickle
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from mixtures import SENSOR, Scans
+from test_generator import write
+from torch.utils.data import DataLoader, Dataset
+
+from lidar_synth.bank.encoding import Encoding
+from lidar_synth.errors import ConfigError, DataError, FileError, ProcessError
+from lidar_synth.generator import Generator, load_generator
+from lidar_synth.mixing import MixedScans, Sources
+from lidar_synth.projection import project
+from lidar_synth.scan import SYNTHETIC, RangeImage, Scan
+from lidar_synth.service import BatchMixer, RollingBank
+from lidar_synth.service.ledger import COUNTERS, Ledger
+from lidar_synth.service.outlook import NEVER, Counting, Pool, Told
+from lidar_synth.service.slots import Slots
+
+SEED = 3
+FIELDS = ("reflectance", "label", "confidence")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("service") / "small.safetensors")
+
+
+@pytest.fixture(scope="module")
+def generator(path: Path) -> Generator:
+    return load_generator(path)
+
+
+@pytest.fixture(scope="module")
+def bank(path: Path) -> Iterator[RollingBank]:
+    with RollingBank(path, seed=SEED, slots=6, threads=1, timeout=60) as bank:
+        yield bank
+
+
+def codes(scan: Scan) -> dict[str, np.ndarray]:
+    """What a bank would hold of a scan."""
+    fields = [name for name in FIELDS if name in scan.fields()]
+    return Encoding(SENSOR, fields).encode(project(scan, SENSOR, fields))
+
+
+def expected(generator: Generator, number: int) -> dict[str, np.ndarray]:
+    return Encoding(SENSOR, FIELDS).encode(generator.range_images(SEED, [number])[0])
+
+
+def agree(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    """The contract: at least 99.99 % of the cells; of the range within a step, which points in float32 may cross."""
+    steps = {name: abs(a[name].astype(int) - b[name].astype(int)) for name in b}
+    return all((steps[name] <= (name == "range")).mean() >= 0.9999 for name in b)
+
+
+# --- what is made ahead ---------------------------------------------------------------------------------------------
+
+
+def test_an_outlook_that_counts_follows_the_requests() -> None:
+    outlook = Counting(window=4)
+    assert outlook.upcoming({0, 1, 3}) == (2, 2)
+    outlook.answer(5)
+    assert outlook.upcoming({2}) == (3, 3)
+    assert [outlook.next_use(n, 0) for n in (0, 1, 2)] == [NEVER, 1, 2]  # farther behind than the window
+    assert outlook.next_use(2, served=1) == NEVER
+    outlook.answer(70)  # training goes on at another place
+    assert outlook.upcoming(()) == (70, 70)
+    assert outlook.next_use(5, 0) == NEVER
+    outlook.answer(0)  # and begins again
+    assert outlook.upcoming({0}) == (1, 1)
+
+
+def test_an_outlook_that_was_told_knows_every_use() -> None:
+    outlook = Told([7, 9, 7, 8], window=4)
+    assert outlook.upcoming(()) == (0, 7)
+    assert outlook.upcoming({7}) == (1, 9)
+    outlook.answer(7)
+    assert [outlook.next_use(n, 0) for n in (7, 8, 9, 6)] == [2, 3, 1, NEVER]
+    assert outlook.upcoming({7, 9}) == (3, 8)
+    assert outlook.upcoming({7, 8, 9}) is None
+    outlook = Told([7, 9, 7, 8], window=4)
+    assert [outlook.answer(n) for n in (7, 9)] == [7, 9]
+    assert outlook.upcoming(()) == (2, 7)  # what was asked for already is not made for that
+    for number in (7, 8, 5):
+        assert outlook.answer(number) == number
+    assert outlook.next_use(7, 0) == NEVER
+
+
+def test_a_pool_replaces_its_oldest_scans() -> None:
+    outlook = Pool(size=4, replaced=1)
+    assert [outlook.answer(n) for n in range(6)] == [0, 1, 2, 3, 0, 1]
+    outlook.set_epoch(2)
+    assert [outlook.answer(n) for n in range(6)] == [4, 5, 2, 3, 4, 5]
+    assert [outlook.next_use(n, 9) for n in (1, 2)] == [NEVER, 2]
+    assert outlook.upcoming({2, 3}) == (4, 4)
+
+
+# --- the books ------------------------------------------------------------------------------------------------------
+
+
+def make_in_thread(ledger: Ledger, size: int) -> None:
+    """A maker whose scans are their numbers."""
+
+    def work() -> None:
+        while True:
+            for slot in ledger.claim(size):
+                ledger.publish(slot, slot.number)
+
+    threading.Thread(target=work, daemon=True).start()
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    slots=st.integers(1, 6),
+    size=st.integers(1, 4),
+    told=st.none() | st.lists(st.integers(0, 12), max_size=12),
+    requests=st.lists(st.integers(0, 12) | st.integers(0, 2**62), max_size=20),
+)
+def test_every_request_gets_its_scan_whatever_was_told(
+    slots: int, size: int, told: list[int] | None, requests: list[int]
+) -> None:
+    counters = np.zeros(len(COUNTERS), np.int64)
+    ledger = Ledger(slots, counters)
+    if told is not None:
+        ledger.expect(told)
+    make_in_thread(ledger, size)
+    for number in requests:
+        slot = ledger.lend(number)
+        assert (slot.number, slot.checksum, slot.ready) == (number, number, True)
+        ledger.give_back(slot)
+    assert counters[1] == len(requests)
+
+
+def claimed(ledger: Ledger, most: int = 9) -> list[int]:
+    """The numbers of the next scans, as if they were made."""
+    slots = ledger.claim(most)
+    for slot in slots:
+        ledger.publish(slot, 0)
+    return [slot.number for slot in slots]
+
+
+def test_scans_are_made_in_the_order_of_their_use() -> None:
+    ledger = Ledger(4, np.zeros(4, np.int64))
+    assert claimed(ledger) == [0, 1]  # half of the slots at a time
+    ledger.expect([5, 1, 5, 6, 7, 8])
+    assert claimed(ledger) == [5, 6]  # in the place of what is not there and of 0; 1 is kept
+    ledger.give_back(ledger.lend(5))
+    assert claimed(ledger) == [7]
+    lent = [ledger.lend(1), ledger.lend(5)]
+    assert ledger._room(99) is None  # two are read, two are still to be used
+    ledger.give_back(lent[1])
+    assert claimed(ledger) == [8]
+
+
+def test_a_scan_that_is_read_stays_until_it_is_given_back() -> None:
+    ledger = Ledger(1, np.zeros(4, np.int64))
+    assert claimed(ledger) == [0]
+    lent = ledger.lend(0)
+    thread = threading.Thread(target=lambda: ledger.give_back(ledger.lend(1)), daemon=True)
+    thread.start()
+    maker = threading.Thread(target=claimed, args=(ledger,), daemon=True)
+    maker.start()
+    maker.join(0.2)
+    assert (maker.is_alive(), lent.number, lent.ready) == (True, 0, True)
+    ledger.give_back(lent)
+    maker.join(10)
+    thread.join(10)
+    assert (maker.is_alive(), thread.is_alive(), lent.number) == (False, False, 1)
+
+
+def test_a_scan_that_somebody_waits_for_is_not_given_up() -> None:
+    ledger = Ledger(1, np.zeros(4, np.int64))
+    ledger._asked += [5, 6]  # as two readers leave it that have not woken up yet
+    assert claimed(ledger) == [5]
+    assert ledger._room(-1) is None
+    ledger._asked.remove(5)
+    assert claimed(ledger) == [6]
+
+
+def test_starved_requests_are_counted_and_take_what_was_served_least() -> None:
+    counters = np.zeros(4, np.int64)
+    ledger = Ledger(4, counters, "reuse")
+    assert claimed(ledger) == [0, 1]
+    assert [ledger.lend(n).number for n in (0, 9, 9, 9)] == [0, 1, 0, 1]
+    assert dict(zip(COUNTERS, counters.tolist(), strict=True)) == {"made": 2, "served": 4, "waited": 0, "reused": 3}
+
+
+# --- shared memory --------------------------------------------------------------------------------------------------
+
+
+def test_slots_notice_damage(generator: Generator) -> None:
+    slots = Slots(Encoding(SENSOR, FIELDS), 2)
+    [image] = generator.range_images(SEED, [1])
+    checksum = slots.write(1, 1, image)
+    back = slots.read(1, 1, checksum)
+    assert all(np.array_equal(back[name], code) for name, code in Encoding(SENSOR, FIELDS).encode(image).items())
+    with pytest.raises(DataError, match="scan 2 in slot 1"):
+        slots.read(1, 2, checksum)
+    slots._slot(1)[100] ^= 1
+    with pytest.raises(DataError, match="scan 1 in slot 1 of the rolling bank is damaged"):
+        slots.read(1, 1, checksum)
+
+
+def test_last_words_fit() -> None:
+    slots = Slots(Encoding(SENSOR), 1)
+    assert slots.last_words == ""
+    slots.last_words = "ä" * 10_000
+    assert set(slots.last_words) <= set("ä\N{REPLACEMENT CHARACTER}")
+    assert not slots._slot(0).any()
+
+
+# --- the rolling bank -----------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=15, deadline=None)
+@given(numbers=st.lists(st.integers(0, 20) | st.integers(0, 2**62), min_size=1, max_size=5))
+def test_a_rolling_bank_gives_the_generators_scans_in_every_order(
+    bank: RollingBank, generator: Generator, numbers: list[int]
+) -> None:
+    for number in numbers:
+        scan = bank[number]
+        assert (scan.id, scan.domain, scan.sensor) == (f"small/{SEED}/{number}", SYNTHETIC, SENSOR)
+        assert agree(codes(scan), expected(generator, number))
+        image = Encoding(SENSOR, FIELDS).encode(bank.image(number))
+        assert all((image[name] == values).mean() >= 0.9999 for name, values in expected(generator, number).items())
+
+
+class Codes(Dataset[Any]):
+    """What workers of a loader read from a bank."""
+
+    def __init__(self, bank: RollingBank, numbers: Sequence[int]) -> None:
+        self.bank, self.numbers = bank, numbers
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, index: int) -> tuple[str, dict[str, np.ndarray]]:
+        scan = self.bank[self.numbers[index]]
+        return scan.id, codes(scan)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"num_workers": 2, "multiprocessing_context": "fork", "persistent_workers": True},
+     {"num_workers": 1, "multiprocessing_context": "spawn"}],
+    ids=["main", "fork", "spawn"],
+)  # fmt: skip
+def test_workers_read_it(bank: RollingBank, generator: Generator, options: dict[str, Any]) -> None:
+    numbers = [3, 3, 40, 41, 42, 5, 43, 0]
+    bank[7]  # so that a fork inherits an open connection
+    bank.expect(numbers)
+    loader = DataLoader(Codes(bank, numbers), batch_size=2, collate_fn=list, **options)
+    for _ in range(2):
+        given = [sample for batch in loader for sample in batch]
+        assert [name for name, _ in given] == [f"small/{SEED}/{n}" for n in numbers]
+        assert all(agree(c, expected(generator, n)) for (_, c), n in zip(given, numbers, strict=True))
+    assert bank[1].id == f"small/{SEED}/1"
+
+
+def test_threads_read_it(bank: RollingBank) -> None:
+    found: list[str] = []
+    lines = set()
+
+    def read(numbers: range) -> None:
+        found.extend(bank[n].id for n in numbers)
+        lines.add(bank._client._line())
+
+    threads = [threading.Thread(target=read, args=(range(i, 40, 4),)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert sorted(found) == sorted(f"small/{SEED}/{n}" for n in range(40))
+    assert len(lines) == 4  # answers cannot be mixed up; nor between a process and its fork:
+    assert {pid for pid, _ in bank._client._connections} == {os.getpid()}
+
+
+def test_what_was_told_is_there_before_it_is_asked_for(bank: RollingBank) -> None:
+    before = bank.counts()
+    bank.expect([100, 102, 101])
+    wait_until(lambda: bank.counts()["made"] >= before["made"] + 3)
+    assert [bank[n].id for n in (102, 100, 101)] == [f"small/{SEED}/{n}" for n in (102, 100, 101)]
+    after = bank.counts()
+    assert (after["served"] - before["served"], after["waited"] - before["waited"]) == (3, 0)
+    many = list(range(200, 20_200))
+    bank.expect(many)  # more than one message
+    wait_until(lambda: bank.counts()["made"] >= after["made"] + 6)
+    assert bank[200].id == f"small/{SEED}/200"
+    assert bank.counts()["waited"] == after["waited"]
+
+
+def wait_until(what: Callable[[], bool], seconds: float = 60) -> None:
+    pause = threading.Event()
+    for _ in range(int(seconds / 0.02)):
+        if what():
+            return
+        pause.wait(0.02)
+    raise AssertionError("it did not happen")
+
+
+def test_micro_batches_change_rounding_only(path: Path, generator: Generator) -> None:
+    with RollingBank(path, seed=SEED, slots=8, threads=1, timeout=60, batch=3) as bank:
+        pairs = [(codes(bank[n]), expected(generator, n)) for n in range(30)]
+    for name in ("range", *FIELDS):
+        given, whole = (np.stack([p[k][name] for p in pairs]).astype(int) for k in (0, 1))
+        assert (abs(given - whole) <= 1).mean() >= 0.999  # one step of the encoding: 1.2 mm
+
+
+def test_a_pool_is_refreshed_with_the_epoch(path: Path, generator: Generator) -> None:
+    with RollingBank(path, seed=SEED, slots=4, refresh=0.5, threads=1, timeout=60) as bank:
+        assert [bank[n].id[-1] for n in range(8)] == list("01230123")
+        bank.expect([17])  # a pool goes by epochs
+        bank.set_epoch(1)
+        assert [bank[n].id[-1] for n in range(4)] == list("4523")
+        assert agree(codes(bank[0]), expected(generator, 4))
+        assert bank.counts()["made"] <= 8
+
+
+def test_a_starved_bank_serves_what_it_holds(path: Path, generator: Generator) -> None:
+    with RollingBank(path, seed=SEED, slots=4, starved="reuse", threads=1, timeout=60) as bank:
+        bank[0]
+        for number in range(100, 160):
+            scan = bank[number]
+            assert agree(codes(scan), expected(generator, int(scan.id.split("/")[-1])))
+        counts = bank.counts()
+        assert counts["served"] == 61
+        assert counts["reused"] >= 1
+        assert counts["waited"] <= 1
+
+
+def test_what_cannot_be_served_is_refused(path: Path, bank: RollingBank, tmp_path: Path) -> None:
+    refusals: list[tuple[dict[str, Any], str]] = [
+        ({"slots": 0}, "slots=0"),
+        ({"timeout": 0}, "timeout=0"),
+        ({"seed": -1}, "seed -1"),
+        ({"starved": "skip"}, r"starved='skip'; expected one of \('wait', 'reuse'\)"),
+        ({"refresh": 1.5}, r"refresh=1.5; expected a share in \(0, 1\]"),
+    ]
+    for options, message in refusals:
+        with pytest.raises(ConfigError, match=message):
+            RollingBank(path, **options)
+    with pytest.raises(FileError, match="nowhere"):
+        RollingBank(tmp_path / "nowhere.safetensors")
+    with pytest.raises(ConfigError, match="a conditional model"):
+        RollingBank(write(tmp_path / "conditioned.safetensors", dropout=0.0))
+    for number in (-1, 2**63):
+        with pytest.raises(ConfigError, match=f"scan {number}"):
+            bank[number]
+    with pytest.raises(RuntimeError, match="should only be shared between processes"):
+        pickle.dumps(bank)
+
+
+def test_a_process_that_does_not_start_says_why(path: Path) -> None:
+    with pytest.raises(ProcessError, match=r"died \(process \d+, exit code 1; .*device 'nowhere'|nowhere"):
+        RollingBank(path, device="nowhere", timeout=60)
+
+
+def test_a_closed_bank_says_so(path: Path) -> None:
+    bank = RollingBank(path, seed=SEED, slots=2, threads=1, timeout=60)
+    assert bank[0].id == f"small/{SEED}/0"
+    bank.close()
+    bank.close()
+    with pytest.raises(ConfigError, match="a rolling bank that is closed"):
+        bank[1]
+    assert bank.counts()["served"] == 1
+
+
+# --- all ways give the same -----------------------------------------------------------------------------------------
+
+
+def to_codes(scan: Scan, rng: np.random.Generator) -> tuple[str, dict[str, np.ndarray]]:
+    return scan.id, codes(scan)
+
+
+def mixed(synth: Any) -> MixedScans:
+    return MixedScans(
+        Scans("real", 12), synth, 0.5, seed=SEED, reuse=2, to_sample=to_codes, collate=list, labels="generated"
+    )
+
+
+def test_all_ways_give_the_same_scans_for_the_same_plan(bank: RollingBank, generator: Generator) -> None:
+    inside, rolling = mixed(generator), mixed(bank)
+    mixer = BatchMixer(mixed(generator), batch_size=5, num_workers=1)
+    for epoch in (0, 2):
+        for dataset in (inside, rolling, mixer.dataset):
+            dataset.set_epoch(epoch)
+        loaders = [
+            DataLoader(inside, batch_size=5, num_workers=1, collate_fn=list),
+            DataLoader(rolling, batch_size=5, num_workers=2, collate_fn=list),
+            mixer,
+        ]
+        ways = [[sample for batch in loader for sample in batch] for loader in loaders]
+        assert [len(way) for way in ways] == [24, 24, 24]
+        assert len({name for name, _ in ways[0] if name.startswith("small")}) == 6
+        for first, *others in zip(*ways, strict=True):
+            for other in others:
+                assert other[0] == first[0]
+                assert agree(other[1], first[1])
+
+
+def test_batch_mixing_takes_a_batch_sampler_and_several_sources(bank: RollingBank, generator: Generator) -> None:
+    dataset = mixed(Sources(generator, bank))
+    mixer = BatchMixer(dataset, batch_sampler=dataset.batches(4, rank=1, world_size=2))
+    given = [sample for batch in mixer for sample in batch]
+    assert len(mixer) == 3
+    assert len(given) == 12
+    positions = [i for batch in dataset.batches(4, rank=1, world_size=2) for i in batch]
+    for position, (name, values) in zip(positions, given, strict=True):
+        assert dataset[position][0] == name
+        assert agree(values, dataset[position][1])
+    for options in ({}, {"batch_size": 2, "batch_sampler": dataset.batches(2)}):
+        with pytest.raises(ConfigError, match="batch_size=.* and batch_sampler=.*; expected one of them"):
+            BatchMixer(dataset, **options)
+
+
+def test_a_loop_that_is_left_early_leaves_no_thread(generator: Generator) -> None:
+    mixer = BatchMixer(mixed(generator), batch_size=2)
+    before = threading.active_count()
+    for _ in mixer:
+        break
+    wait_until(lambda: threading.active_count() <= before)
+
+
+def test_an_image_is_what_its_scan_shows(bank: RollingBank) -> None:
+    image: RangeImage = bank.image(4)
+    assert np.array_equal(image.mask, project(bank[4]).mask)
