@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from banks import write_bank
 from conftest import random_scan
 
 from lidar_synth.errors import LibraryError
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.calibration import AXES_CAMERA_FROM_SENSOR, Calibration
 from lidar_synth.formats.pcd import import_open3d
+from lidar_synth.projection import project
 from lidar_synth.scan import Boxes, Scan
 from lidar_synth.sensor import load_sensor
 
@@ -153,6 +155,7 @@ def write_kitti_raw(root: Path, count: int = 3) -> list[Path]:
 
 
 MAKERS: dict[str, Callable[[Path], list[Path]]] = {
+    "bank": lambda root: write_bank(root, [project(some_scan(i)) for i in range(3)], shard_size=1),
     "kitti360": lambda root: write_all("kitti360", root, [some_scan(i) for i in range(3)]),
     "semantic_kitti": lambda root: write_all("semantic_kitti", root, [some_scan(i) for i in range(3)]),
     "kitti_object": lambda root: write_all("kitti_object", root, [some_scan(i) for i in range(3)]),

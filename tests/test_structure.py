@@ -6,7 +6,7 @@ from pathlib import Path
 import lidar_synth
 
 ORDER = """errors files classes sensor scan projection normalize noise nets codec conditions flow solvers timesteps
-distill checkpoint importers generator labels augment formats bank mixing service convert bake town metrics train config
+distill checkpoint importers generator labels augment bank formats mixing service convert bake town metrics train config
 viz doctor cli""".split()
 """A module may import only from those before it."""
 

@@ -10,6 +10,8 @@ from typing import Annotated
 import typer
 
 from lidar_synth import __version__
+from lidar_synth.cli.bake import bake
+from lidar_synth.cli.bank import bank, info, repair, verify
 from lidar_synth.cli.convert import convert
 from lidar_synth.cli.doctor import doctor
 from lidar_synth.cli.evaluate import evaluate
@@ -25,6 +27,10 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "convert": convert,
     "view": view,
     "sample": sample,
+    "bake": bake,
+    "verify": verify,
+    "repair": repair,
+    "info": info,
     "train": train,
     "distill": distill,
     "evaluate": evaluate,
@@ -55,6 +61,7 @@ def _options(
 
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)
+app.add_typer(bank)
 
 
 def main() -> None:

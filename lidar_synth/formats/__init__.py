@@ -8,7 +8,9 @@ file per dataset or format holds both. To add a format: write that file, and put
 from collections.abc import Callable
 from pathlib import Path
 
+from lidar_synth.bank import is_bank, is_url
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.formats.bank import BankScans
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.folder import SUFFIXES, Folder, KITTIWriter, NPZWriter, PCDWriter, PLYWriter
 from lidar_synth.formats.kitti360 import KITTI360, KITTI360Writer
@@ -27,6 +29,7 @@ __all__ = [
     "KITTI360",
     "READERS",
     "WRITERS",
+    "BankScans",
     "Calibration",
     "Folder",
     "KITTIObject",
@@ -48,6 +51,7 @@ READERS: dict[str, type[ScanFiles]] = {
     "kitti_object": KITTIObject,
     "kitti_raw": KITTIRaw,
     "nuscenes": NuScenes,
+    "bank": BankScans,
     "range": RangeImages,
     "png": RangePNG,
     "folder": Folder,
@@ -75,6 +79,7 @@ SIGNS: dict[str, Callable[[Path], bool]] = {
         root.name.endswith(SUFFIX) or any(any(root.glob(p)) for p in (f"*{SUFFIX}", f"samples/LIDAR_TOP/*{SUFFIX}"))
     ),
     "kitti_raw": lambda root: any(any(root.glob(p)) for p in ("velodyne_points/data", DRIVES, f"*/{DRIVES}")),
+    "bank": is_bank,
     "png": lambda root: root.suffix == ".png" or any(root.glob("range/*.png")),
     "range": lambda root: _holds_range_images(root),
     "folder": lambda root: root.suffix in SUFFIXES or any(p.suffix in SUFFIXES for p in root.rglob("*")),
@@ -90,10 +95,10 @@ def open_scans(
     split: str | None = None,
     on_bad: OnBad = "error",
 ) -> ScanFiles:
-    """A source of the scans at a path: a dataset's root, a folder of scans, or one file.
+    """A source of the scans at a path: a dataset's root, a bank, a folder of scans, or one file.
 
     Args:
-        path: where they are.
+        path: where they are; for a bank also a URL.
         sensor: which sensor took them, where it is not the layout's own.
         layout: one of ``READERS``; by default recognised by what is there.
         split: a split's name, for the layouts that have splits.
@@ -104,8 +109,11 @@ def open_scans(
         DataError: where no layout is recognised, or it holds no scan.
         ConfigError: on an unknown layout or split, or a split for a layout that has none.
     """
-    path = Path(path)
-    name = layout_of(path) if layout is None else layout
+    if isinstance(path, str) and is_url(path):
+        layout = layout or "bank"
+    else:
+        path = Path(path)
+    name = layout_of(Path(path)) if layout is None else layout
     reader = choose("layout", name, READERS)
     options = {"sensor": sensor, "split": split}
     if split is not None and reader not in (KITTI360, SemanticKITTI, KITTIObject):

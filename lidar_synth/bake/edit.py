@@ -1,0 +1,158 @@
+"""Banks from banks: ``merge``, ``split`` and ``head``. Whole shards are linked, or copied where that cannot be."""
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+from tqdm import tqdm
+
+from lidar_synth.bake.folder import sha256, write_bank_files
+from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
+from lidar_synth.errors import ConfigError, FileError
+
+
+def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
+    """One bank with the scans of several, in their order.
+
+    Args:
+        banks: of one sensor and the same fields.
+        out: the new bank's folder.
+        progress: show a bar.
+
+    Raises:
+        ConfigError: on banks that do not fit together or hold the same scans, or a folder that is not empty.
+        FileError: where it cannot be written.
+    """
+    first = banks[0].facts
+    for bank in banks[1:]:
+        if (bank.facts.sensor, bank.facts.fields) != (first.sensor, first.fields):
+            raise ConfigError(
+                f"{bank.root} holds {bank.facts.fields} of sensor {bank.sensor.name!r}",
+                f"{first.fields} of sensor {first.sensor.name!r}, as {banks[0].root}",
+            )
+    _check_apart(banks)
+    return _write(out, [(bank, 0, len(bank)) for bank in banks], progress)
+
+
+def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dict[Path, Index]:
+    """Several banks with consecutive shares of one.
+
+    Args:
+        bank: what to split.
+        parts: {folder: share of the scans}, in order; the shares sum to 1.
+        progress: show a bar.
+
+    Raises:
+        ConfigError: on shares that do not sum to 1 or leave a part empty, or a folder that is not empty.
+        FileError: where it cannot be written.
+    """
+    if any(share <= 0 for share in parts.values()) or abs(sum(parts.values()) - 1) > 1e-9:
+        raise ConfigError(f"shares {list(parts.values())}", "positive numbers that sum to 1")
+    ends, total = [0], 0.0
+    for share in parts.values():
+        total += share
+        ends.append(round(total * len(bank)))
+    if any(start == stop for start, stop in pairwise(ends)):
+        raise ConfigError(f"{len(bank)} scans in shares {list(parts.values())}", "at least one scan for each")
+    for out in parts:
+        _check_empty(out)
+    ranges = zip(parts, ends, ends[1:], strict=False)
+    return {out: _write(out, [(bank, start, stop)], progress) for out, start, stop in ranges}
+
+
+def head(bank: Bank, scans: int, out: Path, progress: bool = True) -> Index:
+    """A bank with the first scans of one.
+
+    Raises:
+        ConfigError: on more scans than there are, or a folder that is not empty.
+        FileError: where it cannot be written.
+    """
+    if not 1 <= scans <= len(bank):
+        raise ConfigError(f"the first {scans} scans of {bank.root}", f"1 to {len(bank)}")
+    return _write(out, [(bank, 0, scans)], progress)
+
+
+def _write(out: Path, parts: Sequence[tuple[Bank, int, int]], progress: bool) -> Index:
+    """A bank of ranges of scans: (bank, first, one past the last)."""
+    _check_empty(out)
+    sources: list[Facts] = []
+    entries: list[Entry] = []
+    with tqdm(total=sum(b - a for _, a, b in parts), unit="scan", disable=not progress) as bar:
+        for bank, start, stop in parts:
+            for number, (entry, end) in enumerate(zip(bank.index.shards, bank.index.ends, strict=True)):
+                base = end - entry.scans
+                first, last = max(start - base, 0), min(stop - base, entry.scans)
+                if first >= last:
+                    continue
+                facts = bank.index.sources[entry.source]
+                if facts not in sources:
+                    sources.append(facts)
+                new = replace(entry, file=f"shard-{len(entries):05d}.h5", source=sources.index(facts))
+                entries.append(_take(bank, number, new, first, last, out))
+                bar.update(last - first)
+    index = Index(tuple(sources), tuple(entries))
+    write_bank_files(out, index)
+    return index
+
+
+def _take(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path) -> Entry:
+    """Scans ``first`` to ``last`` - 1 of a shard as the shard ``entry.file`` of another bank."""
+    path = out / entry.file
+    if (first, last) == (0, entry.scans):
+        _link(Path(bank.root) / bank.index.shards[number].file, path)
+        return entry
+    entry = replace(entry, first=entry.first + first, scans=last - first)
+    shard = bank.shard(number)
+    names = [name for p in range(first, last) if (name := shard.condition(p)) is not None]
+    part = path.with_name(f".{path.name}.part")
+    with ShardWriter(part, shard.facts, entry, conditions=names) as writer:
+        for position in range(first, last):
+            writer.append_chunks(*shard.chunks(position))
+    entry = replace(entry, bytes=part.stat().st_size, sha256=sha256(part))
+    part.replace(path)
+    return entry
+
+
+def _link(source: Path, path: Path) -> None:
+    """A second name for a file; a copy where the file system has no second names."""
+    part = path.with_name(f".{path.name}.part")
+    part.unlink(missing_ok=True)
+    try:
+        os.link(source, part)
+    except OSError:
+        try:
+            shutil.copyfile(source, part)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise FileError(f"{path} cannot be written ({error.strerror})", "a folder on a disk with room") from error
+    part.replace(path)
+
+
+def _check_empty(out: Path) -> None:
+    if (out / INDEX).exists() or any(out.glob("*.h5")):
+        raise ConfigError(f"{out} holds a bank", "a folder of its own for the new one")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{out} cannot be made ({error.strerror})", "a folder that may be written to") from error
+
+
+def _check_apart(banks: Sequence[Bank]) -> None:
+    """Refuse to have a scan twice: the same checkpoint and settings, the same seed, the same index."""
+    taken: dict[tuple[str, str, int], list[tuple[int, int, str | Path]]] = {}
+    for bank in banks:
+        for entry in bank.index.shards:
+            facts = bank.index.sources[entry.source]
+            how = str([facts.settings.get(key) for key in ("steps", "solver")])
+            others = taken.setdefault((facts.checkpoint, how, entry.seed), [])
+            for first, stop, root in others:
+                if entry.first < stop and first < entry.first + entry.scans:
+                    raise ConfigError(
+                        f"{root} and {bank.root} both hold scan {max(first, entry.first)} of seed {entry.seed}",
+                        "every scan once",
+                        "Bake with another --seed, or a --first behind the end of the other bank.",
+                    )
+            others.append((entry.first, entry.first + entry.scans, bank.root))

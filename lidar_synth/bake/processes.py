@@ -1,0 +1,94 @@
+"""Engine ``processes``: several processes on this machine, each taking the next shard that nobody has.
+
+On GPUs every process has one of its own, in turn. A worker that is killed stops the run with a message; what it was
+making is made by the next one.
+"""
+
+import signal
+from collections.abc import Sequence
+from multiprocessing import get_context, parent_process
+from typing import Any
+
+from lidar_synth.bake.job import Plan
+from lidar_synth.bake.resources import Resources
+from lidar_synth.bake.shard import Progress, bake_shard
+from lidar_synth.errors import FileError
+
+_LOOK = 0.2  # seconds between two looks at the workers
+_PATIENCE = 60  # seconds for a worker to give up its shard
+
+
+def bake_in_processes(plan: Plan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+    """Make the shards in ``resources.workers`` processes.
+
+    Raises:
+        FileError: where a worker was killed.
+    """
+    context = get_context("spawn")  # a fork would share torch's threads
+    taken, scans = context.Value("q", 0), context.Value("q", 0)
+    stop, errors = context.Event(), context.SimpleQueue()
+    workers = [
+        context.Process(target=_work, args=(plan, numbers, taken, scans, stop, errors, rank), daemon=True)
+        for rank in range(min(resources.workers, len(numbers)))
+    ]
+    for worker in workers:
+        worker.start()
+    told = 0
+    try:
+        while any(worker.is_alive() for worker in workers):
+            for worker in workers:
+                worker.join(_LOOK / len(workers))
+            told += _tell(progress, scans.value - told)
+            if not errors.empty():
+                raise errors.get()
+            if killed := [worker for worker in workers if worker.exitcode not in (None, 0)]:
+                raise FileError(
+                    f"a worker was killed (exit status {killed[0].exitcode})",
+                    "enough memory for all workers",
+                    "Run the same again, perhaps with fewer workers: finished shards are kept.",
+                )
+        if not errors.empty():
+            raise errors.get()
+        _tell(progress, scans.value - told)
+    finally:
+        stop.set()
+        for worker in workers:
+            worker.join(_PATIENCE)
+            worker.kill()  # one that a killed worker left waiting for a lock
+            worker.join()
+
+
+def _tell(progress: Progress, scans: int) -> int:
+    if scans:
+        progress(scans)
+    return scans
+
+
+def _work(plan: Plan, numbers: Sequence[int], taken: Any, scans: Any, stop: Any, errors: Any, rank: int) -> None:
+    """One worker: until there is no shard left, or the run is stopped."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process says when to stop
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if plan.job.device == "cuda":
+        import torch
+
+        torch.cuda.set_device(rank % torch.cuda.device_count())
+    parent = parent_process()
+
+    def progress(made: int) -> None:
+        if stop.is_set() or parent is None or not parent.is_alive():
+            raise KeyboardInterrupt
+        with scans.get_lock():
+            scans.value += made
+
+    try:
+        while not stop.is_set():
+            with taken.get_lock():
+                position = taken.value
+                taken.value += 1
+            if position >= len(numbers):
+                return
+            bake_shard(plan, numbers[position], progress)
+    except KeyboardInterrupt:
+        return
+    except Exception as error:
+        errors.put(error)

@@ -1,0 +1,143 @@
+"""How a bank holds a range image: 3 to 5 bytes a cell, the same bytes on every machine.
+
+=========== ====== ================================================================================================
+array       type   value
+=========== ====== ================================================================================================
+range       uint16 metres = value * scale, scale = the sensor's range_max / 65535 (1.2 mm for 80 m); 0 = no return
+reflectance uint8  value / 255
+label       uint8  train ids 0..18, 255 = ignore
+confidence  uint8  value / 15: four bits are what a confidence is worth
+=========== ====== ================================================================================================
+
+``encode`` is off by half a step at most and the inverse of ``decode`` on everything that ``decode`` gives. A return
+stays a return: one nearer than half a step is 1 and not 0, and none leaves the sensor's range limits, where a
+projection would drop it.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.scan import RangeImage
+from lidar_synth.sensor import Sensor
+
+RANGE_STEPS = 65535
+"""Steps of the range from 0 to the sensor's farthest."""
+
+TYPES: dict[str, type[np.unsignedinteger[Any]]] = {
+    "range": np.uint16, "reflectance": np.uint8, "label": np.uint8, "confidence": np.uint8,
+}  # fmt: skip
+"""Arrays and their types, in the order in which they are stored."""
+
+LEVELS = {"reflectance": 255, "confidence": 15}
+"""Steps from 0 to 1."""
+
+_INSIDE = 1e-6
+"""Share by which a decoded range keeps away from the sensor's limits: what float32 points lose on the way back."""
+
+
+class Encoding:
+    """Range images of one sensor to compact arrays and back.
+
+    Args:
+        sensor: whose grid.
+        fields: names of ``TYPES`` that a scan carries beside its range.
+
+    Attributes:
+        names: of the arrays, in order.
+        scale: metres per step of the range.
+
+    Raises:
+        ConfigError: on a field that has no encoding.
+    """
+
+    def __init__(self, sensor: Sensor, fields: Iterable[str] = ()) -> None:
+        given = {"range", *fields}
+        if unknown := sorted(given - set(TYPES)):
+            raise ConfigError(f"fields {unknown} of a bank", f"some of {', '.join(TYPES)}")
+        self.sensor = sensor
+        self.names = tuple(name for name in TYPES if name in given)
+        self.scale = sensor.range_max / RANGE_STEPS
+
+    def arrays(self) -> dict[str, tuple[tuple[int, int], np.dtype[Any]]]:
+        """Shape and type of each array of one scan."""
+        return {name: (self.sensor.shape, np.dtype(TYPES[name])) for name in self.names}
+
+    def encode(self, image: RangeImage, out: Mapping[str, NDArray[Any]] | None = None) -> dict[str, NDArray[Any]]:
+        """The arrays of a range image.
+
+        Args:
+            image: on the sensor's grid, with a channel for each field; more do no harm.
+            out: (H, W) arrays to write into, as ``arrays`` tells them; new ones by default.
+
+        Returns:
+            {name: (H, W)}, those of ``out`` where they are given.
+
+        Raises:
+            DataError: on another grid, a missing channel, or a value that has no code: a range outside the sensor's
+                limits, a reflectance or confidence outside [0, 1], an unknown train id, NaN.
+        """
+        if image.sensor.shape != self.sensor.shape:
+            raise DataError(f"a range image of {image.sensor.shape}", f"{self.sensor.shape} of {self.sensor.name!r}")
+        if missing := [name for name in self.names[1:] if name not in image.channels]:
+            raise DataError(f"a range image without {missing}", f"channels {list(self.names[1:])}")
+        codes = {
+            name: self._code(name, image.range if name == "range" else image.channels[name]) for name in self.names
+        }
+        if out is None:
+            return {name: code.astype(TYPES[name]) for name, code in codes.items()}
+        for name, code in codes.items():
+            np.copyto(out[name], code, casting="unsafe")
+        return {name: out[name] for name in self.names}
+
+    def decode(self, arrays: Mapping[str, NDArray[Any]]) -> RangeImage:
+        """The range image of ``encode``'s arrays; its own memory, float32 but for the labels."""
+        shares = {n: np.divide(arrays[n], np.float32(LEVELS[n]), dtype=np.float32) for n in self.names if n in LEVELS}
+        labels = {n: arrays[n].copy() for n in self.names if n == "label"}
+        return RangeImage(self.metres(arrays["range"]), self.sensor, shares | labels)
+
+    def metres(self, codes: NDArray[np.uint16]) -> NDArray[np.float32]:
+        """Ranges (any shape) of their codes, 0 = no return."""
+        near, far = self.sensor.range_min * (1 + _INSIDE), self.sensor.range_max * (1 - _INSIDE)
+        metres = np.multiply(codes, np.float32(self.scale), dtype=np.float32)
+        np.clip(metres, np.float32(near), np.float32(far), out=metres)
+        metres[codes == 0] = 0
+        return metres
+
+    def _code(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
+        """What ``encode`` stores, in any type that holds it."""
+        if name == "range":
+            return self._range(values)
+        return _share(values, name) if name in LEVELS else _train_ids(values)
+
+    def _range(self, metres: NDArray[np.float32]) -> NDArray[Any]:
+        near, far = self.sensor.range_min - self.scale / 2, self.sensor.range_max + self.scale / 2
+        seen = metres != 0
+        if not ((metres >= np.float32(max(near, 0))) & (metres <= np.float32(far)) | ~seen).all():
+            raise DataError(
+                f"a range image with ranges from {metres[seen].min():g} to {metres[seen].max():g} m",
+                f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of {self.sensor.name!r}, "
+                "or 0 = no return",
+            )
+        codes: NDArray[np.float32] = np.rint(np.multiply(metres, np.float32(1 / self.scale), dtype=np.float32))
+        np.clip(codes, seen, RANGE_STEPS, out=codes)
+        return codes
+
+
+def _share(values: NDArray[Any], name: str) -> NDArray[Any]:
+    """Codes of values in [0, 1]."""
+    if not ((values >= 0) & (values <= 1)).all():
+        raise DataError(f"{name} from {values.min():g} to {values.max():g}", "values in [0, 1]")
+    codes: NDArray[np.float32] = np.rint(np.multiply(values, np.float32(LEVELS[name]), dtype=np.float32))
+    return codes
+
+
+def _train_ids(label: NDArray[Any]) -> NDArray[Any]:
+    if ((label >= len(NAMES)) & (label != IGNORE)).any():
+        wrong = np.unique(label[(label >= len(NAMES)) & (label != IGNORE)]).tolist()
+        raise DataError(f"train ids {wrong[:8]}", f"0..{len(NAMES) - 1}, or {IGNORE} = ignore")
+    return label

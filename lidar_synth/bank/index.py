@@ -1,0 +1,257 @@
+"""What a bank says about itself: the facts behind its scans, and ``index.json`` with every shard's size and hash.
+
+``index.json`` of "lidar-synth-bank/1"::
+
+    format     "lidar-synth-bank/1"; a reader refuses every other
+    scans      how many
+    sources    the facts of each bake whose scans are here; more than one after a merge
+    shards     in order: file, seed, first index, scans, source (a position in ``sources``), bytes, sha256
+    repairs    what was made again with other bytes, in words
+    checksum   sha256 of the rest, as JSON without spaces and with sorted keys
+
+The facts stand in the root attributes of each shard too, text and numbers as they are, everything else as JSON, and
+have to agree::
+
+    sensor         as in sensors.yaml; scale = range_max / 65535, metres per step of ``range``
+    fields         what a scan carries beside its range: reflectance, label, confidence
+    model          the checkpoint's name; checkpoint: its hash; provenance: what it says about itself
+    settings       of the bake: what else the scans are a function of
+    label_policy   "generated", or "none"
+    condition      what the scans are conditioned on, by reference, or null
+    licence        of the weights; data_licence: of the data behind them
+    software       versions of what made the scans
+    compression    "gzip" or "blosc2"; layout "plain" or "paged"
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property
+from itertools import accumulate
+from typing import Any
+
+import h5py
+import numpy as np
+
+from lidar_synth.bank.encoding import RANGE_STEPS, Encoding
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.sensor import Sensor
+
+FORMAT = "lidar-synth-bank/1"
+INDEX = "index.json"
+
+REPAIR = "lidar-synth repair BANK makes what is damaged or missing again."
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What all scans of one bake have in common; the fields are those of the module's docstring.
+
+    Raises:
+        ConfigError: on fields that have no encoding.
+    """
+
+    sensor: Sensor
+    fields: tuple[str, ...]
+    model: str
+    checkpoint: str
+    settings: dict[str, Any]
+    label_policy: str
+    licence: str
+    data_licence: str
+    provenance: dict[str, Any] = field(default_factory=dict)
+    software: dict[str, Any] = field(default_factory=dict)
+    condition: dict[str, Any] | None = None
+    compression: str = "gzip"
+    layout: str = "plain"
+
+    @cached_property
+    def encoding(self) -> Encoding:
+        """How the scans are stored."""
+        return Encoding(self.sensor, self.fields)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, with format and scale."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values |= {"sensor": self.sensor.to_dict(), "fields": list(self.fields)}
+        return {"format": FORMAT, "scale": self.sensor.range_max / RANGE_STEPS, **values}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], where: str) -> "Facts":
+        """The inverse of ``to_dict``.
+
+        Raises:
+            DataError: on another format, keys that do not belong there, or a scale that is not the sensor's.
+        """
+        values = dict(values)
+        _check_format(values.pop("format", None), where)
+        scale = values.pop("scale", None)
+        try:
+            facts = cls(**values | {"sensor": Sensor.from_dict(values["sensor"]), "fields": tuple(values["fields"])})
+            expected = facts.encoding.scale
+        except (KeyError, TypeError, ConfigError) as error:
+            raise DataError(f"{where}: facts that do not fit together ({error})", f"those of {FORMAT}") from error
+        if scale != expected:
+            raise DataError(f"{where}: scale {scale!r}", f"{expected!r} for sensor {facts.sensor.name!r}", REPAIR)
+        return facts
+
+    def to_attributes(self) -> dict[str, Any]:
+        """Values for HDF5 attributes. Text has a fixed length: what is longer would stand where no checksum is."""
+        return {name: _attribute(value) for name, value in self.to_dict().items()}
+
+    @classmethod
+    def from_attributes(cls, attributes: Mapping[str, Any], where: str) -> "Facts":
+        """The inverse of ``to_attributes``; raises as ``from_dict``."""
+        _check_format(_plain("format", attributes.get("format", b"")), where)
+        try:
+            values = {name: _plain(name, value) for name, value in attributes.items()}
+        except (ValueError, AttributeError) as error:
+            raise DataError(f"{where}: attributes that cannot be read ({error})", f"those of {FORMAT}") from error
+        return cls.from_dict(values, where)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One shard: scans ``first`` to ``first + scans - 1`` of a seed.
+
+    Args:
+        file: its name in the bank's folder.
+        seed: of the scans' noise.
+        first: index of its first scan.
+        scans: how many.
+        source: position of its facts among the bank's.
+        bytes: the file's size.
+        sha256: of the file.
+    """
+
+    file: str
+    seed: int
+    first: int
+    scans: int
+    source: int = 0
+    bytes: int = 0
+    sha256: str = ""
+
+    @property
+    def span(self) -> str:
+        """Which scans, in words."""
+        return f"scans {self.first} to {self.first + self.scans - 1} of seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class Index:
+    """What is in a bank, in order.
+
+    Args:
+        sources: the facts of each bake.
+        shards: at least one.
+        repairs: what was made again with other bytes.
+
+    Raises:
+        DataError: where they do not fit together.
+    """
+
+    sources: tuple[Facts, ...]
+    shards: tuple[Entry, ...]
+    repairs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for entry in self.shards:
+            if not re.fullmatch(r"[\w.-]+\.h5", entry.file) or entry.file[0] == ".":
+                raise DataError(f"a bank's shard {entry.file!r}", "the name of an .h5 file in the bank's folder")
+            if not (0 <= entry.source < len(self.sources) and entry.scans >= 1 and entry.first >= 0):
+                raise DataError(f"a bank with {entry}", "at least one scan, of one of its sources")
+        if not self.shards or len({e.file for e in self.shards}) < len(self.shards):
+            raise DataError(f"a bank with the shards {[e.file for e in self.shards]}", "at least one, each once")
+        if any((f.sensor, f.fields) != (self.sources[0].sensor, self.sources[0].fields) for f in self.sources):
+            raise DataError("a bank with several sensors or fields", "the same for all scans")
+
+    @property
+    def scans(self) -> int:
+        """How many there are."""
+        return self.ends[-1]
+
+    @cached_property
+    def ends(self) -> list[int]:
+        """Scans up to and with each shard."""
+        return list(accumulate(entry.scans for entry in self.shards))
+
+    @property
+    def size(self) -> int:
+        """Bytes of all shards."""
+        return sum(entry.bytes for entry in self.shards)
+
+    @cached_property
+    def checksum(self) -> str:
+        """What tells this bank from every other one."""
+        return _sum(self._values())
+
+    def to_json(self) -> bytes:
+        """The content of ``index.json``."""
+        return (json.dumps(self._values() | {"checksum": self.checksum}, indent=1, sort_keys=True) + "\n").encode()
+
+    @classmethod
+    def from_json(cls, text: bytes, where: str) -> "Index":
+        """The inverse of ``to_json``.
+
+        Raises:
+            DataError: on another format, or content that is damaged.
+        """
+        try:
+            values = json.loads(text)
+            _check_format(values.get("format"), where)
+            given = values.pop("checksum", None)
+            if given != _sum(values):
+                raise DataError(f"{where} does not have its own checksum: it was damaged or edited", "it as written")
+            return cls(
+                tuple(Facts.from_dict(facts, where) for facts in values["sources"]),
+                tuple(Entry(**entry) for entry in values["shards"]),
+                tuple(values["repairs"]),
+            )
+        except DataError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise DataError(f"{where} is damaged ({error})", f"the index of a bank, {FORMAT}", REPAIR) from error
+
+    def _values(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "scans": self.scans,
+            "sources": [facts.to_dict() for facts in self.sources],
+            "shards": [asdict(entry) for entry in self.shards],
+            "repairs": list(self.repairs),
+        }
+
+
+def _sum(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _check_format(given: Any, where: str) -> None:
+    if given == FORMAT:
+        return
+    if str(given).startswith(FORMAT.rpartition("/")[0]):
+        raise DataError(
+            f"{where} is of format {given!r}", repr(FORMAT), "Use the version of lidar_synth that wrote it."
+        )
+    raise DataError(f"{where} is no part of a bank (format {given!r})", repr(FORMAT))
+
+
+def _attribute(value: Any) -> Any:
+    if isinstance(value, float):
+        return value
+    text = (value if isinstance(value, str) else json.dumps(value, sort_keys=True)).encode()
+    return np.array(text, h5py.string_dtype("utf-8", max(len(text), 1)))
+
+
+_TEXT = ("format", "model", "checkpoint", "label_policy", "licence", "data_licence", "compression", "layout")
+
+
+def _plain(name: str, value: Any) -> Any:
+    """The inverse of ``_attribute``."""
+    if isinstance(value, float):
+        return float(value)
+    text = value if isinstance(value, str) else bytes(value).decode()
+    return text if name in _TEXT else json.loads(text)

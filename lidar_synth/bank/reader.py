@@ -1,0 +1,204 @@
+"""A bank as a source of scans."""
+
+import os
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, BinaryIO, cast, overload
+
+from lidar_synth.bank.index import INDEX, REPAIR, Facts, Index
+from lidar_synth.bank.shard import ShardReader
+from lidar_synth.errors import DataError, FileError, LibraryError
+from lidar_synth.projection import unproject
+from lidar_synth.scan import SYNTHETIC, RangeImage, Scan
+from lidar_synth.sensor import Sensor
+
+_OPEN = 64  # shards kept open at a time
+
+
+class Bank:
+    """The scans of a bank, read when they are asked for.
+
+    Shards are opened when they are first needed, once per process: a bank may be handed to workers, forked or
+    spawned.
+
+    Args:
+        root: the bank's folder, or a URL that fsspec knows ("s3://bucket/bank").
+
+    Attributes:
+        index: what is in it.
+        sensor: whose grid the images have.
+        fields: what a scan carries beside its points.
+        identity: what tells this bank from every other one.
+
+    Raises:
+        FileError: where there is no bank, a shard is missing, or something cannot be read.
+        DataError: on an index that is damaged or of another version, or a shard of another size.
+        LibraryError: on a URL whose file system is not installed.
+    """
+
+    def __init__(self, root: str | Path) -> None:
+        self.root = str(root) if is_url(root) else Path(root)
+        self.index = Index.from_json(_read(self.root, INDEX), f"{self.root}/{INDEX}")
+        if isinstance(self.root, Path):
+            self._check_files(self.root)
+        self._shards: OrderedDict[int, ShardReader] = OrderedDict()
+        self._process = os.getpid()
+
+    @property
+    def facts(self) -> Facts:
+        """What all its scans have in common, by the first of its sources."""
+        return self.index.sources[0]
+
+    @property
+    def sensor(self) -> Sensor:
+        return self.facts.sensor
+
+    @property
+    def fields(self) -> frozenset[str]:
+        return frozenset(self.facts.fields)
+
+    @property
+    def identity(self) -> str:
+        return self.index.checksum
+
+    @property
+    def length(self) -> int:
+        """Number of scans."""
+        return self.index.scans
+
+    @property
+    def ids(self) -> Sequence[str]:
+        """The scans' names, ``<model>/<seed>/<index>``."""
+        return _Names(self.index)
+
+    def __len__(self) -> int:
+        return self.index.scans
+
+    def __getitem__(self, number: int) -> Scan:
+        """The returns of ``image(number)`` through the centres of their cells.
+
+        Raises:
+            DataError, FileError: where it cannot be read; the message names shard and scan.
+        """
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"scan {number} of {len(self)}")
+        number %= len(self)
+        return replace(unproject(self.image(number)), id=self.ids[number], domain=SYNTHETIC)
+
+    def image(self, number: int) -> RangeImage:
+        """The range image of a scan, 0 <= number < len; raises as ``__getitem__``."""
+        shard, position = _place(self.index, number)
+        return self.facts.encoding.decode(self.shard(shard).read(position))
+
+    def facts_of(self, number: int) -> Facts:
+        """The facts behind a scan."""
+        return self.index.sources[self.index.shards[_place(self.index, number)[0]].source]
+
+    def condition(self, number: int) -> str | None:
+        """The name, in the source of conditions, of what a scan was conditioned on; None for an unconditional one."""
+        shard, position = _place(self.index, number)
+        return self.shard(shard).condition(position)
+
+    def shard(self, number: int) -> ShardReader:
+        """An open shard; raises as ``__getitem__``."""
+        if self._process != os.getpid():
+            # A fork: the parent's handles share its file positions and locks. They are left to the parent.
+            self._shards, self._process = OrderedDict(), os.getpid()
+        if number not in self._shards:
+            entry = self.index.shards[number]
+            where, facts = f"{self.root}/{entry.file}", self.index.sources[entry.source]
+            self._shards[number] = ShardReader(_file(self.root, entry.file), where, facts, entry)
+            if len(self._shards) > _OPEN:
+                self._shards.popitem(last=False)[1].close()
+        self._shards.move_to_end(number)
+        return self._shards[number]
+
+    def close(self) -> None:
+        """Close the shards that are open; reading opens them again."""
+        while self._shards and self._process == os.getpid():
+            self._shards.popitem()[1].close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_shards": OrderedDict()}
+
+    def _check_files(self, root: Path) -> None:
+        for entry in self.index.shards:
+            try:
+                size = (root / entry.file).stat().st_size
+            except OSError as error:
+                raise FileError(
+                    f"{root}: shard {entry.file} is missing ({error.strerror})", "a whole bank", REPAIR
+                ) from error
+            if size != entry.bytes:
+                raise DataError(f"{root / entry.file} is {size} bytes long", f"{entry.bytes}, by the index", REPAIR)
+
+
+def is_bank(path: str | Path) -> bool:
+    """Whether a folder holds a bank, or what is left of one."""
+    return (Path(path) / INDEX).is_file() or any(Path(path).glob("shard-*.h5"))
+
+
+def is_url(path: str | Path) -> bool:
+    """Whether a path leads to another machine, by fsspec."""
+    return isinstance(path, str) and "://" in path
+
+
+class _Names(Sequence[str]):
+    """Names made when they are asked for: a bank of a million scans has no million texts."""
+
+    def __init__(self, index: Index) -> None:
+        self._index = index
+
+    def __len__(self) -> int:
+        return self._index.scans
+
+    @overload
+    def __getitem__(self, number: int) -> str: ...
+    @overload
+    def __getitem__(self, number: slice) -> Sequence[str]: ...
+    def __getitem__(self, number: int | slice) -> str | Sequence[str]:
+        if isinstance(number, slice):
+            return [self[i] for i in range(len(self))[number]]
+        shard, position = _place(self._index, range(len(self))[number])
+        entry = self._index.shards[shard]
+        return f"{self._index.sources[entry.source].model}/{entry.seed}/{entry.first + position}"
+
+
+def _place(index: Index, number: int) -> tuple[int, int]:
+    """Shard and position there."""
+    shard = bisect_right(index.ends, number)
+    return shard, number - (index.ends[shard] - index.shards[shard].scans)
+
+
+def _file(root: str | Path, name: str) -> Path | BinaryIO:
+    """A file of the bank as ``ShardReader`` takes it."""
+    if isinstance(root, Path):
+        return root / name
+    try:
+        import fsspec
+    except ImportError as error:
+        raise LibraryError(f"{root}, but fsspec cannot be imported ({error})", "", "pip install fsspec") from error
+    try:
+        return cast(BinaryIO, fsspec.open(f"{root.rstrip('/')}/{name}", "rb").open())
+    except ImportError as error:
+        raise LibraryError(f"{root}: {error}", "the file system's package", "pip install s3fs, gcsfs ...") from error
+    except (OSError, ValueError) as error:
+        raise FileError(f"{root}/{name} cannot be read ({error})", "a file of a bank") from error
+
+
+def _read(root: str | Path, name: str) -> bytes:
+    file = _file(root, name)
+    if not isinstance(file, Path):
+        with file:
+            return file.read()
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise FileError(
+            f"{root} holds no bank: {name} cannot be read ({error.strerror})",
+            "the folder of a bank that is finished",
+            "A bake that was interrupted goes on by the same command; lidar-synth repair writes a lost index again.",
+        ) from error

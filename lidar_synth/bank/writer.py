@@ -1,0 +1,198 @@
+"""Writing a shard; ``shard`` says what is in one, and reads it."""
+
+import os
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+from lidar_synth.bank.chunks import checksum, deflate, filters
+from lidar_synth.bank.index import Entry, Facts
+from lidar_synth.errors import DataError, FileError, LibraryError
+from lidar_synth.scan import RangeImage
+
+_VERSION = "v110"
+_PAGE = 4 << 20  # bytes: a paged file keeps its metadata together, for fewer requests over a network
+_PENDING = 8  # scans per thread that may wait for their turn
+
+
+class ShardWriter:
+    """Writes one shard. The file is whole when ``close`` returns, and only then.
+
+    Args:
+        path: of the file; it is overwritten.
+        facts: of the bank.
+        entry: which scans will come.
+        conditions: names of what each scan is conditioned on.
+        threads: that compress.
+
+    Raises:
+        FileError: where the file cannot be written or the disk is full; also by the methods.
+        LibraryError: on Blosc2 without hdf5plugin.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        facts: Facts,
+        entry: Entry,
+        *,
+        conditions: Sequence[str] = (),
+        threads: int = 1,
+    ) -> None:
+        self.path, self.entry = path, entry
+        self.encoding = facts.encoding
+        self._compression = facts.compression
+        self._direct = facts.compression == "gzip"
+        self._conditions = [name.encode() for name in conditions]
+        self._crc = np.zeros(entry.scans, np.uint32)
+        self._next = 0
+        self._waiting: deque[Future[tuple[int, dict[str, bytes]]]] = deque()
+        self._pool = ThreadPoolExecutor(threads, "compress")
+        self._limit = _PENDING * threads
+        with _on_disk(path):
+            self._file = _create(path, facts.layout)
+            try:
+                self._declare(facts)
+            except BaseException:
+                self.discard()
+                raise
+
+    def append(self, image: RangeImage) -> None:
+        """Add the next scan; it is encoded and packed in a thread and written later, in its turn.
+
+        Raises:
+            DataError: on an image that has no encoding, perhaps by a later call.
+        """
+        position = self._next
+        self._next += 1
+        self._waiting.append(self._pool.submit(self._pack, position, image))
+        self._write_ready(self._limit)
+
+    def append_chunks(self, chunks: Mapping[str, bytes], crc: int) -> None:
+        """Add the next scan by the chunks that another shard of the same facts holds of it."""
+        self._write_ready(0)
+        self._put(self._next, crc, chunks, ready=True)
+        self._next += 1
+
+    def close(self) -> None:
+        """Write what is waiting and have the file on the disk.
+
+        Raises:
+            DataError: where scans are missing.
+            FileError: where it cannot be written.
+        """
+        self._write_ready(0)
+        self._pool.shutdown()
+        if self._next != self.entry.scans:
+            raise DataError(f"{self._next} scans for {self.path}", f"{self.entry.scans}")
+        with _on_disk(self.path):
+            self._file["crc"][:] = self._crc
+            self._file.close()
+            with self.path.open("rb") as file:
+                os.fsync(file.fileno())
+
+    def discard(self) -> None:
+        """Give up and remove the file."""
+        self._pool.shutdown(cancel_futures=True)
+        # A full disk may keep HDF5 from closing; room for its metadata is there once the file is empty.
+        with suppress(OSError):
+            os.truncate(self.path, 0)
+        with suppress(OSError, RuntimeError):
+            self._file.close()
+        with suppress(OSError):
+            self.path.unlink(missing_ok=True)
+
+    def __enter__(self) -> "ShardWriter":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if kind is not None:
+            self.discard()
+            return
+        try:
+            self.close()
+        except BaseException:
+            self.discard()
+            raise
+
+    def _declare(self, facts: Facts) -> None:
+        """Attributes and datasets."""
+        count = self.entry.scans
+        own = {"seed": np.uint64(self.entry.seed), "first": np.uint64(self.entry.first), "scans": count}
+        for name, value in (facts.to_attributes() | own).items():
+            self._file.attrs[name] = value
+        numbers = {
+            "seed": np.full(count, self.entry.seed, "<u8"),
+            "index": np.arange(count, dtype="<u8") + np.uint64(self.entry.first),
+            "crc": self._crc,
+        }
+        if self._conditions:
+            numbers["condition"] = np.array(self._conditions, "S")
+        for name, values in numbers.items():
+            self._file.create_dataset(name, data=values, track_times=False)
+        for name, (shape, dtype) in self.encoding.arrays().items():
+            self._file.create_dataset(
+                name,
+                (count, *shape),
+                dtype.newbyteorder("<"),
+                chunks=(1, *shape),
+                fletcher32=True,
+                track_times=False,
+                **filters(self._compression),
+            )
+
+    def _pack(self, position: int, image: RangeImage) -> tuple[int, dict[str, bytes]]:
+        """CRC and chunks of a scan; in a thread."""
+        arrays = self.encoding.encode(image)
+        plain = {name: arrays[name].astype(dtype, copy=False) for name, dtype in self._types().items()}
+        condition = self._conditions[position] if self._conditions else b""
+        crc = checksum(self.entry.seed, self.entry.first + position, plain, condition)
+        return crc, {name: deflate(a) if self._direct else a.tobytes() for name, a in plain.items()}
+
+    def _types(self) -> dict[str, np.dtype[Any]]:
+        return {name: dtype.newbyteorder("<") for name, (_, dtype) in self.encoding.arrays().items()}
+
+    def _write_ready(self, keep: int) -> None:
+        """Write scans, in order, until no more than ``keep`` wait."""
+        while len(self._waiting) > keep:
+            crc, chunks = self._waiting.popleft().result()
+            self._put(self._next - len(self._waiting) - 1, crc, chunks, ready=self._direct)
+
+    def _put(self, position: int, crc: int, chunks: Mapping[str, bytes], ready: bool) -> None:
+        """Write a scan: its chunks if they are ready for the file, or else plain arrays, which HDF5 compresses."""
+        self._crc[position] = crc
+        with _on_disk(self.path):
+            for name, chunk in chunks.items():
+                if ready:
+                    self._file[name].id.write_direct_chunk((position, 0, 0), chunk)
+                else:
+                    shape, dtype = self.encoding.sensor.shape, self._types()[name]
+                    self._file[name][position] = np.frombuffer(chunk, dtype).reshape(shape)
+
+
+def _create(path: Path, layout: str) -> h5py.File:
+    options = {"fs_strategy": "page", "fs_page_size": _PAGE} if layout == "paged" else {}
+    return h5py.File(path, "w", libver=(_VERSION, _VERSION), **options)
+
+
+@contextmanager
+def _on_disk(path: Path) -> Iterator[None]:
+    """HDF5's errors of writing in words that help."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, LibraryError):
+            raise
+        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+        raise FileError(
+            f"{path} cannot be written ({reason})",
+            "a folder that may be written to, on a disk with room",
+            "Free some space or mend the folder, then run the same again: finished shards are kept.",
+        ) from error

@@ -1,0 +1,113 @@
+"""``lidar-synth bake``: a bank of scans from a model."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from lidar_synth.bake import Plan, Resources
+
+
+def bake(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder of the bank")],
+    config: Annotated[Path | None, typer.Option(help="YAML with these options; what is given here goes first")] = None,
+    model: Annotated[str | None, typer.Option(help="a shipped model's name or a .safetensors checkpoint")] = None,
+    count: Annotated[int | None, typer.Option(help="scans [1000]")] = None,
+    seed: Annotated[int | None, typer.Option(help="scan i is a function of the model, the seed and i [0]")] = None,
+    first: Annotated[int | None, typer.Option(help="index of the first scan [0]")] = None,
+    shard_size: Annotated[int | None, typer.Option(help="scans per file [1024]")] = None,
+    steps: Annotated[int | None, typer.Option(help="of a uniform time grid [the model's own grid]")] = None,
+    solver: Annotated[str | None, typer.Option(help="euler | heun [euler]")] = None,
+    condition: Annotated[
+        str | None, typer.Option(help="dataset that a conditional model takes its labels or images from")
+    ] = None,
+    condition_layout: Annotated[str | None, typer.Option(help="of that dataset, if not to be recognised")] = None,
+    condition_split: Annotated[str | None, typer.Option(help="of that dataset, r2flow/train for instance")] = None,
+    guidance: Annotated[float | None, typer.Option(help="of a conditional model [1 = none]")] = None,
+    fields: Annotated[str | None, typer.Option(help="reflectance,label,confidence [all that the model gives]")] = None,
+    batch: Annotated[int | None, typer.Option(help="scans at a time [1 on a CPU, 16 on a GPU]")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float32 | bfloat16: what the network computes in")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu | cuda [cpu]")] = None,
+    threads: Annotated[int | None, typer.Option(help="of a worker, on the CPU [1]")] = None,
+    compression: Annotated[str | None, typer.Option(help="gzip | blosc2 [gzip]")] = None,
+    layout: Annotated[str | None, typer.Option(help="plain | paged, for reading over a network [plain]")] = None,
+    engine: Annotated[str, typer.Option(help="local | processes | ray | slurm | torchrun")] = "local",
+    workers: Annotated[int | None, typer.Option(help="processes, actors or jobs [one per core, GPU or shard]")] = None,
+    address: Annotated[str | None, typer.Option(help="of a Ray cluster, 'auto' for the running one")] = None,
+    slurm: Annotated[list[str] | None, typer.Option(help="KEY=VALUE for submitit, slurm_partition=gpu")] = None,
+    shard_index: Annotated[int, typer.Option(help="make only every n-th shard, from this one on")] = 0,
+    num_shards: Annotated[int, typer.Option(help="the n of --shard-index: how many runs share the work")] = 1,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be made, and how long it takes")] = False,
+) -> None:
+    """Bakes a bank: a folder of HDF5 files that any trainer reads. Run it again to go on where it stopped.
+
+    The same settings give the same bytes, whatever the engine and however often it was stopped.
+
+    \b
+    Examples:
+      lidar-synth bake bank --count 20000 --seed 1 --engine processes
+      lidar-synth bake bank --config configs/bake_town.yaml --dry-run
+      lidar-synth bake bank --count 1000000 --device cuda --engine ray --address auto --workers 8
+      lidar-synth bake bank --model semantic.safetensors --condition SemanticKITTI --condition-split train
+      lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4
+      torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 --device cuda --engine torchrun
+    """
+    from lidar_synth.bake import Job, Share, make_plan
+    from lidar_synth.bake import bake as run
+    from lidar_synth.config import read_values, validated
+
+    chosen = {
+        "model": model, "count": count, "seed": seed, "first": first, "shard_size": shard_size, "steps": steps,
+        "solver": solver, "fields": None if fields is None else tuple(filter(None, fields.split(","))), "batch": batch,
+        "condition": condition, "condition_layout": condition_layout, "condition_split": condition_split,
+        "guidance": guidance, "dtype": dtype, "device": device, "threads": threads,
+        "compression": compression, "layout": layout,
+    }  # fmt: skip
+    values = {} if config is None else read_values(config, Job)
+    values |= {name: value for name, value in chosen.items() if value is not None}
+    share = Share(shard_index, num_shards)
+    plan = make_plan(out, validated(Job, values, "bake" if config is None else str(config)))
+    if dry_run:
+        _describe(plan)
+        return
+    quiet = os.environ.get("LOCAL_RANK", "0") != "0"
+    try:
+        index = run(plan, engine, _resources(plan, workers, address, slurm), share, progress=not quiet)
+    except KeyboardInterrupt:
+        typer.echo(f"stopped; finished shards are kept in {out}, and the same command goes on", err=True)
+        raise typer.Exit(1) from None
+    if index is None:
+        typer.echo(f"{out}: this part is made; the index will be written when all {len(plan.shards)} shards are there")
+    else:
+        typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards, {index.size / 1e6:.3g} MB")
+
+
+def _resources(plan: "Plan", workers: int | None, address: str | None, slurm: list[str] | None) -> "Resources":
+    import torch
+
+    from lidar_synth.bake import Resources
+    from lidar_synth.errors import ConfigError
+
+    options: dict[str, Any] = {}
+    for item in slurm or ():
+        key, equals, value = item.partition("=")
+        if not (key and equals):
+            raise ConfigError(f"--slurm {item!r}", "KEY=VALUE, such as slurm_partition=gpu")
+        options[key] = int(value) if value.isdigit() else value
+    here = torch.cuda.device_count() if plan.job.device == "cuda" else os.cpu_count()
+    return Resources(workers if workers is not None else here or 1, address, options)
+
+
+def _describe(plan: "Plan") -> None:
+    """What a bake would make; the time by trying."""
+    from lidar_synth.bake.estimate import estimate
+
+    job, shards = plan.job, plan.shards
+    found = estimate(plan)
+    typer.echo(f"{plan.out}: {job.count} scans in {len(shards)} shards of up to {job.shard_size}")
+    typer.echo(f"  model {plan.facts.model} {plan.facts.checkpoint[:12]}, sensor {plan.facts.sensor.name}")
+    typer.echo(f"  carried: range, {', '.join(plan.facts.fields)}; label policy {plan.facts.label_policy}")
+    typer.echo(f"  about {found.bytes / 1e6:.3g} MB, {found.bytes / job.count / 1e3:.0f} kB a scan")
+    typer.echo(f"  about {found.seconds / 60:.1f} minutes by one worker here, {job.count / found.seconds:.2f} scans/s")

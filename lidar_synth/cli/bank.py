@@ -1,0 +1,156 @@
+"""``lidar-synth verify``, ``repair``, ``info`` and ``bank``: looking after banks."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+BankFolder = Annotated[Path, typer.Argument(metavar="BANK", help="folder of a bank")]
+Model = Annotated[str | None, typer.Option(help="the checkpoint's file, where it is not a shipped model")]
+Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder of the new bank")]
+
+
+def verify(
+    bank: BankFolder,
+    deep: Annotated[bool, typer.Option("--deep", help="generate some scans again from their seeds, too")] = False,
+    sample: Annotated[int, typer.Option(min=1, help="how many scans --deep generates")] = 16,
+    model: Model = None,
+) -> None:
+    """Checks a bank: its index, every shard's hash and attributes, and every scan. Exit status 1 = not whole.
+
+    \b
+    Examples:
+      lidar-synth verify bank
+      lidar-synth verify bank --deep --model runs/student/student.safetensors
+    """
+    from lidar_synth.bake.verify import AGREE, regenerate
+    from lidar_synth.bake.verify import verify as run
+
+    problems = run(bank)
+    for problem in problems:
+        typer.echo(f"{problem.file}: {problem.what}", err=True)
+    if problems:
+        typer.echo(f"{bank}: {len(problems)} problems. lidar-synth repair {bank} makes what is damaged again.")
+        raise typer.Exit(1)
+    typer.echo(f"{bank}: whole")
+    if not deep:
+        return
+    shares = regenerate(bank, model, sample)
+    other = {name: share for name, share in shares.items() if share < AGREE}
+    for name, share in other.items():
+        typer.echo(f"{name}: {share:.1%} of its cells agree with the scan made again", err=True)
+    typer.echo(f"{bank}: {len(shares)} scans made again, at least {min(shares.values()):.2%} of the cells agree")
+    if other:
+        raise typer.Exit(1)
+
+
+def repair(bank: BankFolder, model: Model = None) -> None:
+    """Generates again exactly the shards of a bank that are damaged or missing.
+
+    On the machine and with the versions that made the bank, the bytes are the same; elsewhere the scans are equal to
+    rounding, and the index says so.
+
+    \b
+    Examples:
+      lidar-synth repair bank
+      lidar-synth repair bank --model runs/student/student.safetensors
+    """
+    from lidar_synth.bake.repair import repair as run
+
+    done = run(bank, model)
+    for file, what in done.items():
+        typer.echo(f"{file}: {what}")
+    if not done:
+        typer.echo(f"{bank}: whole, nothing to do")
+
+
+def info(
+    bank: Annotated[str, typer.Argument(metavar="BANK", help="folder or URL of a bank")],
+    as_json: Annotated[bool, typer.Option("--json", help="for scripts")] = False,
+) -> None:
+    """Tells what is in a bank: scans, sensor, model, settings, licences.
+
+    \b
+    Examples:
+      lidar-synth info bank
+      lidar-synth info s3://bucket/bank --json
+    """
+    import json
+
+    from lidar_synth.bank import Bank
+    from lidar_synth.bank.card import summary
+
+    found = summary(Bank(bank).index)
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+        return
+    for name, value in found.items():
+        typer.echo(f"{name:<14}{value}")
+
+
+def merge(
+    out: Out,
+    banks: Annotated[list[Path], typer.Argument(metavar="BANK...", help="banks of one sensor and the same fields")],
+) -> None:
+    """Makes one bank of several. Shards are linked, not copied, where the disk allows it.
+
+    \b
+    Example:
+      lidar-synth bank merge all part-0 part-1 part-2
+    """
+    from lidar_synth.bake.edit import merge as run
+    from lidar_synth.bank import Bank
+
+    index = run([Bank(path) for path in banks], out)
+    typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
+
+
+def split(
+    bank: BankFolder,
+    parts: Annotated[list[str], typer.Argument(metavar="FOLDER=SHARE...", help="folders and their shares")],
+) -> None:
+    """Splits a bank in consecutive parts.
+
+    \b
+    Example:
+      lidar-synth bank split bank train=0.9 val=0.1
+    """
+    from lidar_synth.bake.edit import split as run
+    from lidar_synth.bank import Bank
+    from lidar_synth.errors import ConfigError
+
+    shares = {}
+    for part in parts:
+        folder, _, share = part.rpartition("=")
+        try:
+            shares[Path(folder)] = float(share)
+        except ValueError as error:
+            raise ConfigError(f"part {part!r}", "FOLDER=SHARE, such as train=0.9") from error
+        if not folder:
+            raise ConfigError(f"part {part!r}", "FOLDER=SHARE, such as train=0.9")
+    for out, index in run(Bank(bank), shares).items():
+        typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
+
+
+def head(
+    bank: BankFolder,
+    out: Out,
+    count: Annotated[int, typer.Option(help="how many scans")] = 100,
+) -> None:
+    """Makes a bank of the first scans of another one.
+
+    \b
+    Example:
+      lidar-synth bank head bank small --count 1000
+    """
+    from lidar_synth.bake.edit import head as run
+    from lidar_synth.bank import Bank
+
+    index = run(Bank(bank), count, out)
+    typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
+
+
+bank = typer.Typer(name="bank", help="Makes banks from banks: merge, split, head.", no_args_is_help=True)
+bank.command("merge")(merge)
+bank.command("split")(split)
+bank.command("head")(head)

@@ -1,0 +1,34 @@
+"""Banks, "lidar-synth-bank/1", as a source among the others; the format is in ``lidar_synth.bank``."""
+
+from pathlib import Path
+
+from lidar_synth.bank import Bank
+from lidar_synth.errors import ConfigError
+from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor, load_sensor
+
+
+class BankScans(ScanFiles):
+    """A bank: <root>/index.json and its shards; on disk, or at a URL that fsspec knows.
+
+    Args:
+        root: the bank's folder, or its URL.
+        sensor: what the scans are expected to be of; the bank tells it.
+        on_bad: see ``ScanFiles``.
+
+    Raises:
+        FileError: where there is no bank, or a shard is missing.
+        DataError: where the index is damaged or of another version.
+        ConfigError: where the bank is of another sensor.
+        LibraryError: on a URL whose file system is not installed.
+    """
+
+    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
+        self.bank = Bank(root)
+        if sensor is not None and load_sensor(sensor).shape != self.bank.sensor.shape:
+            raise ConfigError(f"sensor {sensor} for {root}", f"{self.bank.sensor.name!r}, whose scans it holds")
+        super().__init__(Path(root), self.bank.ids, self.bank.sensor, on_bad)
+
+    def read(self, index: int) -> Scan:
+        return self.bank[index]

@@ -1,0 +1,85 @@
+"""Small banks for tests, with facts that nobody has to bake for."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.bake.folder import sha256, write_bank_files
+from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
+from lidar_synth.classes import IGNORE
+from lidar_synth.projection import project
+from lidar_synth.scan import RangeImage
+from lidar_synth.sensor import Sensor, load_sensor
+
+SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+
+
+def some_facts(sensor: Sensor = SENSOR, **others: Any) -> Facts:
+    """Facts of a bank that no model made."""
+    known = {
+        "sensor": sensor, "fields": ("reflectance", "label"), "model": "small", "checkpoint": "c" * 64,
+        "settings": {"seed": 5}, "label_policy": "generated", "licence": "MIT", "data_licence": "none",
+    }  # fmt: skip
+    return Facts(**known | others)  # type: ignore[arg-type]
+
+
+def some_image(seed: int = 0, sensor: Sensor = SENSOR) -> RangeImage:
+    """A range image with everything that a bank can hold, a third of it empty."""
+    rng = np.random.default_rng(seed)
+    seen = rng.random(sensor.shape) < 0.67
+    metres = rng.uniform(sensor.range_min, sensor.range_max, sensor.shape)
+    channels = {
+        "reflectance": (rng.random(sensor.shape) * seen).astype(np.float32),
+        "label": np.where(seen, rng.integers(0, 19, sensor.shape), IGNORE).astype(np.uint8),
+        "confidence": (rng.random(sensor.shape) * seen).astype(np.float32),
+    }
+    return RangeImage((metres * seen).astype(np.float32), sensor, channels)
+
+
+def write_bank(root: Path, images: Sequence[RangeImage], shard_size: int = 2, **others: Any) -> list[Path]:
+    """A bank of these images; the file of each shard."""
+    facts = some_facts(images[0].sensor, **others)
+    root.mkdir(parents=True, exist_ok=True)
+    entries = []
+    for first in range(0, len(images), shard_size):
+        part = images[first : first + shard_size]
+        entry = Entry(f"shard-{len(entries):05d}.h5", 5, first, len(part))
+        with ShardWriter(root / entry.file, facts, entry) as writer:
+            for image in part:
+                writer.append(image)
+        path = root / entry.file
+        entries.append(replace(entry, bytes=path.stat().st_size, sha256=sha256(path)))
+    write_bank_files(root, Index((facts,), tuple(entries)))
+    return [root / entry.file for entry in entries]
+
+
+def write_golden_bank(root: Path) -> None:
+    """The bank in tests/golden, and beside it the numbers by which a reader knows that it reads it right."""
+    from lidar_synth.town import Town
+
+    sensor = load_sensor(Path(__file__).parents[1] / "configs" / "tiny_sensor.yaml")
+    images = [project(scan) for scan in Town(0, sensor, 3)]
+    for image in images:
+        image.channels["confidence"] = (image.channels["reflectance"] * image.mask).astype(np.float32)
+    write_bank(root, images, fields=("reflectance", "label", "confidence"))
+    bank = Bank(root)
+    scans = [numbers(bank, i) for i in range(len(bank))]
+    (root / "numbers.json").write_text(json.dumps({"identity": bank.identity, "scans": scans}, indent=1) + "\n")
+
+
+def numbers(bank: Bank, number: int) -> dict[str, Any]:
+    """What a scan of a bank sums up to."""
+    image = bank.image(number)
+    assert image.label is not None and image.reflectance is not None
+    return {
+        "id": bank.ids[number],
+        "returns": len(bank[number].points),
+        "range": round(float(image.range.sum(dtype=np.float64)), 3),
+        "reflectance": round(float(image.reflectance.sum(dtype=np.float64)), 3),
+        "confidence": round(float(image.channels["confidence"].sum(dtype=np.float64)), 3),
+        "labels": np.bincount(image.label.reshape(-1), minlength=256)[[*range(19), IGNORE]].tolist(),
+    }

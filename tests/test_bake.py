@@ -1,0 +1,482 @@
+"""Baking: the same bytes by every engine and after every interruption; what cannot be made is refused at once."""
+
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import namedtuple
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from layouts import some_scan, write_all
+from test_generator import SENSOR, write
+from typer.testing import CliRunner
+
+import lidar_synth.bake.run as run_module
+import lidar_synth.bake.shard as shard_module
+from lidar_synth.bake import ENGINES, Job, Plan, Resources, Share, bake, bake_shard, make_plan
+from lidar_synth.bake.folder import SETTINGS, finish, prepare
+from lidar_synth.bake.repair import repair
+from lidar_synth.bake.verify import regenerate
+from lidar_synth.bank import INDEX, Bank, Encoding
+from lidar_synth.checkpoint import ENCODER, VELOCITY, Header, Part, save_checkpoint
+from lidar_synth.cli import app
+from lidar_synth.config import read_values, validated
+from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
+from lidar_synth.formats import open_scans
+from lidar_synth.generator import load_generator
+from lidar_synth.nets import build_network
+from lidar_synth.normalize import NORMALISATIONS
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+COUNT, SIZE = 10, 3
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("model") / "small.safetensors")
+
+
+@pytest.fixture
+def plan(model: Path, tmp_path: Path) -> Plan:
+    return plan_in(tmp_path / "bank", model)
+
+
+def plan_in(out: Path, model: Path, **settings: Any) -> Plan:
+    return make_plan(out, Job(**{"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 4} | settings))
+
+
+@pytest.fixture(scope="module")
+def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of the bank, baked in one go in this process."""
+    plan = plan_in(tmp_path_factory.mktemp("expected") / "bank", model)
+    bake(plan, progress=False)
+    return files(plan.out)
+
+
+def files(root: Path) -> dict[str, bytes]:
+    assert not list(root.rglob("*.part")) and not (root / ".lidar_synth").exists()
+    return {path.name: path.read_bytes() for path in root.iterdir()}
+
+
+def test_a_bank_holds_the_models_scans(plan: Plan, model: Path, expected: dict[str, bytes]) -> None:
+    index = bake(plan, progress=False)
+    assert index is not None and index.scans == COUNT and [e.scans for e in index.shards] == [3, 3, 3, 1]
+    assert files(plan.out) == expected
+    bank, generator = Bank(plan.out), load_generator(model)
+    encoding = Encoding(generator.sensor, bank.fields)
+    for i, image in enumerate(generator.range_images(4, range(COUNT))):
+        assert np.array_equal(bank.image(i).range, encoding.decode(encoding.encode(image)).range)
+        assert bank[i].id == f"small/4/{i}"
+        assert np.array_equal(bank[i].label, image.label[image.mask])
+    facts = bank.facts
+    assert (facts.checkpoint, facts.label_policy, facts.licence) == (generator.hash, "generated", "MIT")
+    assert facts.settings["seed"] == 4 and facts.software["torch"]
+
+
+def write_conditioned(path: Path) -> Path:
+    """A checkpoint with random weights that makes ranges from label maps."""
+    arguments = {
+        "resolution": SENSOR.shape, "channels": 1, "width": 16, "time_width": 16, "depths": (1, 1), "heads": (2, 2),
+        "patch": (2, 2), "window": (3, 3), "condition_channels": 3,
+    }  # fmt: skip
+    of_maps = {"resolution": SENSOR.shape, "target": SENSOR.shape, "channels": 3}
+    torch.manual_seed(0)
+    networks = {
+        VELOCITY: build_network("hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())}),
+        ENCODER: build_network("semantic_map", of_maps),
+    }
+    for network in networks.values():
+        for parameter in network.parameters():
+            torch.nn.init.normal_(parameter, std=0.2)
+    header = Header(
+        networks={VELOCITY: Part("hdit", arguments), ENCODER: Part("semantic_map", of_maps)}, sensor=SENSOR,
+        normalisation=NORMALISATIONS["r2flow"], channels=("range",), time_grid=(1.0, 0.5, 0.0),
+        provenance={"data": "none", "data_licence": "none", "licence": "MIT"}, conditioning={"semantic": {}},
+    )  # fmt: skip
+    save_checkpoint(path, header, networks)
+    return path
+
+
+def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
+    real = tmp_path / "real"
+    write_all("npz", real, [some_scan(i) for i in range(3)])
+    model = write_conditioned(tmp_path / "semantic.safetensors")
+    plan = plan_in(tmp_path / "bank", model, condition=str(real), seed=2, first=4)
+    index = bake(plan, progress=False)
+    assert index is not None and plan.facts.label_policy == "condition"
+    bank, source = Bank(plan.out), open_scans(real)
+    assert bank.facts.condition == {"kind": "semantic", "source": str(real), "layout": None, "split": None}
+    [expected] = load_generator(model).range_images(2, [9], [source[0]])
+    assert bank.condition(5) == source.ids[0]  # index 9 of 3 conditions
+    assert np.allclose(bank.image(5).range, expected.range, atol=1e-3)
+    assert np.array_equal(bank.image(5).label, expected.label)
+    assert min(regenerate(plan.out, str(model), progress=False).values()) == 1
+    (plan.out / "shard-00001.h5").unlink()
+    assert repair(plan.out, str(model), progress=False) == {"shard-00001.h5": "made again"}
+
+
+# The same bytes
+
+
+def test_two_processes(plan: Plan, expected: dict[str, bytes]) -> None:
+    prepare(plan)
+    told: list[int] = []
+    ENGINES["processes"](plan, range(4), Resources(2), told.append)
+    assert sum(told) == COUNT  # the bar counts every scan once
+    finish(plan)
+    assert files(plan.out) == expected
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_shares_in_any_order(plan: Plan, expected: dict[str, bytes], order: tuple[int, ...]) -> None:
+    found = [bake(plan, share=Share(k, 3), progress=False) for k in order]
+    assert found[:2] == [None, None] and found[2] is not None
+    assert files(plan.out) == expected
+
+
+def test_torchrun(plan: Plan, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match="engine 'torchrun' without 'RANK'.*torchrun --nproc-per-node"):
+        bake(plan, "torchrun", progress=False)
+    monkeypatch.setenv("WORLD_SIZE", "3")
+    for rank in ("1", "0", "2"):
+        monkeypatch.setenv("RANK", rank)
+        monkeypatch.setenv("LOCAL_RANK", rank)
+        index = bake(plan, "torchrun", progress=False)
+    assert index is not None and files(plan.out) == expected
+
+
+@pytest.mark.parametrize("engine", ["ray", "slurm"])
+def test_engines_whose_library_is_missing(plan: Plan, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, {"ray": "ray", "slurm": "submitit"}[engine], None)
+    with pytest.raises(LibraryError, match=rf"engine '{engine}', but .* pip install 'lidar_synth\[{engine}\]'"):
+        bake(plan, engine, progress=False)
+
+
+def test_every_engine_is_named_in_the_help() -> None:
+    text = CliRunner().invoke(app, ["bake", "--help"]).output
+    assert all(engine in text for engine in ENGINES)
+
+
+def stop_after(plan: Plan, scans: int, stop: Callable[[], object]) -> None:
+    """Bake in this process; call ``stop`` when so many scans are made."""
+    made = 0
+
+    def progress(number: int) -> None:
+        nonlocal made
+        made += number
+        if made == scans:
+            stop()
+
+    def engine(plan: Plan, numbers: Any, resources: Resources, _: Any) -> None:
+        for number in numbers:
+            bake_shard(plan, number, progress)
+
+    engines = run_module.ENGINES
+    run_module.ENGINES = {"local": engine}
+    try:
+        bake(plan, progress=False)
+    finally:
+        run_module.ENGINES = engines
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("scans", [1, 5, 10])
+def test_a_signal_keeps_finished_shards(
+    plan: Plan, expected: dict[str, bytes], stop: signal.Signals, scans: int
+) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt):
+        stop_after(plan, scans, lambda: os.kill(os.getpid(), stop))
+    assert signal.getsignal(signal.SIGTERM) == before
+    whole = sorted(path.name for path in plan.out.glob("*.h5"))
+    assert len(whole) == (scans - 1) // SIZE and not list(plan.out.glob(".*.part")) and not (plan.out / INDEX).exists()
+    times = {name: (plan.out / name).stat().st_mtime_ns for name in whole}
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+    assert times == {name: (plan.out / name).stat().st_mtime_ns for name in whole}  # not made twice
+
+
+def start(out: Path, model: Path, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "lidar_synth", "bake", str(out), "--model", str(model), "--count", "60"]
+    command += ["--shard-size", "5", "--seed", "4", *options]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for_shards(process: subprocess.Popen[str], out: Path, count: int) -> None:
+    while len(list(out.glob("*.h5"))) < count:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+
+
+def test_killed_and_terminated_runs_go_on(model: Path, tmp_path: Path) -> None:
+    whole = plan_in(tmp_path / "whole" / "bank", model, count=60, shard_size=5)
+    bake(whole, progress=False)
+    out = tmp_path / "bank"
+    process = start(out, model)
+    wait_for_shards(process, out, 2)
+    process.kill()
+    process.wait()
+    assert not (out / INDEX).exists()
+    process = start(out, model, "--engine", "processes", "--workers", "2")
+    wait_for_shards(process, out, 5)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate()
+    assert process.returncode == 1
+    assert f"stopped; finished shards are kept in {out}, and the same command goes on" in errors
+    assert "Traceback" not in errors
+    bake(plan_in(out, model, count=60, shard_size=5), progress=False)
+    assert files(out) == files(whole.out)
+
+
+def test_a_killed_worker_is_told_of(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
+    plan = plan_in(tmp_path / "bank", model, count=300, shard_size=100)
+
+    def kill(scans: int) -> None:
+        for worker in multiprocessing.active_children():
+            if worker.pid is not None and worker.name.startswith("SpawnProcess"):
+                os.kill(worker.pid, signal.SIGKILL)
+
+    prepare(plan)
+    with pytest.raises(FileError, match=r"a worker was killed \(exit status -9\).*finished shards are kept"):
+        ENGINES["processes"](plan, range(3), Resources(1), kill)
+    assert multiprocessing.active_children() == []
+
+
+def test_what_a_worker_raises_arrives(plan: Plan, model: Path) -> None:
+    prepare(plan)
+    (plan.out / SETTINGS).unlink()
+    with pytest.raises(FileError, match="has vanished or lost its .bake.json"):
+        ENGINES["processes"](plan, range(4), Resources(1), lambda scans: None)
+
+
+def test_a_finished_shard_that_rots_is_made_again(plan: Plan, expected: dict[str, bytes]) -> None:
+    bake(plan, progress=False)
+    path = plan.out / "shard-00001.h5"
+    path.write_bytes(path.read_bytes()[:-1] + b"\x00")
+    (plan.out / "shard-00003.h5").unlink()
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+def test_halves_of_killed_processes_are_removed(plan: Plan, expected: dict[str, bytes]) -> None:
+    prepare(plan)
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    host = shard_module.socket.gethostname()
+    mine, other = (plan.out / f".shard-00000.h5.{h}-{ended.pid}.part" for h in (host, "another"))
+    running = plan.out / f".shard-00000.h5.{host}-{os.getppid()}.part"
+    for path in (mine, other, running):
+        path.touch()
+    bake_shard(plan, 0)
+    assert not mine.exists() and other.exists() and running.exists()
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+# Settings
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 5}, r"'seed': 4.*'seed': 5"),
+        ({"count": 11}, r"'count': 10.*'count': 11"),
+        ({"steps": 2}, r"'steps': None.*'steps': 2"),
+        ({"fields": ("label",)}, r"'fields': \['reflectance', 'label', 'confidence'\].*'fields': \['label'\]"),
+        ({"batch": 2}, r"'batch': 1.*'batch': 2"),
+    ],
+)
+def test_another_setting_is_refused_and_shown(plan: Plan, model: Path, change: dict[str, Any], message: str) -> None:
+    bake(plan, share=Share(0, 4), progress=False)
+    before = {path: path.read_bytes() for path in plan.out.glob("*.h5")}
+    with pytest.raises(ConfigError, match=message):
+        bake(plan_in(plan.out, model, **change), progress=False)
+    assert before == {path: path.read_bytes() for path in plan.out.glob("*.h5")}
+
+
+def test_another_checkpoint_is_refused(plan: Plan, tmp_path: Path) -> None:
+    bake(plan, share=Share(0, 4), progress=False)
+    other = write(tmp_path / "other.safetensors", ("range", "reflectance", "label")[:2])
+    with pytest.raises(ConfigError, match="'checkpoint'"):
+        bake(plan_in(plan.out, other), progress=False)
+    shutil.copyfile(other, tmp_path / "small.safetensors")
+    changed = plan_in(tmp_path / "changed", tmp_path / "small.safetensors")
+    write(tmp_path / "small.safetensors", ("range",))
+    shard_module._load.cache_clear()
+    with pytest.raises(ConfigError, match="expected the checkpoint that made the bank's scans"):
+        bake(changed, progress=False)
+
+
+def test_a_bank_that_no_bake_made(plan: Plan) -> None:
+    bake(plan, progress=False)
+    (plan.out / SETTINGS).unlink()
+    with pytest.raises(ConfigError, match="holds a bank that no bake made"):
+        bake(plan, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--count", "0"], "count = 0: Input should be greater than or equal to 1"),
+        (["--seed", "-1"], "seed = -1"),
+        (["--seed", str(2**64)], "seed = 18446744073709551616"),
+        (["--first", "-1"], "first = -1"),
+        (["--shard-size", "0"], "shard_size = 0"),
+        (["--steps", "0"], "steps = 0"),
+        (["--batch", "0"], "batch = 0"),
+        (["--threads", "0"], "threads = 0"),
+        (["--threads", "5000"], "threads = 5000"),
+        (["--solver", "rk4"], "solver 'rk4'; expected one of 'euler', 'heun'"),
+        (["--dtype", "float16"], "dtype 'float16'; expected one of 'float32', 'bfloat16'"),
+        (["--device", "tpu"], "device = 'tpu': Input should be 'cpu' or 'cuda'"),
+        (["--compression", "lzf"], "compression = 'lzf'"),
+        (["--layout", "flat"], "layout = 'flat'"),
+        (["--fields", "ring"], r"fields \['ring'\] of model"),
+        (["--engine", "dask"], "engine 'dask'; expected one of 'local', 'processes', 'ray'"),
+        (["--workers", "0"], "0 workers; expected at least 1"),
+        (["--shard-index", "3", "--num-shards", "3"], "--shard-index 3 of --num-shards 3"),
+        (["--slurm", "partition"], "--slurm 'partition'; expected KEY=VALUE"),
+        (["--model", "city"], "model 'city'; expected a shipped one"),
+    ],
+)
+def test_options_that_cannot_be_served(options: list[str], message: str, model: Path, tmp_path: Path) -> None:
+    call = ["bake", str(tmp_path / "bank"), "--model", str(model), *options]
+    with pytest.raises(ConfigError, match=message):
+        CliRunner().invoke(app, call, catch_exceptions=False)
+    assert not (tmp_path / "bank").exists()
+
+
+def test_models_that_cannot_serve(tmp_path: Path) -> None:
+    plain = write(tmp_path / "plain.safetensors", ("range", "reflectance"))
+    with pytest.raises(ConfigError, match=r"fields \['label'\] of model .*some of \['reflectance'\].*channels"):
+        plan_in(tmp_path / "bank", plain, fields=("reflectance", "label"))
+    assert plan_in(tmp_path / "bank", plain).facts.label_policy == "none"
+    with pytest.raises(ConfigError, match="condition here for model .*takes no condition; expected none"):
+        plan_in(tmp_path / "bank", plain, condition="here")
+    with pytest.raises(ConfigError, match="condition None for model .*takes semantic conditions; expected a dataset"):
+        plan_in(tmp_path / "bank", write_conditioned(tmp_path / "conditioned.safetensors"))
+    (tmp_path / "broken.safetensors").write_bytes(b"no")
+    with pytest.raises(DataError, match="broken"):
+        plan_in(tmp_path / "bank", tmp_path / "broken.safetensors")
+    assert not (tmp_path / "bank").exists()
+
+
+def test_a_configuration_file(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
+    config = tmp_path / "bake.yaml"
+    config.write_text(yaml.safe_dump({"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 9}))
+    result = CliRunner().invoke(app, ["bake", str(tmp_path / "bank"), "--config", str(config), "--seed", "4"])
+    assert result.exit_code == 0 and "10 scans in 4 shards" in result.output
+    assert files(tmp_path / "bank") == expected
+    config.write_text("model: small\nsize: 3\n")
+    with pytest.raises(ConfigError, match=r"bake.yaml: unknown key 'size'; known there: model, count, seed"):
+        CliRunner().invoke(app, ["bake", str(tmp_path / "b"), "--config", str(config)], catch_exceptions=False)
+    with pytest.raises(FileError, match="nowhere.yaml cannot be read"):
+        CliRunner().invoke(app, ["bake", str(tmp_path / "b"), "--config", "nowhere.yaml"], catch_exceptions=False)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("bake_*.yaml")), ids=lambda p: p.stem)
+def test_published_configurations_load(path: Path) -> None:
+    assert validated(Job, read_values(path, Job), str(path)).count >= 1000
+
+
+def test_a_dry_run_makes_nothing(model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "bank"
+    call = ["bake", str(out), "--model", str(model), "--count", "50", "--shard-size", "20", "--dry-run"]
+    output = CliRunner().invoke(app, call).output
+    assert "50 scans in 3 shards of up to 20" in output and "scans/s" in output and "label policy" in output
+    assert not out.exists()
+    whole = CliRunner().invoke(app, [*call[:-1]]).output  # what was estimated is near what comes
+    estimated, made = (float(text.split(" MB")[0].split()[-1]) for text in (output, whole))
+    assert estimated == pytest.approx(made, rel=0.4)
+
+
+# The disk
+
+
+def test_a_full_disk_by_limit(plan: Plan, expected: dict[str, bytes]) -> None:
+    """A file may not grow beyond what HDF5 needs for one and a half scans."""
+    bake(plan, share=Share(0, 4), progress=False)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (6000, limits[1]))
+    try:
+        with pytest.raises(FileError, match=r"cannot be written \(File too large\).*finished shards are kept"):
+            bake(plan, progress=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.name for path in plan.out.glob("*.h5")] == ["shard-00000.h5"]
+    assert not list(plan.out.glob(".*.part"))
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 44 kB, where one may be mounted."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = shutil.which("mount") and subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=44k", "tmpfs", folder], capture_output=True, check=False
+    )
+    if not mounted or mounted.returncode:
+        pytest.skip("no file system may be mounted here")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk(
+    small_disk: Path, model: Path, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shard_module, "_PACKED", 0)  # the look at free space before a shard
+    plan = plan_in(small_disk / "bank", model)
+    with pytest.raises(FileError, match=r"No space left on device.*finished shards are kept"):
+        bake(plan, progress=False)
+    kept = {path.name for path in plan.out.glob("*.h5")}
+    assert 1 <= len(kept) < 4 and not list(plan.out.glob(".*.part"))
+    assert all((plan.out / name).read_bytes() == expected[name] for name in kept)
+    subprocess.run(["mount", "-o", "remount,size=400k", small_disk], check=True)
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+def test_space_is_looked_at_before_a_shard(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = namedtuple("usage", "total used free")
+    need = 3 * 8 * 32 * 5 * 0.6
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need - 1))
+    with pytest.raises(FileError, match=r"bank has 0 MB free; expected about 0 MB for the next shard. Free some space"):
+        bake(plan, progress=False)
+    assert not list(plan.out.glob("*.h5"))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need + 1))
+    assert bake(plan, progress=False) is not None
+
+
+def test_a_folder_that_cannot_be_written(model: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file", tmp_path / "file" / "bank", Path("/proc/bank")):
+        with pytest.raises(FileError, match=r"cannot be written \(.*Choose another output folder"):
+            bake(plan_in(out, model), progress=False)
+
+
+def test_a_folder_that_vanishes(plan: Plan, expected: dict[str, bytes]) -> None:
+    for scans in (3, 4):  # at the end of a shard, and within one
+        with pytest.raises(FileError, match=r"bank.*(has vanished or lost its .bake.json|No such file)"):
+            stop_after(plan, scans, lambda: shutil.rmtree(plan.out))
+        assert not plan.out.exists()
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+def test_an_index_waits_for_every_shard(plan: Plan) -> None:
+    bake(plan, share=Share(0, 2), progress=False)
+    bake(plan, share=Share(1, 2), progress=False)
+    (plan.out / INDEX).unlink()
+    assert finish(plan) is None  # the notes went with the index: the same command looks, and makes again

@@ -1,0 +1,289 @@
+"""Keeping banks whole: verify finds what is wrong, repair makes it again; merge, split and head keep every scan."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from banks import some_image, write_bank
+from test_generator import write
+from typer.testing import CliRunner
+
+import lidar_synth.bake.repair as repair_module
+from lidar_synth.bake import Job, bake, make_plan
+from lidar_synth.bake.edit import head, merge, split
+from lidar_synth.bake.folder import sha256, write_bank_files
+from lidar_synth.bake.repair import repair
+from lidar_synth.bake.verify import AGREE, regenerate, verify
+from lidar_synth.bank import INDEX, Bank, Index
+from lidar_synth.cli import app
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.scan import RangeImage
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("model") / "small.safetensors")
+
+
+def baked(out: Path, model: Path, **settings: Any) -> Path:
+    bake(make_plan(out, Job(**{"model": str(model), "count": 8, "shard_size": 3} | settings)), progress=False)
+    return out
+
+
+@pytest.fixture(scope="module")
+def original(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return baked(tmp_path_factory.mktemp("original") / "bank", model)
+
+
+@pytest.fixture
+def root(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "bank"))
+
+
+def shards(root: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in root.glob("*.h5")}
+
+
+def call(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.output
+
+
+# Verify
+
+
+def flip(path: Path, bit: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "flip": (lambda path: flip(path, 8 * path.stat().st_size // 2), r"has \d+ bytes and sha256"),
+    "cut": (lambda path: path.write_bytes(path.read_bytes()[:-9]), "by the index"),
+    "longer": (lambda path: path.write_bytes(path.read_bytes() + b"x"), "by the index"),
+    "missing": (lambda path: path.unlink(), r"cannot be read \(No such file"),
+    "another": (lambda path: shutil.copyfile(path.with_name("shard-00000.h5"), path), "holds scans 0 to 2 of seed 0"),
+}
+
+
+def test_a_whole_bank(root: Path, model: Path) -> None:
+    assert verify(root, progress=False) == [] and repair(root, progress=False) == {}
+    status, output = call("verify", root, "--deep", "--model", model, "--sample", 3)
+    assert status == 0 and f"{root}: whole" in output and "3 scans made again, at least 100.00%" in output
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_damage_is_found_and_made_again(root: Path, original: Path, model: Path, kind: str) -> None:
+    damage, message = DAMAGE[kind]
+    damage(root / "shard-00001.h5")
+    status, output = call("verify", root)
+    assert status == 1 and "shard-00001.h5: " in output and "lidar-synth repair" in output
+    problems = verify(root, progress=False)
+    assert {p.file for p in problems} == {"shard-00001.h5"}
+    assert any(re.search(message, p.what) for p in problems)
+    assert repair(root, str(model), progress=False) == {"shard-00001.h5": "made again"}
+    assert shards(root) == shards(original) and verify(root, progress=False) == []
+    assert (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
+
+
+def test_every_flipped_bit_is_found(root: Path) -> None:
+    path = root / "shard-00002.h5"
+    content = path.read_bytes()
+    for bit in np.random.default_rng(1).choice(8 * len(content), 40, replace=False).tolist():
+        flip(path, bit)
+        assert verify(root, progress=False), f"bit {bit}"
+        path.write_bytes(content)
+    assert verify(root, progress=False) == []
+
+
+def test_a_damaged_scan_is_named(root: Path) -> None:
+    """A file whose hash the index knows, but with a scan that is not its CRC's: only reading it finds that."""
+    import h5py
+
+    path = root / "shard-00001.h5"
+    with h5py.File(path, "r+") as file:
+        file["label"][2, 3, 4] = 18 - file["label"][2, 3, 4] % 19
+    index = Index.from_json((root / INDEX).read_bytes(), INDEX)
+    entry = replace(index.shards[1], bytes=path.stat().st_size, sha256=sha256(path))
+    write_bank_files(root, replace(index, shards=(index.shards[0], entry, index.shards[2])))
+    [problem] = verify(root, progress=False)
+    assert problem.file == "shard-00001.h5" and "scan 2 cannot be read (its CRC does not match)" in problem.what
+
+
+def test_files_that_nobody_knows(root: Path) -> None:
+    shutil.copyfile(root / "shard-00000.h5", root / "shard-00009.h5")
+    [problem] = verify(root, progress=False)
+    assert (problem.file, problem.what) == ("shard-00009.h5", "is not in the index")
+
+
+def test_scans_that_are_not_what_they_say(tmp_path: Path, model: Path) -> None:
+    honest = Bank(baked(tmp_path / "honest", model, seed=5))
+    told = {name: getattr(honest.facts, name) for name in ("settings", "checkpoint", "fields")}
+    write_bank(tmp_path / "false", [some_image(i) for i in range(8)], **told)
+    assert verify(tmp_path / "false", progress=False) == []
+    assert max(regenerate(tmp_path / "false", str(model), progress=False).values()) < AGREE
+    status, output = call("verify", tmp_path / "false", "--deep", "--model", model)
+    assert status == 1 and "of its cells agree with the scan made again" in output
+    other = write(tmp_path / "other.safetensors", ("range",))
+    with pytest.raises(ConfigError, match=r"other.*the checkpoint that made the bank's scans, small .*--model"):
+        regenerate(honest.root, str(other), progress=False)
+    with pytest.raises(ConfigError, match="model 'small'; expected a shipped one"):
+        call("verify", honest.root, "--deep")
+
+
+# Repair
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_lost_or_damaged_index_is_written_again(root: Path, original: Path, model: Path, lost: bool) -> None:
+    if lost:
+        (root / INDEX).unlink()
+    else:
+        (root / INDEX).write_text((root / INDEX).read_text().replace('"seed": 0', '"seed": 1', 1))
+    (root / "shard-00002.h5").unlink()
+    flip(root / "shard-00000.h5", 8 * 5000)
+    with pytest.raises((DataError, FileError)):
+        verify(root, progress=False)
+    done = repair(root, str(model), progress=False)
+    assert done == {INDEX: "written again from the shards", "shard-00000.h5": "made again",
+                    "shard-00002.h5": "made again"}  # fmt: skip
+    assert shards(root) == shards(original) and (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
+
+
+def test_what_cannot_be_repaired(root: Path, tmp_path: Path) -> None:
+    (root / INDEX).unlink()
+    with pytest.raises(DataError, match="and no shard of .* can be read"):
+        repair(tmp_path, progress=False)
+    for path in root.glob("*.h5"):
+        flip(path, 8 * 50)
+    with pytest.raises(DataError, match="and no shard of .* can be read"):
+        repair(root, progress=False)
+    write_bank(tmp_path / "strange", [some_image()])
+    (tmp_path / "strange" / "shard-00000.h5").unlink()
+    with pytest.raises(ConfigError, match="model 'small'; expected a shipped one"):
+        repair(tmp_path / "strange", progress=False)
+
+
+def test_other_bytes_are_written_down(root: Path, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on another machine: the scans are equal to rounding, their bytes are not."""
+    before, made = [scan.points for scan in Bank(root)], repair_module.write_shard
+
+    class Rounding:
+        def __init__(self, generator: Any) -> None:
+            self.generator = generator
+            self.batch = generator.batch
+
+        def range_images(self, *arguments: Any, **options: Any) -> list[RangeImage]:
+            images: list[RangeImage] = self.generator.range_images(*arguments, **options)
+            for image in images:
+                image.range[image.mask] = np.minimum(image.range[image.mask] * np.float32(1 + 1e-4), 80)
+            return images
+
+    monkeypatch.setattr(repair_module, "write_shard", lambda generator, *rest: made(Rounding(generator), *rest))
+    (root / "shard-00001.h5").unlink()
+    assert repair(root, str(model), progress=False) == {"shard-00001.h5": "made again, with other bytes"}
+    assert verify(root, progress=False) == []
+    assert "shard-00001.h5 was made again with torch" in Bank(root).index.repairs[0]
+    assert "with other bytes" in (root / "README.md").read_text()
+    for old, new in zip(before, (scan.points for scan in Bank(root)), strict=True):
+        assert np.allclose(old, new, rtol=1e-3)
+    bake_again = make_plan(root, Job(model=str(model), count=8, shard_size=3))
+    index = bake(bake_again, progress=False)
+    assert index is not None and index.repairs  # going on does not forget
+
+
+def test_repair_by_command(root: Path, model: Path) -> None:
+    status, output = call("repair", root, "--model", model)
+    assert status == 0 and f"{root}: whole, nothing to do" in output
+    (root / "shard-00001.h5").unlink()
+    status, output = call("repair", root, "--model", model)
+    assert status == 0 and "shard-00001.h5: made again" in output
+
+
+# Merge, split, head
+
+
+def names_and_points(*roots: Path) -> list[tuple[str, bytes]]:
+    return [(scan.id, scan.points.tobytes()) for root in roots for scan in Bank(root)]
+
+
+def test_split_and_merge_are_inverse(root: Path, tmp_path: Path) -> None:
+    parts = split(Bank(root), {tmp_path / "a": 0.5, tmp_path / "b": 0.25, tmp_path / "c": 0.25}, progress=False)
+    assert [index.scans for index in parts.values()] == [4, 2, 2]
+    assert names_and_points(*parts) == names_and_points(root)
+    assert all(verify(part, progress=False) == [] for part in parts)
+    index = merge([Bank(part) for part in parts], tmp_path / "merged", progress=False)
+    assert index.scans == 8 and len(index.sources) == 1
+    assert names_and_points(tmp_path / "merged") == names_and_points(root)
+    assert verify(tmp_path / "merged", progress=False) == []
+
+
+def test_head(root: Path, tmp_path: Path, model: Path) -> None:
+    status, output = call("bank", "head", root, tmp_path / "head", "--count", 4)
+    assert status == 0 and f"{tmp_path / 'head'}: 4 scans in 2 shards" in output
+    assert names_and_points(tmp_path / "head") == names_and_points(root)[:4]
+    assert (tmp_path / "head" / "shard-00000.h5").read_bytes() == (root / "shard-00000.h5").read_bytes()
+    before = shards(tmp_path / "head")
+    (tmp_path / "head" / "shard-00001.h5").unlink()
+    assert repair(tmp_path / "head", str(model), progress=False) == {"shard-00001.h5": "made again"}
+    assert shards(tmp_path / "head") == before
+    for count in (0, 9):
+        with pytest.raises(ConfigError, match=f"the first {count} scans of .*; expected 1 to 8"):
+            head(Bank(root), count, tmp_path / "none", progress=False)
+
+
+def test_banks_of_several_bakes(root: Path, tmp_path: Path, model: Path) -> None:
+    other = baked(tmp_path / "other", model, first=8, count=4)
+    status, _ = call("bank", "merge", tmp_path / "all", root, other)
+    assert status == 0
+    assert names_and_points(tmp_path / "all") == names_and_points(root, other)
+    bank = Bank(tmp_path / "all")
+    assert len(bank.index.sources) == 2 and bank[11].id == "small/0/11"
+    (tmp_path / "all" / "shard-00003.h5").unlink()
+    assert repair(tmp_path / "all", str(model), progress=False) == {"shard-00003.h5": "made again"}
+    assert names_and_points(tmp_path / "all") == names_and_points(root, other)
+    with pytest.raises(ConfigError, match="both hold scan 6 of seed 0; expected every scan once"):
+        merge([Bank(root), Bank(baked(tmp_path / "over", model, first=6, count=4))], tmp_path / "x", progress=False)
+    write_bank(tmp_path / "few", [some_image()])
+    with pytest.raises(ConfigError, match=r"few holds \('reflectance', 'label'\) of sensor 'small'; expected"):
+        merge([Bank(root), Bank(tmp_path / "few")], tmp_path / "x", progress=False)
+    assert not (tmp_path / "x").exists()
+
+
+def test_edits_that_cannot_be(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds a bank; expected a folder of its own"):
+        head(Bank(root), 2, root, progress=False)
+    for shares in ({"a": 0.5, "b": 0.6}, {"a": 1.5, "b": -0.5}, {"a": 0.99, "b": 0.01}):
+        with pytest.raises(ConfigError, match="sum to 1|at least one scan"):
+            split(Bank(root), {tmp_path / name: share for name, share in shares.items()}, progress=False)
+    for part in ("train", "train=much", "=0.5"):
+        with pytest.raises(ConfigError, match=f"part '{part}'; expected FOLDER=SHARE"):
+            call("bank", "split", root, part)
+    (tmp_path / "file").touch()
+    with pytest.raises(FileError, match="file cannot be made"):
+        head(Bank(root), 2, tmp_path / "file", progress=False)
+
+
+def test_info(root: Path) -> None:
+    status, output = call("info", root)
+    assert status == 0
+    for text in (
+        "scans         8",
+        "small, 8 x 32",
+        "1.45 to 80 m in steps of 1.22 mm",
+        "reflectance, label, confidence",
+    ):
+        assert text in output
+    found = json.loads(call("info", root, "--json")[1])
+    assert (found["scans"], found["shards"], found["identity"]) == (8, 3, Bank(root).identity)
+    with pytest.raises(FileError, match="holds no bank"):
+        call("info", root / "nowhere")
