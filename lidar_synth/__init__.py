@@ -9,14 +9,19 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _HOME = {
+    "Bank": "bank",
+    "BatchMixer": "service",
     "Boxes": "scan",
     "Generator": "generator",
     "KITTI360": "formats",
     "KITTIObject": "formats",
     "KITTIRaw": "formats",
     "LidarSynthError": "errors",
+    "MixedScans": "mixing",
+    "MixedStream": "mixing",
     "NuScenes": "formats",
     "RangeImage": "scan",
+    "RollingBank": "service",
     "Scan": "scan",
     "SemanticKITTI": "formats",
     "Sensor": "sensor",
@@ -33,6 +38,7 @@ _HOME = {
 __all__ = ["__version__", *_HOME]
 
 if TYPE_CHECKING:
+    from lidar_synth.bank import Bank as Bank
     from lidar_synth.errors import LidarSynthError as LidarSynthError
     from lidar_synth.formats import KITTI360 as KITTI360
     from lidar_synth.formats import KITTIObject as KITTIObject
@@ -42,6 +48,8 @@ if TYPE_CHECKING:
     from lidar_synth.formats import open_scans as open_scans
     from lidar_synth.generator import Generator as Generator
     from lidar_synth.generator import load_generator as load_generator
+    from lidar_synth.mixing import MixedScans as MixedScans
+    from lidar_synth.mixing import MixedStream as MixedStream
     from lidar_synth.projection import project as project
     from lidar_synth.projection import unfold as unfold
     from lidar_synth.projection import unproject as unproject
@@ -51,6 +59,8 @@ if TYPE_CHECKING:
     from lidar_synth.scan import Source as Source
     from lidar_synth.sensor import Sensor as Sensor
     from lidar_synth.sensor import load_sensor as load_sensor
+    from lidar_synth.service import BatchMixer as BatchMixer
+    from lidar_synth.service import RollingBank as RollingBank
     from lidar_synth.town import Town as Town
 
 

@@ -4,12 +4,14 @@ The header stands in the file's metadata under ``lidar_synth`` and says all that
 
     format          "lidar-synth-checkpoint/1"; a reader refuses every other
     convention      "t=1 noise, t=0 data, v=noise-data", so that nobody has to guess
-    networks        {part: {architecture, arguments}}; the part "velocity" is the flow, a latent model has others
+    networks        {part: {architecture, arguments}}; "velocity" is the flow, "codec" the autoencoder of a latent
+                    model (an autoencoder alone has this part only), "condition" the encoder of a condition
     sensor          as in sensors.yaml
     normalisation   of the range
     channels        of the network's data, in order, each a name of ``normalize.CHANNELS``
     label_encoding  how labels are written into channels, or null
-    conditioning    what the network is conditioned on; empty = nothing
+    conditioning    {name of conditions.CONDITIONS: its options}; empty = unconditional. Options: ``dropout``, share of
+                    blank conditions in training; ``image``, rows and columns of the camera's images
     time_grid       descending from 1 to 0: the steps that the weights were made for
     provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher, recipe, metrics
     weights         sha256 of all tensors
@@ -31,6 +33,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from lidar_synth.conditions import CONDITIONS, Conditioned
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
 from lidar_synth.nets import assemble
@@ -40,8 +43,8 @@ from lidar_synth.sensor import Sensor
 FORMAT = "lidar-synth-checkpoint/1"
 CONVENTION = "t=1 noise, t=0 data, v=noise-data"
 LABEL_ENCODING = f"{LABEL_BITS} analog bits, most significant first, code 19 = no label"
-VELOCITY = "velocity"
-"""The part that is the flow's velocity network."""
+VELOCITY, CODEC, ENCODER = "velocity", "codec", "condition"
+"""Parts: the flow's velocity network, the autoencoder, the encoder of the condition."""
 
 
 class Part(NamedTuple):
@@ -68,22 +71,24 @@ class Header:
     conditioning: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if VELOCITY not in self.networks:
-            raise ConfigError(f"networks {sorted(self.networks)}", f"{VELOCITY!r} among them")
+        if not {VELOCITY, CODEC} & set(self.networks):
+            raise ConfigError(f"networks {sorted(self.networks)}", f"{VELOCITY!r} or {CODEC!r} among them")
         grid = self.time_grid
         if len(grid) < 2 or (grid[0], grid[-1]) != (1, 0) or any(a <= b for a, b in pairwise(grid)):
             raise ConfigError(f"time grid {grid}", "at least two times descending from 1 (noise) to 0 (data)")
         if missing := [k for k in ("data", "data_licence", "licence") if not self.provenance.get(k)]:
             raise ConfigError(f"a provenance without {', '.join(missing)}", "data, data_licence and licence")
+        if unknown := sorted(set(self.conditioning) - set(CONDITIONS)):
+            raise ConfigError(f"conditioning on {unknown}", f"some of {', '.join(CONDITIONS)}")
         shape = (self.tensors.size, *self.sensor.shape)
-        if set(self.networks) == {VELOCITY}:  # a pixel model works on the sensor's own grid
-            arguments = self.networks[VELOCITY].arguments
-            given = (arguments.get("channels", shape[0]), *arguments.get("resolution", shape[1:]))
-            if given != shape:
-                raise ConfigError(
-                    f"a network for {given} channels, rows and columns",
-                    f"{shape}: channels {self.channels} on sensor {self.sensor.name!r}",
-                )
+        # What stands next to the range image works on the sensor's own grid.
+        arguments = self.networks[CODEC if CODEC in self.networks else VELOCITY].arguments
+        given = (arguments.get("channels", shape[0]), *arguments.get("resolution", shape[1:]))
+        if given != shape:
+            raise ConfigError(
+                f"a network for {given} channels, rows and columns",
+                f"{shape}: channels {self.channels} on sensor {self.sensor.name!r}",
+            )
 
     @property
     def tensors(self) -> TensorFormat:
@@ -136,6 +141,19 @@ class Header:
             if values.get(key) != expected[key]:
                 raise ConfigError(f"{key} {values.get(key)!r}", repr(expected[key]))
         return header
+
+
+def join(networks: Mapping[str, nn.Module]) -> nn.Module:
+    """The flow of a checkpoint as one v(y, t, c) that takes conditions as they are stored."""
+    velocity = networks[VELOCITY]
+    return Conditioned(velocity, networks[ENCODER]) if ENCODER in networks else velocity
+
+
+def split(network: nn.Module) -> dict[str, nn.Module]:
+    """The inverse of ``join``."""
+    if isinstance(network, Conditioned):
+        return {VELOCITY: network.velocity, ENCODER: network.encoder}
+    return {VELOCITY: network}
 
 
 class Checkpoint(NamedTuple):
@@ -235,8 +253,8 @@ def _read(path: Path, weights: bool = True) -> tuple[str, Header, dict[str, Tens
         raise DataError(
             f"{path} is a PyTorch pickle",
             "a .safetensors checkpoint",
-            f"A pickle can run code and is never loaded as a checkpoint. R2Flow's released weights are converted by: "
-            f"lidar-synth import {path} OUT.safetensors",
+            f"A pickle can run code and is never loaded as a checkpoint. Peers' released weights are converted by: "
+            f"lidar-synth import {path} OUT.safetensors (--peer lidm for LiDM's)",
         )
     try:
         with safe_open(path, framework="pt") as content:

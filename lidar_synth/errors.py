@@ -36,3 +36,7 @@ class FileError(LidarSynthError, OSError):
 
 class LibraryError(LidarSynthError, OSError):
     """An optional library, or a system library behind it, that is not installed."""
+
+
+class ProcessError(LidarSynthError, OSError):
+    """A process of the package that died, or that does not answer in time."""

@@ -43,12 +43,14 @@ class Example:
         t: (B,) float32 times.
         velocity: (B, ...) targets.
         teacher_evaluations: evaluations of a teacher that the batch took, one per sample and step.
+        cond: what the network is conditioned on, (B, ...) or None.
     """
 
     y: Tensor
     t: Tensor
     velocity: Tensor
     teacher_evaluations: int = 0
+    cond: Any = None
 
 
 def per_sample(t: Tensor, y: Tensor) -> Tensor:
@@ -73,9 +75,28 @@ def flow_matching(y0: Tensor, y1: Tensor, t: Tensor) -> Example:
     return Example(interpolate(y0, y1, t), t, y1 - y0)
 
 
-def velocity_loss(velocity: Velocity, example: Example, metric: Metric, cond: Any = None) -> Tensor:
+def velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
     """E m(v_theta(y_t, t, c), v), the scalar that training lowers; the same for teacher and student."""
-    return metric(velocity(example.y, example.t, cond), example.velocity).mean()
+    return metric(velocity(example.y, example.t, example.cond), example.velocity).mean()
+
+
+def guided(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
+    """Classifier-free guidance (Ho and Salimans, 2022): v(y, t, blank) + scale (v(y, t, c) - v(y, t, blank)).
+
+    Args:
+        velocity: trained with conditions and, now and then, with a blank one.
+        scale: 1 = no guidance; more follows the condition more closely, at the cost of variety.
+        blank: (...) the condition of one sample that says nothing, as ``velocity`` takes it.
+    """
+
+    def toward(y: Tensor, t: Tensor, cond: Tensor) -> Tensor:
+        nothing = blank.expand(len(y), *blank.shape)
+        # One evaluation of twice the batch: what the network computes once is not computed twice.
+        both = velocity(torch.cat((y, y)), torch.cat((t, t)), torch.cat((cond, nothing.to(cond))))
+        with_condition, without = both.chunk(2)
+        return torch.lerp(without, with_condition, scale)
+
+    return velocity if scale == 1 else toward
 
 
 def squared_l2(a: Tensor, b: Tensor) -> Tensor:

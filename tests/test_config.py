@@ -35,7 +35,7 @@ def test_every_configuration_loads(path: Path) -> None:
 
 def test_the_published_recipes() -> None:
     teacher = load_config(TrainConfig, CONFIGS / "kitti360_teacher.yaml")
-    assert teacher.network_arguments()["resolution"] == (64, 1024)
+    assert teacher.parts((2, 64, 1024), (64, 1024))["velocity"].arguments["resolution"] == [64, 1024]
     assert (teacher.recipe.iterations, teacher.recipe.batch, teacher.recipe.warmup) == (320_000, 8, 10_000)
     student = load_config(DistillConfig, CONFIGS / "kitti360_student.yaml")
     assert (student.grid, student.steps, student.recipe.metric) == ((1, 0.86, 0.58, 0.22, 0), 20, "pseudo_huber")
@@ -46,8 +46,9 @@ def test_overrides() -> None:
     config = load_config(TrainConfig, TINY, overrides)
     assert (config.recipe.batch, config.data.flip, config.recipe.rate) == (4, False, 1e-3)
     assert config.tensors().size == 1
-    assert config.network_arguments()["channels"] == 1
     assert config.samples.every == 0
+    student = CONFIGS / "kitti360_student.yaml"
+    assert [load_config(DistillConfig, student, o).precision for o in ([], ["precision=no"])] == ["bf16", "no"]
 
 
 def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -82,7 +83,7 @@ def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_
         ("network.arguments.width=[1]", "arguments"),
         ("network.arguments.depth=3", "arguments"),
         ("network.arguments.channels=3", r"network.arguments with \['channels'\]"),
-        ("network.architecture=unet", "architecture 'unet'; expected one of"),
+        ("network.architecture=resnet", "architecture 'resnet'; expected one of"),
         ("data.path=here", "data with town=40 and path=here; expected one of the two"),
         ("data.town=null", "expected one of the two"),
         ("precision=fp8", "precision = 'fp8'"),
@@ -118,3 +119,22 @@ def test_files_that_are_no_configuration_are_refused(tmp_path: Path) -> None:
     path.write_text(yaml.safe_dump(values))
     with pytest.raises(ConfigError, match="'licence' is missing"):
         load_config(TrainConfig, path)
+
+
+def test_the_papers_latent_recipes() -> None:
+    """Timesteps, 10 Euler steps of the teacher, squared l2; LiDM's sizes."""
+    grids = {
+        "kitti360_latent": (1, 0.82, 0.57, 0.28, 0),
+        "kitti360_camera": (1, 0.74, 0.48, 0.22, 0),
+        "semantic_kitti": (1, 0.42, 0.20, 0.08, 0),
+    }
+    for name, grid in grids.items():
+        student = load_config(DistillConfig, CONFIGS / f"{name}_student.yaml")
+        assert (student.grid, student.steps, student.recipe.metric) == (grid, 10, "squared_l2")
+        teacher = load_config(TrainConfig, CONFIGS / f"{name}_teacher.yaml")
+        parts = teacher.parts((8, 16, 128), (64, 1024))
+        assert parts["velocity"].arguments["position"] is True
+        assert teacher.codec is not None
+        assert load_config(TrainConfig, CONFIGS / f"{teacher.codec.stem}.yaml").autoencodes
+        assert set(parts) == {"velocity"} | ({"condition"} if teacher.condition else set())
+        assert student.teacher.stem == f"{name}_teacher"

@@ -8,12 +8,13 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
+from conftest import random_scan
 from hypothesis import given, settings
 from layouts import formats
 from typer.testing import CliRunner
 
 import lidar_synth.generator as module
-from lidar_synth.checkpoint import VELOCITY, Header, Part, save_checkpoint
+from lidar_synth.checkpoint import ENCODER, VELOCITY, Header, Part, save_checkpoint
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import open_scans
@@ -30,8 +31,9 @@ SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 GRID = (1.0, 0.8, 0.5, 0.0)
 
 
-def write(path: Path, channels: tuple[str, ...] = tuple(CHANNELS), condition_channels: int = 0) -> Path:
-    """A checkpoint with random weights."""
+def write(path: Path, channels: tuple[str, ...] = tuple(CHANNELS), dropout: float | None = None) -> Path:
+    """A checkpoint with random weights; with a ``dropout`` a semantic map is its condition."""
+    condition_channels = 0 if dropout is None else 3
     arguments = {
         "resolution": SENSOR.shape, "channels": sum(CHANNELS[c] for c in channels), "width": 16, "time_width": 16,
         "depths": (1, 1), "heads": (2, 2), "patch": (2, 2), "window": (3, 3), "condition_channels": condition_channels,
@@ -43,9 +45,15 @@ def write(path: Path, channels: tuple[str, ...] = tuple(CHANNELS), condition_cha
     header = Header(
         networks={VELOCITY: Part("hdit", arguments)}, sensor=SENSOR, normalisation=NORMALISATIONS["r2flow"],
         channels=channels, time_grid=GRID, provenance={"data": "none", "data_licence": "none", "licence": "MIT"},
-        conditioning={"semantic": {}} if condition_channels else {},
     )  # fmt: skip
-    save_checkpoint(path, header, {VELOCITY: network})
+    networks = {VELOCITY: network}
+    if dropout is not None:
+        encoder = Part("semantic_map", {"resolution": SENSOR.shape, "target": SENSOR.shape, "channels": 3})
+        networks[ENCODER] = build_network(*encoder)
+        torch.nn.init.normal_(networks[ENCODER].mix.weight, std=2.0)
+        conditioning = {"semantic": {"dropout": dropout}}
+        header = replace(header, networks=header.networks | {ENCODER: encoder}, conditioning=conditioning)
+    save_checkpoint(path, header, networks)
     return path
 
 
@@ -126,21 +134,63 @@ def test_lower_precision_stays_close(path: Path, generator: Generator) -> None:
     assert 0 < (a - b).abs().mean() < 0.05
 
 
+def label_maps(count: int) -> np.ndarray:
+    return np.random.default_rng(0).choice([0, 8, 18, IGNORE], (count, *SENSOR.shape)).astype(np.uint8)
+
+
 def test_conditions(tmp_path: Path, generator: Generator) -> None:
-    conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 2))
-    one, many = torch.randn(2, 8, 32), torch.randn(3, 2, 8, 32)
-    same = conditioned.range_images(0, [4, 4], one)
+    conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
+    many = label_maps(3)
+    same = conditioned.range_images(0, [4, 4], many[0])
     assert np.allclose(same[0].range, same[1].range, atol=1e-3)
-    images = conditioned.range_images(0, [4, 4, 4], many)
-    [third] = conditioned.range_images(0, [4], many[2])
+    images = conditioned.range_images(0, [4, 4, 4], torch.from_numpy(many))
+    [third] = conditioned.range_images(0, [4], {"semantic": many[2], "camera": None})
     assert np.allclose(images[2].range, third.range, atol=1e-3)
     assert not np.allclose(images[0].range, third.range, atol=1e-3)
-    with pytest.raises(DataError, match=r"condition of shape \(3, 8, 32\) for 'conditioned'; expected \(2, 8, 32\)"):
-        conditioned.scans(0, [0], torch.zeros(3, 8, 32))
+    with pytest.raises(DataError, match=r"of shape \(8, 16\); expected \(8, 32\) for all scans, or \(1, 8, 32\)"):
+        conditioned.scans(0, [0], np.zeros((8, 16), np.uint8))
     with pytest.raises(DataError, match="no condition for 'conditioned'"):
         conditioned.scans(0, [0])
     with pytest.raises(ConfigError, match="the model is unconditional"):
-        generator.scans(0, [0], one)
+        generator.scans(0, [0], many[0])
+    assert (generator.condition, conditioned.condition) == (None, "semantic")
+
+
+def test_the_map_labels_the_scan_that_was_made_of_it(tmp_path: Path, generator: Generator) -> None:
+    conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range", "reflectance"), 0.0))
+    assert conditioned.fields == {"reflectance", "label", "confidence"} == generator.fields
+    [labels] = label_maps(1)
+    [image], [scan] = conditioned.range_images(0, [1], labels), conditioned.scans(0, [1], labels)
+    assert image.mask.any() and not image.mask.all()
+    assert np.array_equal(image.label, np.where(image.mask, labels, IGNORE))
+    assert np.array_equal(image.channels["confidence"], (image.label != IGNORE).astype(np.float32))
+    assert np.array_equal(scan.label, labels[image.mask])
+
+
+def test_real_scans_are_conditions(tmp_path: Path) -> None:
+    conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
+    scans = [random_scan(SENSOR, 400, seed) for seed in range(2)]
+    maps = np.stack([project(scan, SENSOR, ["label"]).label for scan in scans])
+    for a, b in zip(conditioned.scans(0, [1, 2], scans), conditioned.scans(0, [1, 2], maps), strict=True):
+        assert np.array_equal(a.points, b.points)
+    [a], [b] = conditioned.scans(0, [1], scans[1]), conditioned.scans(0, [1], maps[1])
+    assert np.array_equal(a.points, b.points)
+
+
+def test_guidance(tmp_path: Path) -> None:
+    guided = load_generator(write(tmp_path / "guided.safetensors", ("range",), 0.1))
+    maps = label_maps(2)
+    [plain] = guided.samples(0, [1], maps[0], guidance=1.0)
+    [more] = guided.samples(0, [1], maps[0], guidance=2.0)
+    [nothing] = guided.samples(0, [1], np.full_like(maps[0], IGNORE))
+    [none] = guided.samples(0, [1], maps[0], guidance=0.0)
+    assert torch.allclose(none, nothing, atol=1e-4)
+    assert not torch.allclose(plain, more, atol=1e-2)
+    many = torch.cat(list(replace(guided, batch=2).samples(0, [1, 5], maps, guidance=2.0)))
+    assert torch.allclose(many[0], more[0], atol=1e-4)
+    never = load_generator(write(tmp_path / "never.safetensors", ("range",), 0.0))
+    with pytest.raises(ConfigError, match="guidance 2.0 for 'never'; expected 1: .*never met a blank condition"):
+        never.scans(0, [1], maps[0], guidance=2.0)
 
 
 def test_names_and_paths(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

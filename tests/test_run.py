@@ -19,6 +19,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from typer.testing import CliRunner
 
+import lidar_synth.cli.plan as plan_module
 import lidar_synth.cli.run as module
 from lidar_synth.checkpoint import VELOCITY, load_checkpoint, read_header
 from lidar_synth.cli import app
@@ -176,14 +177,14 @@ def test_what_is_not_finite_stops_the_run_and_keeps_the_last_good_checkpoint(
     scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = write_config(scans, tmp_path)
-    task, calls = module.teacher_task(), []
+    task, calls = plan_module.teacher_task(), []
 
     def poisoned(batch: Any) -> Example:
         calls.append(batch)
         example = task(batch)
         return Example(example.y, example.t, example.velocity * (torch.nan if len(calls) == 7 else 1))
 
-    monkeypatch.setattr(module, "teacher_task", lambda timesteps: poisoned)
+    monkeypatch.setattr(plan_module, "teacher_task", lambda timesteps: poisoned)
     with pytest.raises(DataError, match=r"step 7: the loss is nan.*last saved state and checkpoint are kept"):
         call("train", config)
     assert read_header(tmp_path / "run" / "run.safetensors")[0].provenance["iterations"] == 4
@@ -243,7 +244,7 @@ def test_a_student_is_distilled(
         assert header.time_grid == tuple(found["grid"])
         assert found["cost"] <= found["uniform_cost"]
         assert found["per_trajectory"].shape == (3, 3)
-    monkeypatch.delattr(module, "select_timesteps")  # it is not called again
+    monkeypatch.delattr(plan_module, "select_timesteps")  # it is not called again
     call("distill", config, "--resume", "recipe.iterations=14")
     assert read_header(tmp_path / "run" / "run.safetensors")[0].time_grid == header.time_grid
 

@@ -1,10 +1,16 @@
-"""The whole way of a scan on one machine, in about a minute.
+"""The main job on one machine, in a few minutes: real scans, synthetic ones among them, a training, a page to look at.
 
     python tools/demo.py demo_out --scans 24
 
-Writes a small town in KITTI-360's layout, reads it back as a user's own dataset would be read, puts every scan on the
-sensor's grid and back, converts the dataset to SemanticKITTI's layout, and leaves one page to look at. The dataset is
-the procedural town, not KITTI-360. Running it again goes on where it stopped.
+1. Writes a small town in SemanticKITTI's layout: it stands for your own dataset (it is no one's recording). With
+   SEMANTICKITTI_ROOT set, that dataset is used instead; with KITTI360_ROOT, which has no labels per scan, scans are
+   mixed and shown, and nothing is trained.
+2. Mixes it with 4-step scans that the shipped model makes on the fly, one sample in four, in two DataLoader workers,
+   and trains a small segmenter on that for a moment.
+3. Bakes a bank of synthetic scans, verifies it, and mixes from the bank.
+4. Leaves one page with real and synthetic samples.
+
+Running it again goes on where it stopped.
 """
 
 import argparse
@@ -15,13 +21,16 @@ import time
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
+import torch
 
-from lidar_synth import Scan, open_scans, project, unproject
-from lidar_synth.classes import NAMES
+from lidar_synth import Bank, MixedScans, Scan, Source, load_generator, open_scans
+from lidar_synth.nets.segmenter import RangeSegmenter
+from lidar_synth.train.segmentation import endless_batches, train_segmenter
 from lidar_synth.viz import write_view
 
-SHOWN = 6
+RATIO = 0.25
+BATCH = 4
+WORKERS = 2
 
 
 def command(*words: str) -> None:
@@ -30,24 +39,35 @@ def command(*words: str) -> None:
     subprocess.run([sys.executable, "-m", "lidar_synth", *words], check=True)
 
 
-def there_and_back(scans: list[Scan]) -> str:
-    """Puts every scan on the grid and back; a sentence on what was seen."""
-    filled, points, seen = [], [], np.zeros(len(NAMES), int)
-    for scan in tqdm(scans, desc="project", unit="scan"):
-        image = project(scan)
-        again = project(unproject(image))
-        if not np.array_equal(again.mask, image.mask):
-            raise AssertionError(f"{scan.id}: a cell did not return to itself")
-        filled.append(image.mask.mean())
-        points.append(len(scan))
-        if scan.label is not None:
-            seen += np.bincount(scan.label[scan.label < len(NAMES)], minlength=len(NAMES))
-    most = [NAMES[i] for i in np.argsort(-seen)[:5]]
+def dataset(out: Path, scans: int, seed: int) -> tuple[Source, str, bool]:
+    """The user's own scans, what they are, and whether they have labels."""
+    if root := os.environ.get("SEMANTICKITTI_ROOT"):
+        return open_scans(root, layout="semantic_kitti", split="train"), "SemanticKITTI", True
+    if root := os.environ.get("KITTI360_ROOT"):
+        return open_scans(root, layout="kitti360", split="r2flow/train"), "KITTI-360", False
+    town = out / "town"
+    wanted = ("--scans", str(scans), "--seed", str(seed), "--layout", "semantic_kitti")
+    command("town", str(town), *wanted, "--jobs", str(os.cpu_count() or 1))
+    return open_scans(town), "the town (procedural; no one's recording)", True
+
+
+def train(real: Source, synthetic: object, steps: int) -> str:
+    """A short training on the mixture; a sentence on how it went."""
+    mixed = MixedScans(real, synthetic, RATIO, labels="generated", balanced=True, collate="range")
+    height = torch.from_numpy(np.sin(mixed.collate.sensor.ray_angles()[0]))
+    torch.manual_seed(0)
+    losses = train_segmenter(RangeSegmenter(), endless_batches(mixed, BATCH, WORKERS), height, steps)
+    share = sum(mixed.domain(i) for i in range(len(mixed))) / len(mixed)
     return (
-        f"{len(scans)} scans of {np.mean(points):,.0f} points on average fill {100 * np.mean(filled):.0f} % of the "
-        f"{scans[0].sensor.shape[0]} x {scans[0].sensor.columns} cells; every cell returned to itself. "
-        f"{np.count_nonzero(seen)} of the {len(NAMES)} classes occur, most of all {', '.join(most)}."
+        f"A segmenter saw {steps} batches of {BATCH}, {100 * share:.0f} % of them synthetic; "
+        f"its loss went from {losses[0]:.2f} to {np.mean(losses[-5:]):.2f}."
     )
+
+
+def samples(real: Source, synthetic: object, labels: str, count: int) -> list[Scan]:
+    """The first samples of a mixture, as scans."""
+    mixed = MixedScans(real, synthetic, 0.5, labels=labels, balanced=True, to_sample=lambda scan, rng: scan)
+    return [mixed[i] for i in range(min(count, len(mixed)))]
 
 
 def main() -> None:
@@ -58,17 +78,19 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="another town")
     given = parser.parse_args()
     start = time.monotonic()
-    town, page = given.out / "town", given.out / "index.html"
     command("doctor")
-    wanted = ("--scans", str(given.scans), "--seed", str(given.seed), "--layout", "kitti360")
-    command("town", str(town), *wanted, "--jobs", str(os.cpu_count() or 1))
-    source = open_scans(town)
-    found = there_and_back([source[i] for i in range(len(source))])
+    real, name, labelled = dataset(given.out, given.scans, given.seed)
+    labels = "generated" if labelled else "none"
+    generator = load_generator("town")
+    found = train(real, generator, steps=2 * given.scans) if labelled else "Without labels there is no training."
     print(found)
-    command("convert", str(town), str(given.out / "semantic_kitti"), "--to", "semantic_kitti")
-    chosen = np.unique(np.linspace(0, len(source) - 1, SHOWN).astype(int))
-    notes = f"Scans of the procedural town, written and read in KITTI-360's layout; it is not KITTI-360.\n\n{found}"
-    write_view(page, [source[int(i)] for i in chosen], title="The town", notes=notes)
+    bank = given.out / "bank"
+    command("bake", str(bank), "--model", "town", "--count", str(given.scans), "--seed", "1", "--shard-size", "16")
+    command("verify", str(bank), "--deep")
+    shown = samples(real, generator, labels, 6) + samples(real, Bank(bank), labels, 4)[-2:]
+    page = given.out / "index.html"
+    notes = f"Real scans: {name}. Synthetic scans: the model that comes with the package, in 4 steps.\n\n{found}"
+    write_view(page, shown, title="Real and synthetic scans", notes=notes)
     print(f"\n{time.monotonic() - start:.0f} s. Look at {page.resolve()}")
 
 

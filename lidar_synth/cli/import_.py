@@ -9,9 +9,9 @@ from lidar_synth.errors import ConfigError
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE.pth", help="The peer's released weights.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The peer's released weights: .pth or .ckpt.")],
     out: Annotated[Path, typer.Argument(metavar="OUT.safetensors", help="Where the checkpoint will stand.")],
-    peer: Annotated[str, typer.Option(help="Whose weights: r2flow.")] = "r2flow",
+    peer: Annotated[str, typer.Option(help="Whose weights: r2flow | lidm.")] = "r2flow",
 ) -> None:
     """Convert a peer's released weights to a checkpoint.
 
@@ -23,16 +23,18 @@ def import_(
       lidar-synth import r2flow-kitti360-1rf.pth r2flow-1rf.safetensors
 
       lidar-synth sample scans --model r2flow-1rf.safetensors --count 16 --steps 32
+
+      lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm     (config.yaml beside model.ckpt)
     """
-    from lidar_synth.checkpoint import VELOCITY, save_checkpoint
+    from lidar_synth.checkpoint import save_checkpoint
     from lidar_synth.importers import IMPORTERS
 
     if peer not in IMPORTERS:
         raise ConfigError(f"--peer {peer}", f"one of {', '.join(IMPORTERS)}")
     header, networks = IMPORTERS[peer](file)
     digest = save_checkpoint(out, header, networks)
-    count = sum(p.numel() for p in networks[VELOCITY].parameters())
+    counts = [f"{n} {sum(p.numel() for p in net.parameters()) / 1e6:.1f} M parameters" for n, net in networks.items()]
     rows, columns = header.sensor.shape
-    print(f"{out}: {count / 1e6:.1f} M parameters, {rows} x {columns}, {', '.join(header.channels)}")
+    print(f"{out}: {', '.join(counts)}, {rows} x {columns}, {', '.join(header.channels)}")
     print(f"hash {digest}; weights {header.provenance['licence']}; data {header.provenance['data']}, "
           f"{header.provenance['data_licence']}")  # fmt: skip

@@ -9,7 +9,11 @@ from pathlib import Path
 from torch import nn
 
 from lidar_synth.checkpoint import Header
+from lidar_synth.importers.lidm import read_lidm
 from lidar_synth.importers.r2flow import read_r2flow
 
-IMPORTERS: dict[str, Callable[[Path], tuple[Header, Mapping[str, nn.Module]]]] = {"r2flow": read_r2flow}
+IMPORTERS: dict[str, Callable[[Path], tuple[Header, Mapping[str, nn.Module]]]] = {
+    "r2flow": read_r2flow,
+    "lidm": read_lidm,
+}
 """Readers of peers' files by the peer's name: a path to the header and the networks of a checkpoint."""

@@ -10,9 +10,7 @@ v(y, t) = -u(1 - t, y). Both changes are linear and are folded into the weights:
 Its rotary harmonics, stored for every block, are those of a level and stored once.
 """
 
-import hashlib
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +20,8 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.checkpoint import VELOCITY, Header, Part
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.errors import DataError
+from lidar_synth.importers.pickled import load_pickle, sha256_of, state_of
 from lidar_synth.nets import assemble
 from lidar_synth.nets.positions import BASES, LEARNED
 from lidar_synth.normalize import Normalisation
@@ -86,24 +85,11 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise FileError(f"{path} cannot be read ({error.strerror or error})", "a .pth file of R2Flow") from error
-    except Exception as error:  # a damaged pickle can raise anything
-        if code := re.search(r"GLOBAL ([\w.]+)", str(error)):
-            raise DataError(
-                f"{path} calls for {code[1]} when it is loaded, and was not loaded",
-                "tensors and plain values only",
-                "A pickle with code in it can do anything: get the file from R2Flow's own release page.",
-            ) from error
-        raise DataError(f"{path} is cut, damaged or no .pth file", "a whole file of R2Flow's release") from error
+    content = load_pickle(path, "R2Flow")
     if not isinstance(content, dict) or not {"cfg", "weights"} <= set(content):
         given = sorted(map(str, content))[:8] if isinstance(content, dict) else type(content).__name__
         raise DataError(f"{path} holds {given}", "R2Flow's dictionary with cfg and weights among its keys")
-    weights = content["weights"]
-    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-        raise DataError(f"{path}: its weights are no tensors by name", "the state dictionary of a network")
+    state_of(content, "weights", path)
     return content
 
 
@@ -157,15 +143,10 @@ def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "licence": "as R2Flow's repository: MIT",
         "source": "https://github.com/kazuto1011/r2flow",
         "file": path.name,
-        "file_sha256": _sha256(path),
+        "file_sha256": sha256_of(path),
         "images": content.get("num_images"),
         "recipe": {group: cfg.get(group) for group in ("data", "flow", "training", "finetuning")},
     }
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def convert(weights: Mapping[str, Tensor], part: Part, what: str = "R2Flow's weights") -> nn.Module:

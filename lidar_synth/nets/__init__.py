@@ -4,7 +4,7 @@ To add one: write its file, enter its class in ``NETWORKS``. Its arguments have 
 stand in the checkpoint.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -12,10 +12,23 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.nets.denoiser import Denoiser
+from lidar_synth.nets.diffusion import DiffusionUNet
+from lidar_synth.nets.encoders import ClipViewEncoder, SemanticMapEncoder, ViewEncoder
 from lidar_synth.nets.hdit import HDiT
+from lidar_synth.nets.unet import UNet
+from lidar_synth.nets.vqvae import VQVAE
 
-NETWORKS: dict[str, Callable[..., nn.Module]] = {"hdit": HDiT, "denoiser": Denoiser}
-"""Architectures by the name that a checkpoint holds."""
+NETWORKS: dict[str, type[nn.Module]] = {
+    "hdit": HDiT,
+    "denoiser": Denoiser,
+    "unet": UNet,
+    "diffusion_unet": DiffusionUNet,
+    "vqvae": VQVAE,
+    "semantic_map": SemanticMapEncoder,
+    "views": ViewEncoder,
+    "clip_views": ClipViewEncoder,
+}
+"""Architectures by the name that a checkpoint holds: velocity networks, autoencoders, encoders of conditions."""
 
 
 def build_network(architecture: str, arguments: dict[str, Any]) -> nn.Module:
@@ -69,4 +82,5 @@ def assemble(
         shapes = ", ".join(f"{key} {shape} for {expected[key]}" for key, shape in wrong.items())
         raise DataError(f"{what} has weights of other shapes: {shapes}", "the shapes that its arguments give")
     network.load_state_dict({key: v.to(device, torch.float32) for key, v in state.items()}, assign=True)
-    return network.to(device).eval()
+    # What is no image has no such layout; convolutions would arrange their weights anew at every call.
+    return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload, no-any-return]

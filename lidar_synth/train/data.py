@@ -1,153 +1,62 @@
-"""Training data: scans kept as compact range images, and batches that are a function of their position alone.
+"""Training batches that are a function of their position alone.
 
 A run asks for samples by their position in one endless sequence. What stands there (which scan, turned and mirrored
 how, with which noise, at which time) follows from (seed, position) and nothing else, so that a run that was killed,
 or that runs on another number of processes, sees the same data.
 """
 
-import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from tqdm import tqdm
 
-from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files import write_file
+from lidar_synth.codec import Codec
+from lidar_synth.conditions import CONDITIONS, blank, one_view
+from lidar_synth.errors import ConfigError
 from lidar_synth.noise import gaussian, uniform
 from lidar_synth.normalize import TensorFormat
-from lidar_synth.projection import project
-from lidar_synth.scan import RangeImage, Source
-from lidar_synth.sensor import Sensor
-
-DTYPES = {"range": np.uint16, "reflectance": np.uint8, "label": np.uint8}
-"""How a cache holds each channel: the range in 65535 steps of the sensor's farthest (1.2 mm for 80 m), reflectance
-in 255, labels as they are."""
+from lidar_synth.train.cache import ImageCache
 
 _TRAINING = 1 << 62
 """Added to a run's seed, so that its noise is not that of the scans that are made with the same seed."""
-
-_SAVE_EVERY = 64  # scans between two notes of how far a cache has come
-
-
-@dataclass(frozen=True)
-class ImageCache:
-    """Range images, 3 to 4 bytes a cell.
-
-    Args:
-        fields: {channel: (N, H, W)} of the types in ``DTYPES``, in memory or memory-mapped.
-        sensor: whose grid.
-    """
-
-    fields: Mapping[str, NDArray[Any]]
-    sensor: Sensor
-
-    def __len__(self) -> int:
-        return len(self.fields["range"])
-
-    def read(self, indices: Sequence[int]) -> dict[str, Tensor]:
-        """(B, H, W) of each channel: range float32 metres, reflectance float32 in [0, 1], label uint8."""
-        values = {name: torch.from_numpy(v[np.asarray(indices, np.int64)]) for name, v in self.fields.items()}
-        values["range"] = values["range"].float() * (self.sensor.range_max / 65535)
-        if "reflectance" in values:
-            values["reflectance"] = values["reflectance"].float() / 255
-        return values
-
-    def write(self, index: int, image: RangeImage) -> None:
-        """Put a range image into its place."""
-        self.fields["range"][index] = np.rint(image.range * (65535 / self.sensor.range_max)).clip(max=65535)
-        if "reflectance" in self.fields:
-            self.fields["reflectance"][index] = np.rint(image.channels["reflectance"].clip(0, 1) * 255)
-        if "label" in self.fields:
-            self.fields["label"][index] = image.channels["label"]
-
-
-def cache_scans(
-    source: Source,
-    sensor: Sensor,
-    channels: Iterable[str],
-    folder: Path | None = None,
-    description: Mapping[str, Any] | None = None,
-    progress: bool = True,
-) -> ImageCache:
-    """The scans of a source, projected once.
-
-    Args:
-        source: of scans.
-        sensor: whose grid.
-        channels: names of ``DTYPES``.
-        folder: keep the cache there, memory-mapped: a second call finds it, an interrupted one goes on; by
-            default the cache is in memory.
-        description: what tells this source from another one, plain values; stands beside the cache.
-        progress: show a bar.
-
-    Raises:
-        ConfigError: where ``folder`` holds the cache of something else, or a scan lacks a channel.
-        DataError: where the source is empty.
-        FileError: where the folder cannot be written.
-    """
-    if not len(source):
-        raise DataError("a source without scans", "at least one")
-    shape = (len(source), *sensor.shape)
-    names = [name for name in DTYPES if name in set(channels)]
-    if folder is None:
-        cache, done = ImageCache({n: np.empty(shape, DTYPES[n]) for n in names}, sensor), 0
-    else:
-        facts = {"sensor": sensor.to_dict(), "shape": shape, "channels": names, "source": dict(description or {})}
-        cache, done = _open_folder(folder, facts, sensor)
-    for i in tqdm(range(done, len(source)), desc="scans", disable=not progress or done == len(source)):
-        cache.write(i, project(source[i], sensor, [n for n in names if n != "range"]))
-        if folder is not None and ((i + 1) % _SAVE_EVERY == 0 or i + 1 == len(source)):
-            for values in cache.fields.values():
-                values.flush()  # type: ignore[attr-defined]  # a memmap
-            _note(folder, facts, i + 1)
-    return cache
-
-
-def _open_folder(folder: Path, facts: dict[str, Any], sensor: Sensor) -> tuple[ImageCache, int]:
-    """A cache on disk and the number of scans that are in it."""
-    note = folder / "cache.json"
-    try:
-        if note.exists():
-            found = json.loads(note.read_text())
-            done = found.pop("done")
-            if found != json.loads(json.dumps(facts)):
-                differs = [key for key in facts if found.get(key) != json.loads(json.dumps(facts[key]))]
-                raise ConfigError(f"{folder} is the cache of other data ({', '.join(differs)} differ)",
-                                  "the cache of this configuration", "Remove it, or name another folder.")  # fmt: skip
-            mode: Literal["r", "r+"] = "r" if done == facts["shape"][0] else "r+"
-            maps = {n: np.load(folder / f"{n}.npy", mmap_mode=mode) for n in facts["channels"]}
-            return ImageCache(maps, sensor), done
-        folder.mkdir(parents=True, exist_ok=True)
-        shape = facts["shape"]
-        new = {n: np.lib.format.open_memmap(folder / f"{n}.npy", "w+", DTYPES[n], shape) for n in facts["channels"]}
-        return ImageCache(new, sensor), 0
-    except (OSError, KeyError, json.JSONDecodeError) as error:
-        raise FileError(f"the cache {folder} cannot be opened ({error})", "a folder that can be written") from error
-
-
-def _note(folder: Path, facts: dict[str, Any], done: int) -> None:
-    write_file(folder / "cache.json", json.dumps(facts | {"done": done}, indent=1).encode())
 
 
 class Batch(NamedTuple):
     """What a task makes an example of.
 
     Args:
-        y0: (B, C, H, W) data in [-1, 1].
+        y0: (B, C, H, W) data: tensors in [-1, 1], or latents.
         y1: (B, C, H, W) standard normal noise.
         u: (B,) uniform numbers in (0, 1), for the time.
+        cond: (B, ...) conditions as they are stored, uint8; None for an unconditional model.
     """
 
     y0: Tensor
     y1: Tensor
     u: Tensor
+    cond: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """How samples get their conditions.
+
+    Args:
+        name: of ``CONDITIONS``.
+        dropout: share of samples with a blank condition, so that the model can be guided.
+        view_dropout: share of camera images of which one view is left.
+        views: of a camera image.
+    """
+
+    name: str
+    dropout: float = 0.0
+    view_dropout: float = 0.0
+    views: int = 1
 
 
 @dataclass(frozen=True)
@@ -161,6 +70,11 @@ class Batches:
         flip: mirror every other sample, left to right.
         roll: turn every sample about the vertical by a random whole number of columns.
         device: where the noise is made and the tensors are put together.
+        codec: makes states of tensors; None = they are the states.
+        conditioning: which field of the cache is the condition; None = there is none.
+
+    Raises:
+        ConfigError: where scans shall be turned, and the condition cannot.
     """
 
     cache: ImageCache
@@ -169,6 +83,12 @@ class Batches:
     flip: bool = False
     roll: bool = False
     device: torch.device | str = "cpu"
+    codec: Codec | None = None
+    conditioning: Conditioning | None = None
+
+    def __post_init__(self) -> None:
+        if self.roll and self.conditioning and not CONDITIONS[self.conditioning.name].turns:
+            raise ConfigError(f"roll with the condition {self.conditioning.name!r}", "roll=false: it does not turn")
 
     def scans_at(self, positions: Sequence[int]) -> list[int]:
         """Which scan stands at each position: every epoch is a permutation of all."""
@@ -178,16 +98,48 @@ class Batches:
     def __call__(self, positions: Sequence[int]) -> Batch:
         """The samples at these positions of the sequence."""
         seed = self.seed + _TRAINING
-        chance = uniform(seed, positions, (3,))
+        chance = uniform(seed, positions, (5,))
         fields = {n: v.to(self.device) for n, v in self.cache.read(self.scans_at(positions)).items()}
         y0 = self.tensors.encode(fields)
+        cond = fields[CONDITIONS[self.conditioning.name].field] if self.conditioning else None
         if self.flip:
-            mirrored = (chance[:, 1] < 0.5).to(y0.device)
-            y0 = torch.where(mirrored[:, None, None, None], y0.flip(-1), y0)
+            y0 = _where(chance[:, 1] < 0.5, y0.flip(-1), y0)
+            cond = cond if cond is None else _where(chance[:, 1] < 0.5, cond.flip(-1), cond)
         if self.roll:
             columns = (chance[:, 2] * y0.shape[-1]).long().tolist()
-            y0 = torch.stack([y.roll(c, -1) for y, c in zip(y0, columns, strict=True)])
-        return Batch(y0, gaussian(seed, positions, y0.shape[1:], self.device), chance[:, 0].to(self.device))
+            y0 = _rolled(y0, columns)
+            cond = cond if cond is None else _rolled(cond, columns)
+        if self.codec is not None:
+            y0 = self.codec.encode(y0)
+        if cond is not None:
+            cond = self._dropped(cond, chance)
+        return Batch(y0, gaussian(seed, positions, y0.shape[1:], self.device), chance[:, 0].to(self.device), cond)
+
+    def conditions(self, positions: Sequence[int]) -> Tensor | None:
+        """The whole conditions (B, ...) of the scans at these positions, neither blank nor turned; None without."""
+        if self.conditioning is None:
+            return None
+        field = CONDITIONS[self.conditioning.name].field
+        values = self.cache.fields[field][np.asarray(self.scans_at(positions), np.int64)]
+        return torch.from_numpy(values).to(self.device)
+
+    def _dropped(self, cond: Tensor, chance: Tensor) -> Tensor:
+        """Some conditions (B, ...) blank, some with one view."""
+        assert self.conditioning is not None
+        about = self.conditioning
+        if about.view_dropout:
+            cond = _where(chance[:, 4] < about.view_dropout, one_view(cond, about.views), cond)
+        return _where(chance[:, 3] < about.dropout, blank(about.name, cond), cond) if about.dropout else cond
+
+
+def _where(chosen: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Sample by sample a or b (B, ...), by ``chosen`` (B,)."""
+    return torch.where(chosen.to(b.device).view(-1, *[1] * (b.ndim - 1)), a, b)
+
+
+def _rolled(x: Tensor, columns: Sequence[int]) -> Tensor:
+    """Every sample of (B, ..., W) turned by its own number of columns."""
+    return torch.stack([one.roll(c, -1) for one, c in zip(x, columns, strict=True)])
 
 
 @lru_cache(maxsize=2)

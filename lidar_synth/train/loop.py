@@ -1,15 +1,17 @@
 """The training loop: a generator that yields one record per optimiser step, so that any engine can drive it.
 
-Teacher and student differ in the task only: what is asked of the network where (an ``Example`` for a ``Batch``).
+Teacher and student differ in the task only: what is asked of the network where (an ``Example`` for a ``Batch``). An
+autoencoder has a loss of its own.
 The caller logs, saves and stops as it likes; a ``Training`` that was saved goes on with the same losses.
 """
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from lidar_synth.distill import STRATEGIES
 from lidar_synth.errors import DataError
@@ -25,16 +27,24 @@ if TYPE_CHECKING:
 Task = Callable[[Batch], Example]
 """What a batch is made into: at which state and time the network is trained, and on which velocity."""
 
+Loss = Callable[[nn.Module, Example, Metric], Tensor]
+"""The scalar that training lowers: of the network, what it is asked, and the recipe's metric."""
+
 
 def teacher_task(timesteps: str = "uniform") -> Task:
     """Flow matching with t from one of ``TIMESTEPS`` (Eq. 1)."""
-    return lambda batch: flow_matching(batch.y0, batch.y1, TIMESTEPS[timesteps](batch.u))
+    return lambda batch: replace(flow_matching(batch.y0, batch.y1, TIMESTEPS[timesteps](batch.u)), cond=batch.cond)
 
 
 def student_task(strategy: str, teacher: Velocity, grid: Sequence[float], steps: int) -> Task:
     """Distillation of ``teacher`` by one of ``STRATEGIES`` on the student's ``grid`` with ``steps`` Euler steps of
     the teacher per piece (Algorithm 1)."""
-    return lambda batch: STRATEGIES[strategy](teacher, batch.y0, batch.y1, batch.u, grid, steps, None)
+
+    def task(batch: Batch) -> Example:
+        example = STRATEGIES[strategy](teacher, batch.y0, batch.y1, batch.u, grid, steps, batch.cond)
+        return replace(example, cond=batch.cond)
+
+    return task
 
 
 class Record(NamedTuple):
@@ -68,7 +78,9 @@ def weighted(metric: Metric, weights: Mapping[str, float], tensors: TensorFormat
     return of_roots
 
 
-def steps(training: Training, task: Task, batches: Batches, accelerator: "Accelerator") -> Iterator[Record]:
+def steps(
+    training: Training, task: Task, batches: Batches, accelerator: "Accelerator", loss: Loss = velocity_loss
+) -> Iterator[Record]:
     """Train to the end of the recipe, step by step.
 
     Args:
@@ -76,6 +88,7 @@ def steps(training: Training, task: Task, batches: Batches, accelerator: "Accele
         task: what to train on.
         batches: the data.
         accelerator: Accelerate's: one process or several, its precision.
+        loss: what is lowered.
 
     Yields:
         A record after each step; between two of them ``training`` may be saved or sampled from.
@@ -100,9 +113,9 @@ def steps(training: Training, task: Task, batches: Batches, accelerator: "Accele
             with nullcontext() if positions is parts[-1] else accelerator.no_sync(network):
                 with accelerator.autocast():
                     example = task(batches(positions))
-                    loss = velocity_loss(network, example, metric) / len(parts)
-                accelerator.backward(loss)
-            total += accelerator.reduce(loss.detach(), "mean").item()
+                    part = loss(network, example, metric) / len(parts)
+                accelerator.backward(part)
+            total += accelerator.reduce(part.detach(), "mean").item()
             evaluations += example.teacher_evaluations * accelerator.num_processes
         gradient = float(accelerator.clip_grad_norm_(network.parameters(), recipe.clip))
         if not (math.isfinite(total) and math.isfinite(gradient)):

@@ -1,17 +1,47 @@
-"""Training of the range-view segmenter on batches of labelled range images."""
+"""The reference trainer: a small range-view segmenter on real scans with synthetic ones among them.
 
-from collections.abc import Iterable
+All that a training with mixed data takes, in one file: ``endless_batches`` is the data loading, ``train_segmenter`` the
+loop. ``tools/train_segmenter.py`` calls it from the command line, on the town or on your own dataset.
+"""
+
+from collections.abc import Iterable, Iterator
+from itertools import count
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.metrics.segmentation import Images
+from lidar_synth.mixing import MixedScans
 from lidar_synth.nets.segmenter import segmenter_input
+
+
+def endless_batches(mixed: MixedScans, batch: int, workers: int = 0) -> Iterator[Images]:
+    """Epoch after epoch of a mixture.
+
+    Args:
+        mixed: made with ``collate="range"``.
+        batch: samples of a batch.
+        workers: processes that load; 0 = this one.
+
+    Yields:
+        Batches of range images, the last one of an epoch too where it is smaller.
+    """
+    loader = DataLoader(
+        mixed,
+        batch_sampler=mixed.batches(batch),
+        num_workers=workers,
+        collate_fn=mixed.collate,
+        persistent_workers=workers > 0,
+    )
+    for epoch in count():
+        mixed.set_epoch(epoch)  # another order, fresh synthetic scans; persistent workers are told
+        yield from loader
 
 
 def train_segmenter(

@@ -89,12 +89,14 @@ class Training:
         self.step = 0
 
     def update_average(self) -> None:
-        """Move the averaged weights towards the network's."""
+        """Move the averaged weights towards the network's, and take over what it counts (norms, codebooks)."""
         updates = self.step // self.recipe.ema_every
         # The start is forgotten soon: an average over few steps follows at once.
         keep = min(self.recipe.ema_decay, (1 + updates) / (10 + updates))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - keep)
+            for mine, new in zip(self.average.buffers(), self.network.buffers(), strict=True):
+                mine.copy_(new)
 
     def save(self, path: Path) -> None:
         """Write all of it beside ``path``, then rename.

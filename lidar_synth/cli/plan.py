@@ -1,0 +1,262 @@
+"""What a training configuration asks for: the networks, what they are trained on, and what the checkpoint will say."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import nn
+from tqdm import tqdm
+
+from lidar_synth import __version__
+from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Checkpoint, Header, join, load_checkpoint, split
+from lidar_synth.codec import Codec, make_codec
+from lidar_synth.conditions import CONDITIONS, Conditioned, blank
+from lidar_synth.config import DistillConfig, Run, TrainConfig
+from lidar_synth.errors import ConfigError
+from lidar_synth.files import write_file
+from lidar_synth.flow import METRICS, guided, velocity_loss
+from lidar_synth.nets import build_network
+from lidar_synth.sensor import load_sensor
+from lidar_synth.solvers import uniform_grid
+from lidar_synth.timesteps import Selection, select_timesteps
+from lidar_synth.train import (
+    Autoencoding,
+    Batches,
+    Conditioning,
+    Loss,
+    Other,
+    Task,
+    autoencoder_loss,
+    cache_scans,
+    reconstruction_task,
+    student_task,
+    teacher_task,
+)
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run before its first step.
+
+    Args:
+        network: what is trained.
+        task: on what.
+        header: what the checkpoint will say.
+        loss: what is lowered.
+        autoencoder: of a latent model, frozen.
+    """
+
+    network: nn.Module
+    task: Task
+    header: Header
+    loss: Loss = velocity_loss
+    autoencoder: nn.Module | None = None
+
+    def codec(self) -> Codec:
+        """Between tensors and states."""
+        return make_codec(self.autoencoder, self.header.tensors, self.header.sensor.shape)
+
+    def parts(self, network: nn.Module) -> dict[str, nn.Module]:
+        """The parts of the checkpoint, of the network or its averaged twin."""
+        if isinstance(network, Autoencoding):
+            return {CODEC: network.network}
+        return split(network) | ({CODEC: self.autoencoder} if self.autoencoder is not None else {})
+
+
+def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -> Plan:
+    """A teacher, a student or an autoencoder.
+
+    Raises:
+        ConfigError: where the configuration does not fit the checkpoints that it names.
+    """
+    if isinstance(config, DistillConfig):
+        return plan_student(config, accelerator)
+    return plan_autoencoder(config) if config.autoencodes else plan_teacher(config, accelerator)
+
+
+def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> Plan:
+    """Flow matching, from fresh weights or from those of ``config.init``."""
+    task = teacher_task(config.timesteps)
+    networks, header = _start(config) if config.init is not None else _fresh(config)
+    if config.codec is not None and CODEC not in networks:
+        networks[CODEC] = load_checkpoint(config.codec).networks[CODEC]
+    autoencoder = networks.get(CODEC)
+    if autoencoder is not None:
+        autoencoder.requires_grad_(False).to(accelerator.device)
+    return Plan(join(networks), task, header, autoencoder=autoencoder)
+
+
+def plan_autoencoder(config: TrainConfig) -> Plan:
+    """An autoencoder, from fresh weights or from those of ``config.init``."""
+    networks, header = _start(config) if config.init is not None else _fresh(config)
+    recipe = config.recipe
+    network: Any = networks[CODEC]
+    trained = Autoencoding(
+        network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights
+    )
+    return Plan(trained, reconstruction_task, header, autoencoder_loss)
+
+
+def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
+    """Distillation on the given, the selected or a uniform grid, from the teacher's weights."""
+    teacher = load_checkpoint(config.teacher, accelerator.device)
+    if VELOCITY not in teacher.networks:
+        raise ConfigError(f"teacher {config.teacher}, an autoencoder", "a model that generates")
+    if CODEC in teacher.networks and config.recipe.weights:
+        raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
+    velocity = join(teacher.networks).requires_grad_(False)
+    if config.compile:
+        velocity.compile()
+    provenance = _provenance(config) | {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
+    header = replace(teacher.header, time_grid=config.grid or uniform_grid(config.intervals), provenance=provenance)
+    student = join(load_checkpoint(config.teacher).networks)
+    plan = Plan(student, teacher_task(), header, autoencoder=teacher.networks.get(CODEC))
+    flow = velocity if config.guidance == 1 else _guided(config, teacher)
+    if config.grid is None and config.strategy == "adaptive_piecewise":
+        with accelerator.main_process_first():
+            found = _selection(config, flow, plan, accelerator)
+        provenance |= {"selection": {"cost": found.cost, "uniform_cost": found.uniform_cost}}
+        header = replace(header, time_grid=found.grid, provenance=provenance)
+    return replace(plan, task=student_task(config.strategy, flow, header.time_grid, config.steps), header=header)
+
+
+def open_data(config: Run, plan: Plan, device: torch.device) -> Batches:
+    """The run's batches; the scans are projected once, into the run's cache."""
+    sensor, tensors = plan.header.sensor, plan.header.tensors
+    conditioning, channels, others = None, set(tensors.channels), {}
+    for name, options in plan.header.conditioning.items():
+        condition, encoder = CONDITIONS[name], plan.parts(plan.network)[ENCODER]
+        shape = condition.shape(encoder)
+        shares = {key: options.get(key, 0.0) for key in ("dropout", "view_dropout")}
+        conditioning = Conditioning(name, **shares, views=getattr(encoder, "views", 1))
+        if condition.field == "label":  # a channel of the range image
+            channels.add("label")
+        else:
+            others[condition.field] = Other(shape, _reader(name, sensor, shape, options))
+    folder = config.data.cache or config.output / "cache"
+    source = config.data.open(sensor)
+    cache = cache_scans(source, sensor, channels, folder, config.data.describe(), others=others)
+    codec = plan.codec() if plan.autoencoder is not None else None
+    return Batches(cache, tensors, config.seed, config.data.flip, config.data.roll, device, codec, conditioning)
+
+
+def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, Any]) -> Callable[[Any], Any]:
+    return lambda scan: CONDITIONS[name].read(scan, sensor, shape, options)
+
+
+def _fresh(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
+    """New networks and the header that describes them."""
+    provenance = _provenance(config)
+    if config.codec is not None:
+        codec = load_checkpoint(config.codec)
+        if CODEC not in codec.networks:
+            raise ConfigError(f"codec {config.codec}", "the checkpoint of an autoencoder")
+        _check_held(config, codec.header, ("sensor", "channels", "normalisation"), config.codec)
+        sensor, tensors, fixed = codec.header.sensor, codec.header.tensors, {CODEC: codec.header.networks[CODEC]}
+        state = make_codec(codec.networks[CODEC], tensors, sensor.shape).shape
+        provenance |= {"codec": codec.hash, "codec_provenance": codec.header.provenance}
+    else:
+        sensor, tensors, fixed = load_sensor(config.sensor), config.tensors(), {}
+        state = (tensors.size, *sensor.shape)
+    parts = config.parts(state, sensor.shape)
+    torch.manual_seed(config.seed)
+    angles = torch.from_numpy(sensor.ray_angles(config.rays))
+    pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[0]
+    networks = {}
+    for name, part in parts.items():
+        looks = {"angles": pooled} if part.architecture in ("hdit", "denoiser") else {}
+        networks[name] = build_network(part.architecture, part.arguments | looks)
+    header = Header(
+        networks=parts | fixed,
+        sensor=sensor,
+        normalisation=tensors.normalisation,
+        channels=tensors.channels,
+        time_grid=uniform_grid(1 if config.autoencodes else config.steps),
+        provenance=provenance,
+        conditioning={config.condition.kind: config.condition.options()} if config.condition else {},
+    )
+    return networks, header
+
+
+def _start(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
+    """The networks of ``config.init``, and its header for the new run."""
+    assert config.init is not None
+    start = load_checkpoint(config.init)
+    if (CODEC if config.autoencodes else VELOCITY) not in start.networks or config.codec is not None:
+        raise ConfigError(f"init {config.init} with parts {sorted(start.networks)}", "a checkpoint of the same kind")
+    _check_held(config, start.header, ("sensor", "channels", "normalisation", "network"), config.init)
+    provenance = _provenance(config) | {"init": start.hash, "init_provenance": start.header.provenance}
+    grid = start.header.time_grid if config.autoencodes else uniform_grid(config.steps)
+    networks = {CODEC: start.networks[CODEC]} if config.autoencodes else start.networks
+    kept = {name: start.header.networks[name] for name in networks}
+    return networks, replace(start.header, networks=kept, time_grid=grid, provenance=provenance)
+
+
+def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path: Any) -> None:
+    """What the configuration says, if it says it, has to be what the checkpoint holds."""
+    part = header.networks[CODEC if config.autoencodes or "network" not in keys else VELOCITY]
+    held = {
+        "sensor": header.sensor.to_dict(),
+        "channels": list(header.channels),
+        "normalisation": header.normalisation.to_dict(),
+        "network": {"architecture": part.architecture, "arguments": part.arguments},
+    }
+    arguments = part.arguments | config.network.arguments
+    asked = {
+        "sensor": load_sensor(config.sensor).to_dict(),
+        "channels": list(config.channels),
+        "normalisation": config.tensors().normalisation.to_dict(),
+        "network": {"architecture": config.network.architecture, "arguments": arguments},
+    }
+    for key in set(keys) & config.model_fields_set:
+        if json.dumps(asked[key], sort_keys=True) != json.dumps(held[key], sort_keys=True):
+            raise ConfigError(f"{key} {asked[key]}", f"that of {path}: {held[key]}", f"Or leave out {key}.")
+
+
+def _guided(config: DistillConfig, teacher: Checkpoint) -> Any:
+    """The teacher with guidance, of conditions as they are stored."""
+    network = join(teacher.networks)
+    if not isinstance(network, Conditioned):
+        raise ConfigError(f"guidance {config.guidance} of an unconditional teacher", "1")
+    [(name, options)] = teacher.header.conditioning.items()
+    if not options.get("dropout"):
+        raise ConfigError(f"guidance {config.guidance} of a teacher that never met a blank condition", "1")
+    empty = torch.zeros(CONDITIONS[name].shape(network.encoder), dtype=torch.uint8)
+    return guided(network, config.guidance, blank(name, empty))
+
+
+def _provenance(config: Run) -> dict[str, Any]:
+    return {
+        "data": config.data.describe(),
+        "data_licence": config.data.licence,
+        "licence": config.licence,
+        "recipe": config.model_dump(mode="json", exclude={"output", "data", "licence", "samples", "save_every"}),
+        "software": f"lidar_synth {__version__}, torch {torch.__version__}",
+    }
+
+
+def _selection(config: DistillConfig, velocity: Any, plan: Plan, accelerator: "Accelerator") -> Selection:
+    """The timesteps of the student, from the folder where an earlier call left them."""
+    path = config.output / "selection.npz"
+    if path.exists():
+        with np.load(path) as values:
+            return Selection(
+                tuple(values["grid"].tolist()), float(values["cost"]), float(values["uniform_cost"]),
+                tuple(values["candidates"].tolist()), values["costs"], values["per_trajectory"],
+            )  # fmt: skip
+    conditions = open_data(config, plan, accelerator.device).conditions if plan.header.conditioning else None
+    with accelerator.autocast():
+        selection = select_timesteps(
+            velocity, plan.codec().shape, config.intervals, metric=config.recipe.metric, device=accelerator.device,
+            condition=conditions, **config.selection.model_dump(),
+        )  # fmt: skip
+    write_file(path, lambda file: np.savez(file, **asdict(selection)))
+    tqdm.write(f"timesteps {selection.grid}: cost {selection.cost:.4g}, uniform {selection.uniform_cost:.4g}")
+    return selection

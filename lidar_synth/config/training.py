@@ -1,0 +1,121 @@
+"""Configurations of teachers, autoencoders and students."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import nn
+
+from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Part
+from lidar_synth.conditions import CONDITIONS
+from lidar_synth.config.sections import Condition, Count, Network, Run, Section
+from lidar_synth.errors import ConfigError
+from lidar_synth.nets import build_network
+from lidar_synth.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.train import Losses
+
+
+class TrainConfig(Run):
+    """A teacher, a rectified flow from noise to scans; or, with the architecture "vqvae", the autoencoder of one.
+
+    Args:
+        sensor: a preset's name or a YAML file.
+        channels: of the tensor, in order.
+        normalisation: a name of ``NORMALISATIONS``.
+        rays: through the cells' centres or, as the peers have it, their corners: the angles that the network sees.
+        network: what to train.
+        codec: checkpoint of an autoencoder, for a latent model; sensor, channels and normalisation are its own then.
+        condition: what the model is conditioned on.
+        init: checkpoint to start from; its networks, sensor, channels and normalisation are those of the run then.
+        timesteps: a name of ``TIMESTEPS``.
+        steps: of the uniform time grid that the checkpoint names.
+        losses: of an autoencoder.
+    """
+
+    sensor: str = "hdl64e_kitti360"
+    channels: tuple[str, ...] = ("range", "reflectance")
+    normalisation: str = "r2flow"
+    rays: Literal["centre", "corner"] = "centre"
+    network: Network = Network()
+    codec: Path | None = None
+    condition: Condition | None = None
+    init: Path | None = None
+    timesteps: Literal["uniform", "u_shaped", "logit_normal"] = "uniform"
+    steps: Count = 50
+    losses: Losses = Losses()
+
+    @property
+    def autoencodes(self) -> bool:
+        """Whether an autoencoder is trained, and no flow."""
+        return self.network.architecture == "vqvae"
+
+    def tensors(self) -> TensorFormat:
+        """Layout of the network's tensors.
+
+        Raises:
+            ConfigError: on an unknown channel or normalisation.
+        """
+        if self.normalisation not in NORMALISATIONS:
+            raise ConfigError(f"normalisation {self.normalisation!r}", f"one of {', '.join(NORMALISATIONS)}")
+        return TensorFormat(self.channels, NORMALISATIONS[self.normalisation])
+
+    def parts(self, state: tuple[int, int, int], resolution: tuple[int, int]) -> dict[str, Part]:
+        """The networks to train: the velocity (or the autoencoder) and the condition's encoder.
+
+        Args:
+            state: channels, rows and columns of the flow's states (or of the autoencoder's images).
+            resolution: rows and columns of the sensor.
+
+        Raises:
+            ConfigError: on values that do not fit together.
+        """
+        given: dict[str, Any] = {"resolution": list(state[1:]), "channels": state[0]}
+        parts = {}
+        if self.condition is not None:
+            parts[ENCODER] = encoder = self.condition.part(resolution, state[1:])
+            given[CONDITIONS[self.condition.kind].argument] = getattr(_checked(encoder), "channels", None)
+        if twice := sorted(set(given) & set(self.network.arguments)):
+            raise ConfigError(f"network.arguments with {twice}", "no such keys: they follow from what the states are")
+        part = Part(self.network.architecture, given | self.network.arguments)
+        _checked(part)
+        return parts | {CODEC if self.autoencodes else VELOCITY: part}
+
+
+def _checked(part: Part) -> nn.Module:
+    """The network without weights: no memory and no time, only whether the values fit together."""
+    with torch.device("meta"):
+        return build_network(*part)
+
+
+class Selection(Section):
+    """How timesteps are selected: see ``timesteps.select_timesteps``."""
+
+    candidates: Count = 100
+    trajectories: Count = 256
+    batch: Count = 1
+    seed: int = 0
+
+
+class DistillConfig(Run):
+    """A student that needs few steps.
+
+    Args:
+        teacher: checkpoint; its network, sensor, channels and normalisation are the student's.
+        strategy: a name of ``STRATEGIES``.
+        steps: Euler steps of the teacher per piece.
+        guidance: scale of classifier-free guidance of the teacher, which the student learns; 1 = none.
+        intervals: N, steps of the student.
+        grid: N + 1 descending times from 1 to 0; without it, ``adaptive_piecewise`` selects them and the other
+            strategies take uniform ones.
+        selection: how.
+    """
+
+    teacher: Path
+    strategy: Literal[
+        "adaptive_piecewise", "uniform_piecewise", "piecewise_reflow", "reflow", "timestep_distillation"
+    ] = "adaptive_piecewise"
+    steps: Count = 20
+    guidance: float = 1.0
+    intervals: Count = 4
+    grid: tuple[float, ...] | None = None
+    selection: Selection = Selection()

@@ -1,0 +1,184 @@
+"""Autoencoder of range images that two CPU cores can train: patches in, few convolutions, one head per channel.
+
+An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 8) in (-1, 1), the size of LiDM's (Ran et al., "Towards
+Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024). In place of a codebook, the latent is bounded and
+the decoder is trained on latents with noise, so that it forgives what a flow leaves. Every norm is over the channels
+of one cell: a crop in training and the whole turn in use give the same.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.nets.layers import EPS
+
+DETAIL = (2, 4)
+"""Rows and columns of the patches that the outer convolutions see."""
+DOWN = (4, 8)
+"""Rows and columns of one latent cell."""
+
+
+class Heads(NamedTuple):
+    """What the decoder says of every cell.
+
+    Args:
+        values: (B, V, H, W) channels as of the image; the range as if every cell had a return.
+        returned: (B, 1, H, W) logit of a return.
+        classes: (B, K, H, W) logits of the label's codes; K = 0 without labels.
+    """
+
+    values: Tensor
+    returned: Tensor
+    classes: Tensor
+
+
+class CircularConv(nn.Conv2d):
+    """3 x 3 convolution; columns wrap, rows end."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels, channels, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the same shape."""
+        return super().forward(F.pad(F.pad(x, (1, 1, 0, 0), "circular"), (0, 0, 1, 1)))
+
+
+class Residual(nn.Module):
+    """x + conv(silu(conv(norm(x)))).
+
+    Args:
+        channels: C.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first, self.second = CircularConv(channels), CircularConv(channels)
+        nn.init.zeros_(self.second.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the same shape."""
+        normed = F.rms_norm(x.movedim(1, -1), x.shape[1:2], eps=EPS).movedim(-1, 1)
+        out: Tensor = x + self.second(F.silu(self.first(normed)))
+        return out
+
+
+class Autoencoder(nn.Module):
+    """Images to latents and back; a codec like ``VQVAE``.
+
+    Args:
+        resolution: H, W of the image, multiples of 4 and 8.
+        values: V, channels of the image that are numbers: the range first, then such as reflectance.
+        bits: channels of the image after them that are an analog code (``normalize.encode_labels``).
+        codes: K, how many codes there are.
+        latent_channels: Z.
+        widths: channels on patches of 2 x 4 cells and of 4 x 8.
+        depth: residual blocks of the decoder on the coarser grid; one less after it, one less on it in the encoder.
+        fine: channels of the decoder's last map, on single cells.
+
+    Raises:
+        ConfigError: on values that do not fit together.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(
+        self,
+        resolution: Sequence[int],
+        values: int = 2,
+        bits: int = 5,
+        codes: int = 20,
+        latent_channels: int = 8,
+        widths: Sequence[int] = (48, 96),
+        depth: int = 3,
+        fine: int = 24,
+    ) -> None:
+        super().__init__()
+        rows, columns = resolution
+        if rows % DOWN[0] or columns % DOWN[1] or not 2**bits >= codes > 2 ** (bits - 1) - (bits == 0) or depth < 2:
+            raise ConfigError(
+                f"resolution {tuple(resolution)}, {codes} codes in {bits} bits, depth {depth}",
+                f"multiples of {DOWN}, as many bits as the codes need, and depth >= 2",
+            )
+        outer, inner = widths
+        self.resolution, self.values, self.bits, self.fine = (rows, columns), values, bits, fine
+        self.channels = values + bits
+        self.latent_shape = (latent_channels, rows // DOWN[0], columns // DOWN[1])
+        """Channels, rows and columns of a latent."""
+        # What lies where is known by row: on the road, a beam's elevation gives its range.
+        self.place_stem = _rows(outer, rows // DETAIL[0])
+        self.place_latent = _rows(inner, rows // DOWN[0])
+        self.place_outer = _rows(outer, rows // DETAIL[0])
+        self.place_fine = _rows(fine, rows)
+        self.stem = nn.Conv2d(self.channels + 1, outer, DETAIL, DETAIL)
+        self.encode_outer = Residual(outer)
+        self.merge = nn.Conv2d(outer, inner, 2, 2)
+        self.encode_inner = nn.Sequential(*(Residual(inner) for _ in range(depth - 1)))
+        self.to_latent = nn.Conv2d(inner, latent_channels, 1)
+        self.from_latent = nn.Conv2d(latent_channels, inner, 1)
+        self.decode_inner = nn.Sequential(*(Residual(inner) for _ in range(depth)))
+        self.split = nn.Conv2d(inner, 4 * outer, 1)
+        self.decode_outer = nn.Sequential(*(Residual(outer) for _ in range(depth - 1)))
+        self.spread = nn.Conv2d(outer, DETAIL[0] * DETAIL[1] * fine, 1)
+        self.refine = CircularConv(fine)
+        self.heads = nn.Conv2d(fine, values + 1 + codes, 1)
+        # Latents leave with mean 0 and variance 1 per channel, as a flow from standard normal noise likes them.
+        self.register_buffer("shift", torch.zeros(latent_channels))
+        self.register_buffer("scale", torch.ones(latent_channels))
+
+    def encode(self, x: Tensor) -> Tensor:
+        """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of mean 0 and variance 1
+        per channel."""
+        return (self.squeeze(x) - _channel(self.shift)) / _channel(self.scale)
+
+    def decode(self, z: Tensor) -> Tensor:
+        """Latents (B, *latent_shape) to images (B, C, H, W): the range -1 where there is no return; the bits as logits
+        of the likeliest code, which are as far from 0 as this one is likely."""
+        said = self.expand(z * _channel(self.scale) + _channel(self.shift))
+        distance = torch.where(said.returned > 0, said.values[:, :1], -1.0)
+        if not self.bits:
+            return torch.cat([distance, said.values[:, 1:]], 1)
+        likely, code = said.classes.float().softmax(1).max(1)
+        bits = self._corners(code) * (2 * torch.atanh(likely.clamp(max=0.9999)))[:, None]
+        return torch.cat([distance, said.values[:, 1:], bits.to(distance.dtype)], 1)
+
+    def squeeze(self, x: Tensor) -> Tensor:
+        """Images (B, C, H, W) to bounded latents in (-1, 1), float32."""
+        returned = (x[:, :1] > -1).to(x.dtype)
+        h = self.stem(torch.cat([x, returned], 1).contiguous(memory_format=torch.channels_last))
+        h = self.encode_outer(h + self.place_stem)
+        return torch.tanh(self.to_latent(self.encode_inner(self.merge(h))).float())
+
+    def expand(self, z: Tensor) -> Heads:
+        """Bounded latents to what is said of every cell."""
+        z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
+        h = self.decode_inner(self.from_latent(z) + self.place_latent)
+        h = self.decode_outer(F.pixel_shuffle(self.split(h), 2) + self.place_outer)
+        h = _unpatch(self.spread(h), self.fine) + self.place_fine
+        said = self.heads(h + F.silu(self.refine(h)))
+        return Heads(*said.split([self.values, 1, said.shape[1] - self.values - 1], 1))
+
+    def _corners(self, code: Tensor) -> Tensor:
+        """Codes (B, H, W) as their bits (B, bits, H, W), -1 and 1, highest first."""
+        return torch.stack([(code >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
+
+
+def _rows(channels: int, rows: int) -> nn.Parameter:
+    """(1, C, rows, 1), the same in all columns."""
+    return nn.Parameter(torch.zeros(1, channels, rows, 1))
+
+
+def _channel(x: Tensor) -> Tensor:
+    """(Z,) as (1, Z, 1, 1)."""
+    return x.view(1, -1, 1, 1)
+
+
+def _unpatch(x: Tensor, channels: int) -> Tensor:
+    """(B, 8 C, h, w) to (B, C, 2 h, 4 w)."""
+    batch, _, rows, columns = x.shape
+    x = x.reshape(batch, *DETAIL, channels, rows, columns).permute(0, 4, 1, 5, 2, 3)
+    return x.reshape(batch, rows * DETAIL[0], columns * DETAIL[1], channels).movedim(-1, 1)

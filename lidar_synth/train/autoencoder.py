@@ -1,0 +1,209 @@
+"""Training of the autoencoder of latent models: its losses, and how well it gives scans back, in metres.
+
+It runs in the same loop as everything else: one network, one optimiser, one loss::
+
+    reconstruction   the recipe's metric per channel, with the recipe's weights; label bits by cross-entropy
+    codebook         squared distance of latents to their codes: ``commitment`` moves the encoder, ``codebook`` a
+                     "gradient" codebook; an "ema" codebook moves by itself
+    geometric        squared distance of points, each the mean of four neighbours in a row, in units of the farthest
+                     range: the beams' curves shall be straight where they were
+    adversarial      a discriminator of patches, with the hinge loss (Esser et al., "Taming Transformers for
+                     High-Resolution Image Synthesis", CVPR 2021). Both sides are trained in every step: the
+                     autoencoder's term goes through the discriminator as it stands, the discriminator's own looks at
+                     detached reconstructions
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lidar_synth.codec import Latent, expected
+from lidar_synth.errors import ConfigError
+from lidar_synth.flow import Example, Metric
+from lidar_synth.nets.convolution import Norm, WrapConv
+from lidar_synth.nets.vqvae import VQVAE, Encoding
+from lidar_synth.normalize import CHANNELS, TensorFormat
+from lidar_synth.scan import RangeImage
+from lidar_synth.sensor import Sensor
+from lidar_synth.train.data import Batch
+
+CURVE_LENGTH = 4
+"""Neighbours in a row whose points are averaged, as LiDM has it."""
+
+_QUERIES = 2048  # points whose nearest neighbours are looked for
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Weights of the terms; 0 = left out.
+
+    Args:
+        commitment: of the encoder's distance to its codes.
+        codebook: of the codes' distance to what they stand for, where they move by gradients.
+        geometric: of the points.
+        adversarial: of the discriminator's verdict.
+        discriminator_width: channels of the discriminator.
+
+    Raises:
+        ConfigError: on a negative weight.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # read where a configuration is checked
+
+    commitment: float = 0.25
+    codebook: float = 1.0
+    geometric: float = 0.0
+    adversarial: float = 0.0
+    discriminator_width: int = 32
+
+    def __post_init__(self) -> None:
+        if min(self.commitment, self.codebook, self.geometric, self.adversarial) < 0:
+            raise ConfigError(f"{self}", "weights of at least 0")
+
+
+class Autoencoding(nn.Module):
+    """What is trained: the autoencoder and, for an adversarial term, its discriminator.
+
+    Args:
+        network: the autoencoder.
+        tensors: layout of its images.
+        sensor: whose rays.
+        losses: weights of the terms.
+        metric: of the reconstruction.
+        weights: {channel: weight}, 1 where none is given.
+    """
+
+    rays: Tensor
+
+    def __init__(
+        self,
+        network: VQVAE,
+        tensors: TensorFormat,
+        sensor: Sensor,
+        losses: Losses,
+        metric: Metric,
+        weights: Mapping[str, float],
+    ) -> None:
+        super().__init__()
+        self.network, self.tensors, self.losses = network, tensors, losses
+        self.metric, self.weights = metric, weights
+        self.discriminator = Discriminator(tensors.size, losses.discriminator_width) if losses.adversarial else None
+        directions = torch.from_numpy(sensor.ray_directions().copy()).movedim(-1, 0) / sensor.range_max
+        self.register_buffer("rays", directions, persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The loss of a batch of tensors (B, C, H, W), a scalar."""
+        encoding: Encoding = self.network(x)
+        output = encoding.output.float()
+        loss = self.reconstruction(output, x) + self.losses.commitment * encoding.gap.mean()
+        loss = loss + self.losses.codebook * encoding.code_gap.mean()
+        if self.losses.geometric:
+            loss = loss + self.losses.geometric * (self._points(output) - self._points(x)).square().sum(1).mean()
+        if self.discriminator is not None:
+            loss = loss + self._adversarial(self.discriminator, expected(output, self.tensors), x)
+        return loss
+
+    def reconstruction(self, output: Tensor, x: Tensor) -> Tensor:
+        """The weighted sum over channels, a scalar."""
+        sizes = [CHANNELS[name] for name in self.tensors.channels]
+        loss = output.new_zeros(())
+        for name, a, b in zip(self.tensors.channels, output.split(sizes, 1), x.split(sizes, 1), strict=True):  # type: ignore[no-untyped-call]
+            label = name == "label"
+            part = F.binary_cross_entropy_with_logits(a, (b + 1) / 2) if label else self.metric(a, b).mean()
+            loss = loss + self.weights.get(name, 1.0) * part
+        return loss
+
+    def _points(self, x: Tensor) -> Tensor:
+        """(B, 3, H, W / 4) mean points of neighbours, in units of the farthest range."""
+        first = sum(CHANNELS[name] for name in self.tensors.channels[: self.tensors.channels.index("range")])
+        metres = self.tensors.normalisation.decode(x[:, first : first + 1])
+        return F.avg_pool2d(metres * self.rays, (1, CURVE_LENGTH))
+
+    def _adversarial(self, judge: nn.Module, output: Tensor, x: Tensor) -> Tensor:
+        frozen = {name: p.detach() for name, p in judge.named_parameters()}
+        fooled: Tensor = -torch.func.functional_call(judge, frozen, (output,)).mean()
+        verdict = F.relu(1 - judge(x)).mean() + F.relu(1 + judge(output.detach())).mean()
+        return self.losses.adversarial * fooled + verdict / 2
+
+
+class Discriminator(nn.Module):
+    """Real or not, patch by patch: positive for real.
+
+    Args:
+        channels: of the images.
+        width: channels of the first layer; each further one has twice as many.
+        depth: layers that halve the image.
+    """
+
+    def __init__(self, channels: int, width: int, depth: int = 3) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for i in range(depth):
+            inputs, outputs = (channels if i == 0 else width << (i - 1)), width << i
+            layers += [WrapConv(inputs, outputs, (4, 4), (2, 2), (1, 2, 1, 2))]
+            layers += [Norm(outputs, 1e-6), nn.LeakyReLU(0.2)] if i else [nn.LeakyReLU(0.2)]
+        self.layers = nn.Sequential(*layers, WrapConv(width << (depth - 1), 1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, 1, h, w)."""
+        out: Tensor = self.layers(x)
+        return out
+
+
+def reconstruction_task(batch: Batch) -> Example:
+    """The answer to an image is the image."""
+    return Example(batch.y0, batch.u, batch.y0)
+
+
+def autoencoder_loss(network: nn.Module, example: Example, metric: Metric) -> Tensor:
+    """The loss of ``Autoencoding``, which knows its metric itself."""
+    loss: Tensor = network(example.y)
+    return loss
+
+
+def reconstruct(codec: Latent, x: Tensor, sensor: Sensor) -> list[RangeImage]:
+    """Tensors (B, C, H, W) through the codec and its codebook, as range images."""
+    return codec.tensors.to_images(codec.decode(codec.encode(x)), sensor)
+
+
+def reconstruction_figures(codec: Latent, x: Tensor, sensor: Sensor) -> dict[str, float]:
+    """How well tensors (B, C, H, W) come back.
+
+    Returns:
+        ``mae``, metres, over cells with a return in both; ``within_5cm``, share of all real returns; ``drop_accuracy``,
+        share of cells that are a return in both or in neither; ``chamfer``, metres, mean of both directions' mean
+        distances to the nearest point, from up to 2048 points evenly spaced; with labels ``label_accuracy``, share of
+        cells with a return in both whose label is the same.
+    """
+    rays = torch.from_numpy(sensor.ray_directions().copy())
+    sums: dict[str, list[float]] = {}
+    for real, made in zip(codec.tensors.to_images(x, sensor), reconstruct(codec, x, sensor), strict=True):
+        a, b = torch.from_numpy(real.range), torch.from_numpy(made.range)
+        both = (a > 0) & (b > 0)
+        error = (a - b).abs()
+        figures = {
+            "mae": float(error[both].mean()),
+            "within_5cm": float((error[both] <= 0.05).sum() / (a > 0).sum()),
+            "drop_accuracy": float(((a > 0) == (b > 0)).float().mean()),
+            "chamfer": _chamfer((a[..., None] * rays)[a > 0], (b[..., None] * rays)[b > 0]),
+        }
+        if real.label is not None and made.label is not None:
+            figures["label_accuracy"] = float((real.label == made.label)[both.numpy()].mean())
+        for name, value in figures.items():
+            sums.setdefault(name, []).append(value)
+    return {name: sum(values) / len(values) for name, values in sums.items()}
+
+
+def _chamfer(a: Tensor, b: Tensor) -> float:
+    """Mean of both directions, metres, of clouds (N, 3) and (M, 3)."""
+    if not len(a) or not len(b):
+        return float("nan")
+    means = []
+    for some, others in ((a, b), (b, a)):
+        queries = some[torch.linspace(0, len(some) - 1, min(len(some), _QUERIES)).long()]
+        nearest = [torch.cdist(part, others).amin(1) for part in torch.split(queries, 64)]
+        means.append(float(torch.cat(nearest).mean()))
+    return sum(means) / 2

@@ -1,0 +1,152 @@
+"""Training data on disk: scans kept as compact range images, projected once."""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files import write_file
+from lidar_synth.projection import project
+from lidar_synth.scan import RangeImage, Scan, Source
+from lidar_synth.sensor import Sensor
+
+DTYPES: dict[str, type[np.generic]] = {"range": np.uint16, "reflectance": np.uint8, "label": np.uint8}
+"""How a cache holds each channel: the range in 65535 steps of the sensor's farthest (1.2 mm for 80 m), reflectance
+in 255, labels as they are."""
+
+Layout = dict[str, tuple[tuple[int, ...], type[np.generic]]]
+"""{field of a cache: its shape and type}."""
+
+_SAVE_EVERY = 64  # scans between two notes of how far a cache has come
+
+
+@dataclass(frozen=True)
+class ImageCache:
+    """Range images, 3 to 4 bytes a cell.
+
+    Args:
+        fields: {channel: (N, H, W)} of the types in ``DTYPES``, in memory or memory-mapped; others, such as camera
+            images (N, 3, h, w), are uint8 and stay as they are.
+        sensor: whose grid.
+    """
+
+    fields: Mapping[str, NDArray[Any]]
+    sensor: Sensor
+
+    def __len__(self) -> int:
+        return len(self.fields["range"])
+
+    def read(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        """(B, H, W) of each channel: range float32 metres, reflectance float32 in [0, 1], label uint8; (B, ...) uint8
+        of all else."""
+        values = {name: torch.from_numpy(v[np.asarray(indices, np.int64)]) for name, v in self.fields.items()}
+        values["range"] = values["range"].float() * (self.sensor.range_max / 65535)
+        if "reflectance" in values:
+            values["reflectance"] = values["reflectance"].float() / 255
+        return values
+
+    def write(self, index: int, image: RangeImage, others: Mapping[str, NDArray[np.uint8]] | None = None) -> None:
+        """Put a range image, and what else is kept of its scan, into its place."""
+        self.fields["range"][index] = np.rint(image.range * (65535 / self.sensor.range_max)).clip(max=65535)
+        if "reflectance" in self.fields:
+            self.fields["reflectance"][index] = np.rint(image.channels["reflectance"].clip(0, 1) * 255)
+        if "label" in self.fields:
+            self.fields["label"][index] = image.channels["label"]
+        for name, values in (others or {}).items():
+            self.fields[name][index] = values
+
+
+class Other(NamedTuple):
+    """What a cache keeps of every scan beside its range image.
+
+    Args:
+        shape: of one scan.
+        read: a scan to uint8 values of this shape.
+    """
+
+    shape: tuple[int, ...]
+    read: Callable[[Scan], NDArray[np.uint8]]
+
+
+def cache_scans(
+    source: Source,
+    sensor: Sensor,
+    channels: Iterable[str],
+    folder: Path | None = None,
+    description: Mapping[str, Any] | None = None,
+    progress: bool = True,
+    others: Mapping[str, Other] | None = None,
+) -> ImageCache:
+    """The scans of a source, projected once.
+
+    Args:
+        source: of scans.
+        sensor: whose grid.
+        channels: names of ``DTYPES``.
+        folder: keep the cache there, memory-mapped: a second call finds it, an interrupted one goes on; by
+            default the cache is in memory.
+        description: what tells this source from another one, plain values; stands beside the cache.
+        progress: show a bar.
+        others: {name: what else to keep}.
+
+    Raises:
+        ConfigError: where ``folder`` holds the cache of something else, or a scan lacks a channel.
+        DataError: where the source is empty, or a scan lacks one of ``others``.
+        FileError: where the folder cannot be written.
+    """
+    if not len(source):
+        raise DataError("a source without scans", "at least one")
+    others = others or {}
+    shape = (len(source), *sensor.shape)
+    names = [name for name in DTYPES if name in set(channels)]
+    layout: Layout = {name: (shape, DTYPES[name]) for name in names}
+    layout |= {name: ((len(source), *other.shape), np.uint8) for name, other in others.items()}
+    if folder is None:
+        cache, done = ImageCache({n: np.empty(*kind) for n, kind in layout.items()}, sensor), 0
+    else:
+        facts = {"sensor": sensor.to_dict(), "shape": shape, "channels": names, "source": dict(description or {})}
+        if others:
+            facts["others"] = {name: other.shape for name, other in others.items()}
+        cache, done = _open_folder(folder, facts, layout, sensor)
+    for i in tqdm(range(done, len(source)), desc="scans", disable=not progress or done == len(source)):
+        scan = source[i]
+        image = project(scan, sensor, [n for n in names if n != "range"])
+        cache.write(i, image, {name: other.read(scan) for name, other in others.items()})
+        if folder is not None and ((i + 1) % _SAVE_EVERY == 0 or i + 1 == len(source)):
+            for values in cache.fields.values():
+                values.flush()  # type: ignore[attr-defined]  # a memmap
+            _note(folder, facts, i + 1)
+    return cache
+
+
+def _open_folder(folder: Path, facts: dict[str, Any], layout: Layout, sensor: Sensor) -> tuple[ImageCache, int]:
+    """A cache on disk and the number of scans that are in it."""
+    note = folder / "cache.json"
+    try:
+        if note.exists():
+            found = json.loads(note.read_text())
+            done = found.pop("done")
+            if found != (wanted := json.loads(json.dumps(facts))):
+                differs = [key for key in found | wanted if found.get(key) != wanted.get(key)]
+                raise ConfigError(f"{folder} is the cache of other data ({', '.join(differs)} differ)",
+                                  "the cache of this configuration", "Remove it, or name another folder.")  # fmt: skip
+            mode: Literal["r", "r+"] = "r" if done == facts["shape"][0] else "r+"
+            maps = {n: np.load(folder / f"{n}.npy", mmap_mode=mode) for n in layout}
+            return ImageCache(maps, sensor), done
+        folder.mkdir(parents=True, exist_ok=True)
+        new = {n: np.lib.format.open_memmap(folder / f"{n}.npy", "w+", d, s) for n, (s, d) in layout.items()}
+        return ImageCache(new, sensor), 0
+    except (OSError, KeyError, json.JSONDecodeError) as error:
+        raise FileError(f"the cache {folder} cannot be opened ({error})", "a folder that can be written") from error
+
+
+def _note(folder: Path, facts: dict[str, Any], done: int) -> None:
+    write_file(folder / "cache.json", json.dumps(facts | {"done": done}, indent=1).encode())

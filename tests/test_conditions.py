@@ -1,0 +1,347 @@
+"""Conditions: what users give, what real scans have, how encoders see it, and what is refused."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_scan
+from PIL import Image
+from torch import Tensor, nn
+
+from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.conditions import CONDITIONS, batch_of, blank, one_view
+from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
+from lidar_synth.flow import guided
+from lidar_synth.nets import NETWORKS, build_network
+from lidar_synth.nets.encoders import CLIP_VARIABLE, CLIP_WIDTH, cut, frozen_clip
+from lidar_synth.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.projection import project
+from lidar_synth.scan import Scan
+from lidar_synth.sensor import Sensor
+from lidar_synth.train import Batches, Conditioning, Other, cache_scans
+
+SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+TENSORS = TensorFormat(("range",), NORMALISATIONS["r2flow"])
+CAMERA_SHAPE = (3, 32, 64)
+OPTIONS: dict[str, Any] = {"image": [40, 80]}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def picture(path: Path, size: tuple[int, int] = (40, 80), seed: int = 0) -> Path:
+    """A PNG of so many rows and columns."""
+    Image.fromarray(np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)).save(path)
+    return path
+
+
+def some_scan(tmp_path: Path, seed: int = 0) -> Scan:
+    return replace(random_scan(SENSOR, 400, seed), image_path=picture(tmp_path / f"{seed}.png", seed=seed))
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_every_condition_reads_scans_and_its_encoders_take_what_it_reads(name: str, tmp_path: Path) -> None:
+    condition, scan = CONDITIONS[name], some_scan(tmp_path)
+    encoder = {
+        "semantic": lambda: build_network("semantic_map", {"resolution": (8, 32), "target": (4, 16)}),
+        "camera": lambda: build_network("views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)}),
+    }[name]()
+    shape = condition.shape(encoder)
+    values = condition.read(scan, SENSOR, shape, OPTIONS)
+    assert (values.shape, values.dtype) == (shape, np.uint8)
+    given = batch_of(name, scan, 3, SENSOR, shape, OPTIONS)
+    assert torch.equal(given, torch.from_numpy(values).expand(3, *shape))
+    encoded = encoder(given)
+    assert encoded.shape == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5)}[name]
+    assert (blank(name, given) == condition.blank).all()
+    assert set(condition.encoders) <= set(NETWORKS)
+
+
+def test_the_label_map_of_a_scan_of_another_sensor_lies_on_the_models_grid() -> None:
+    other = replace(SENSOR, name="other", columns=64, rows=16)
+    scan = random_scan(other, 3000)
+    labels = CONDITIONS["semantic"].read(scan, SENSOR, SENSOR.shape, {})
+    assert np.array_equal(labels, project(scan, SENSOR, ["label"]).label)
+
+
+@pytest.mark.parametrize("method", ["rescale", "patches"])
+def test_label_maps_are_seen_as_classes_where_they_are(method: str) -> None:
+    net = build_network("semantic_map", {"resolution": (8, 32), "target": (4, 8), "channels": 6, "method": method})
+    labels = torch.full((1, 8, 32), 3, dtype=torch.uint8)
+    same = net(labels)
+    assert torch.allclose(same, same[:, :, :1, :1].expand_as(same), atol=1e-6)
+    labels[:, 2:4, 4:8] = IGNORE  # the patch in row 1, column 1
+    changed = (net(labels) - same).abs().amax(1)[0] > 1e-6
+    assert changed[1, 1]
+    assert not changed[3, 5]
+    if method == "patches":
+        assert changed.sum() == 1
+
+
+def test_all_train_ids_are_told_apart() -> None:
+    net = build_network("semantic_map", {"resolution": (4, 5), "target": (4, 5), "channels": 20})
+    ids = torch.tensor([*range(len(NAMES)), IGNORE], dtype=torch.uint8).view(1, 4, 5)
+    net.mix.weight.data.copy_(torch.eye(20)[..., None, None])
+    assert torch.equal(net(ids)[0].flatten(1), torch.eye(20))
+
+
+def test_an_image_is_cut_into_views_from_left_to_right() -> None:
+    image = torch.arange(2 * 3 * 4 * 12).reshape(2, 3, 4, 12)
+    views = cut(image, 3)
+    assert torch.equal(views[4], image[1, :, :, 4:8])
+    left = one_view(image, 3)
+    assert torch.equal(left[..., 4:8], image[..., 4:8])
+    assert not left[..., :4].any() and not left[..., 8:].any()
+
+
+def test_the_place_of_a_view_and_of_a_cell_counts_and_trains() -> None:
+    net = build_network("views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)})
+    image = torch.randint(0, 256, (2, 3, 32, 64), dtype=torch.uint8)
+    swapped = torch.cat((image[..., 32:], image[..., :32]), -1)
+    net.eval()
+    a, b = net(image), net(swapped)
+    assert not torch.allclose(a[:, :64], b[:, 64:], atol=1e-4)
+    net.train()(image).square().mean().backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None and parameter.grad.any(), name
+
+
+# --- what users give -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "error", "message"),
+    [
+        ("semantic", np.full((8, 32), 40, np.uint8), DataError, r"ids \[40\]; expected train ids 0..18, or 255"),
+        ("semantic", np.full((8, 32), 1000), DataError, "from 1000 to 1000"),
+        ("semantic", np.zeros((64, 1024), np.uint8), DataError, r"of shape \(64, 1024\); expected \(8, 32\)"),
+        ("semantic", np.zeros((2, 8, 32), np.uint8), DataError, r"or \(3, 8, 32\)"),
+        ("semantic", torch.zeros(8, 32), DataError, "semantic condition of torch.float32; expected whole numbers"),
+        ("semantic", "map.png", ConfigError, "a condition of type str"),
+        ("semantic", {"camera": 1}, ConfigError, r"conditions \['camera'\]; expected 'semantic' among them"),
+        ("semantic", [], ConfigError, "a condition of type list"),
+        ("camera", np.zeros((3, 32, 60), np.uint8), DataError, r"camera condition of shape \(3, 32, 60\)"),
+    ],
+)
+def test_what_is_no_condition(name: str, given: Any, error: type[Exception], message: str) -> None:
+    shape = SENSOR.shape if name == "semantic" else CAMERA_SHAPE
+    with pytest.raises(error, match=message):
+        batch_of(name, given, 3, SENSOR, shape, OPTIONS)
+
+
+def test_scans_that_lack_what_is_needed(tmp_path: Path) -> None:
+    scan = some_scan(tmp_path)
+    with pytest.raises(DataError, match="'random-0' has no labels"):
+        batch_of("semantic", replace(scan, label=None), 1, SENSOR, SENSOR.shape, {})
+    with pytest.raises(DataError, match="'random-0' has no camera image"):
+        batch_of("camera", replace(scan, image_path=None), 1, SENSOR, CAMERA_SHAPE, {})
+    picture(tmp_path / "other.png", (40, 70))
+    with pytest.raises(
+        DataError, match=r"other.png of \(40, 70\) rows and columns; expected \(40, 80\), those of the camera"
+    ):
+        batch_of("camera", replace(scan, image_path=tmp_path / "other.png"), 1, SENSOR, CAMERA_SHAPE, OPTIONS)
+    (tmp_path / "cut.png").write_bytes((tmp_path / "0.png").read_bytes()[:200])
+    with pytest.raises(DataError, match=r"cut.png cannot be read"):
+        batch_of("camera", replace(scan, image_path=tmp_path / "cut.png"), 1, SENSOR, CAMERA_SHAPE, OPTIONS)
+    with pytest.raises(DataError, match=r"nowhere.png cannot be read"):
+        batch_of("camera", replace(scan, image_path=tmp_path / "nowhere.png"), 1, SENSOR, CAMERA_SHAPE, OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"target": (3, 16)}, r"label map of \(8, 32\)|a label map"),
+        ({"target": (8, 64)}, "multiple"),
+        ({"target": (4, 16), "method": "guess"}, "one of rescale, patches"),
+        ({"resolution": (12, 32), "target": (4, 16)}, "powers of two"),
+    ],
+)
+def test_sizes_that_an_encoder_cannot_reach(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build_network("semantic_map", {"resolution": (8, 32)} | arguments)
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def conditioned_batches(tmp_path: Path, name: str, **options: Any) -> Batches:
+    scans = [some_scan(tmp_path, seed) for seed in range(4)]
+    others = {"camera": Other(CAMERA_SHAPE, lambda s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS))}
+    about = {key: options.pop(key) for key in ("dropout", "view_dropout") if key in options}
+    cache = cache_scans(scans, SENSOR, ["range", "label"], progress=False, others=others)
+    return Batches(cache, TENSORS, 3, conditioning=Conditioning(name, views=2, **about), **options)
+
+
+def test_conditions_stay_with_their_scans(tmp_path: Path) -> None:
+    plain = conditioned_batches(tmp_path, "semantic")
+    moved = conditioned_batches(tmp_path, "semantic", flip=True, roll=True)
+    for batches in (plain, moved):
+        y0, _, _, cond = batches(range(8))
+        assert cond is not None and cond.shape == (8, 8, 32)
+        empty = TENSORS.decode(y0)["range"] == 0
+        assert (cond[empty] == IGNORE).all()  # no return, no label, wherever the scan was turned to
+    whole = plain.conditions(range(8))
+    assert whole is not None and torch.equal(whole, plain(range(8)).cond)  # type: ignore[arg-type]
+    assert not torch.equal(whole, moved(range(8)).cond)  # type: ignore[arg-type]
+
+
+def test_camera_images_are_mirrored_with_the_scan_and_cannot_turn(tmp_path: Path) -> None:
+    plain, flipped = (conditioned_batches(tmp_path, "camera", flip=flip) for flip in (False, True))
+    a, b = plain(range(16)), flipped(range(16))
+    assert a.cond is not None and b.cond is not None
+    mirrored = torch.tensor([not torch.equal(x, y) for x, y in zip(a.y0, b.y0, strict=True)])
+    assert 0 < mirrored.sum() < 16
+    for i, is_mirrored in enumerate(mirrored):
+        assert torch.equal(b.cond[i], a.cond[i].flip(-1) if is_mirrored else a.cond[i])
+    with pytest.raises(ConfigError, match="roll with the condition 'camera'"):
+        conditioned_batches(tmp_path, "camera", roll=True)
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_dropout_blanks_its_share_and_nothing_else(name: str, tmp_path: Path) -> None:
+    plain, dropped = conditioned_batches(tmp_path, name), conditioned_batches(tmp_path, name, dropout=0.25)
+    a, b = plain(range(200)), dropped(range(200))
+    assert torch.equal(a.y0, b.y0) and torch.equal(a.y1, b.y1)
+    assert a.cond is not None and b.cond is not None
+    is_blank = (b.cond == CONDITIONS[name].blank).flatten(1).all(1)
+    assert 30 <= int(is_blank.sum()) <= 70
+    assert torch.equal(a.cond[~is_blank], b.cond[~is_blank])
+
+
+def test_view_dropout_leaves_one_view(tmp_path: Path) -> None:
+    cond = conditioned_batches(tmp_path, "camera", view_dropout=0.5)(range(60)).cond
+    assert cond is not None
+    left, right = (cond[..., :32] == 0).flatten(1).all(1), (cond[..., 32:] == 0).flatten(1).all(1)
+    assert 15 <= int(left.sum()) <= 45
+    assert not right.any()
+
+
+def test_a_cache_with_images_goes_on_and_refuses_others(tmp_path: Path) -> None:
+    scans = [some_scan(tmp_path, seed) for seed in range(3)]
+    others = {"camera": Other(CAMERA_SHAPE, lambda s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS))}
+    cache = cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others)
+    again = cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others)
+    assert np.array_equal(cache.fields["camera"], again.fields["camera"])
+    assert again.read([1])["camera"].dtype == torch.uint8
+    with pytest.raises(ConfigError, match=r"the cache of other data \(others differ\)"):
+        cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False)
+
+
+# --- guidance ---------------------------------------------------------------------------------------------------------
+
+
+def test_guidance_extrapolates_from_the_blank_condition() -> None:
+    calls = []
+
+    def velocity(y: Tensor, t: Tensor, c: Tensor) -> Tensor:
+        calls.append(len(y))
+        return y * t.view(-1, 1) + c.float() ** 2
+
+    y, t, cond, nothing = (
+        torch.randn(3, 2),
+        torch.rand(3),
+        torch.tensor([[1.0, 2], [3, 4], [5, 6]]),
+        torch.tensor([0.5, 1]),
+    )
+    with_condition, without = velocity(y, t, cond), velocity(y, t, nothing.expand(3, 2))
+    calls.clear()
+    for scale in (0.0, 1.5, 4.0):
+        out = guided(velocity, scale, nothing)(y, t, cond)
+        assert torch.allclose(out, without + scale * (with_condition - without), atol=1e-5)
+    assert calls == [6, 6, 6]
+    assert guided(velocity, 1.0, nothing) is velocity
+
+
+# --- CLIP ------------------------------------------------------------------------------------------------------------
+
+
+class Tower(nn.Module):
+    """What CLIP's vision tower looks like from outside: the mean colour of an image, 768 channels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(1))
+
+    def encode_image(self, x: Tensor) -> Tensor:
+        assert x.shape[1:] == (3, 224, 224)
+        return x.mean((1, 2, 3))[:, None].expand(-1, CLIP_WIDTH) * self.weight
+
+    def forward(self, pixel_values: Tensor) -> Any:
+        return SimpleNamespace(image_embeds=self.encode_image(pixel_values))
+
+
+@pytest.fixture
+def clip_libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """transformers and open_clip with a small tower; which one was asked, and for what."""
+    asked: list[str] = []
+
+    def from_pretrained(place: str, local_files_only: bool, use_safetensors: bool) -> Tower:
+        assert local_files_only and use_safetensors
+        asked.append(f"transformers {Path(place).name}")
+        return Tower()
+
+    def create_model(name: str, pretrained: str) -> Tower:
+        asked.append(f"open_clip {name} {Path(pretrained).name}")
+        return Tower()
+
+    holder = SimpleNamespace(CLIPVisionModelWithProjection=SimpleNamespace(from_pretrained=from_pretrained))
+    monkeypatch.setitem(sys.modules, "transformers", holder)
+    monkeypatch.setitem(sys.modules, "open_clip", SimpleNamespace(create_model=create_model))
+    frozen_clip.cache_clear()
+    yield asked
+    frozen_clip.cache_clear()
+
+
+@pytest.mark.parametrize("form", ["folder", "file"])
+def test_frozen_clip_tells_views_apart_and_only_the_rest_trains(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clip_libraries: list[str]
+) -> None:
+    place = tmp_path / ("clip" if form == "folder" else "clip.safetensors")
+    place.mkdir() if form == "folder" else place.write_bytes(b"")
+    monkeypatch.setenv(CLIP_VARIABLE, str(place))
+    net = build_network("clip_views", {"views": 2, "channels": 6})
+    assert {name for name, _ in net.named_parameters()} == {"view_embedding", "project.weight", "project.bias"}
+    image = torch.randint(0, 256, (3, 3, 224, 448), dtype=torch.uint8)
+    tokens = net(image)
+    assert tokens.shape == (3, 2, 6)
+    tokens.square().mean().backward()
+    assert all(p.grad is not None and p.grad.any() for p in net.parameters())
+    assert frozen_clip(str(place), "cpu").training is False
+    assert not any(p.requires_grad for p in frozen_clip(str(place), "cpu").parameters())
+    assert len(clip_libraries) == 1  # read once
+
+
+def test_without_clips_weights_or_library_it_is_said_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frozen_clip.cache_clear()
+    net, image = build_network("clip_views", {"views": 2}), torch.zeros(1, 3, 224, 448, dtype=torch.uint8)
+    monkeypatch.delenv(CLIP_VARIABLE, raising=False)
+    with pytest.raises(
+        FileError, match=r"LIDAR_SYNTH_CLIP is not set.*set LIDAR_SYNTH_CLIP to it; or train with .*'views'"
+    ):
+        net(image)
+    monkeypatch.setenv(CLIP_VARIABLE, str(tmp_path / "nowhere"))
+    with pytest.raises(FileError, match=r"LIDAR_SYNTH_CLIP=.*nowhere"):
+        net(image)
+    (tmp_path / "clip.pt").write_bytes(b"")
+    monkeypatch.setenv(CLIP_VARIABLE, str(tmp_path / "clip.pt"))
+    with pytest.raises(FileError, match=r"expected a folder, or a .safetensors file"):
+        net(image)
+    for place, library in ((tmp_path, "transformers"), (tmp_path / "clip.safetensors", "open_clip")):
+        (tmp_path / "clip.safetensors").write_bytes(b"")
+        monkeypatch.setenv(CLIP_VARIABLE, str(place))
+        monkeypatch.setitem(sys.modules, library, None)
+        with pytest.raises(LibraryError, match=rf"{library}\w* is not installed.*pip install {library}"):
+            net(image)

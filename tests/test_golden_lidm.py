@@ -1,0 +1,94 @@
+"""U-Net, autoencoder and label maps against the numbers that LiDM's own code gave for the same weights."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Part
+from lidar_synth.classes import IGNORE
+from lidar_synth.importers.lidm import codec_part, convert, unet_part
+from lidar_synth.importers.lidm_names import COND_STAGE, UNET
+from lidar_synth.nets.diffusion import DiffusionUNet
+from lidar_synth.nets.vqvae import VQVAE
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Small networks gain nothing from more threads, and wait for each other on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def distance(a: Tensor, b: Tensor) -> float:
+    """Relative in the l2 norm."""
+    return float((a - b).detach().norm() / b.norm())
+
+
+def read_golden(folder: Path, name: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
+    """What is known about it, its tensors, its weights."""
+    tensors = load_file(folder / f"{name}.safetensors")
+    weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}
+    return json.loads((folder / f"{name}.json").read_text()), tensors, weights
+
+
+def tolerance(figures: dict[str, float]) -> float:
+    return max(1e-5, 20 * figures["rel_l2"])
+
+
+@pytest.mark.parametrize("grad", [False, True], ids=["inference", "training"])
+@pytest.mark.parametrize("name", ["lidm_unet_tiny_uncond", "lidm_unet_tiny_context"])
+def test_golden_unet(golden: Path, name: str, grad: bool) -> None:
+    about, tensors, weights = read_golden(golden, name)
+    parts = {VELOCITY: unet_part(about["config"], name)}
+    net = cast(DiffusionUNet, convert({UNET + k: v for k, v in weights.items()}, parts)[VELOCITY])
+    assert sum(p.numel() for p in net.parameters()) == about["parameters"]
+    taps = {}
+    net.time.register_forward_hook(lambda _, __, out: taps.update(time_embedding=out))
+    net.middle[-1].register_forward_hook(lambda _, __, out: taps.update(middle=out))
+    with torch.set_grad_enabled(grad):
+        out = net.evaluate(tensors["input.x"], tensors["input.timesteps"], tensors.get("input.context"))
+    assert distance(out, tensors["output"]) < about["sensitivity"]["suggested_rel_l2_tolerance"]
+    assert set(taps) == {"time_embedding", "middle"}
+    for tap, value in taps.items():
+        assert distance(value, tensors[f"tap.{tap}"]) < 5e-5, tap
+
+
+@torch.no_grad()
+def test_golden_autoencoder(golden: Path) -> None:
+    about, tensors, weights = read_golden(golden, "lidm_vqvae_tiny")
+    net = cast(VQVAE, convert(weights, {CODEC: codec_part(about["config"], about["size"], "")})[CODEC])
+    assert sum(p.numel() for p in net.parameters()) == about["parameters"]
+    figures = about["f32_vs_f64"]
+    latent = net.encode(tensors["input.x"])
+    assert distance(latent, tensors["latent"]) < tolerance(figures["latent"])
+    quantised, index = net.codebook(latent)
+    assert torch.equal(index.flatten(), tensors["indices"])
+    assert distance(quantised, tensors["quantised"]) < 1e-6
+    assert distance(net.decode(latent), tensors["output"]) < tolerance(figures["output_without_quantiser"])
+    plain = net._decode(tensors["latent"])
+    assert distance(plain, tensors["output_without_quantiser"]) < tolerance(figures["output_without_quantiser"])
+    gaps = net(tensors["input.x"])
+    torch.testing.assert_close(gaps.gap + 0.25 * gaps.code_gap, tensors["codebook_loss"], rtol=1e-4, atol=0)
+
+
+@torch.no_grad()
+def test_golden_label_map(golden: Path) -> None:
+    """Their unlabelled is 0 and their classes begin at 1; ours are 255 and 0."""
+    about, tensors, weights = read_golden(golden, "lidm_spatial_rescaler")
+    theirs = tensors["input.labels"]
+    assert len(theirs.unique()) == about["config"]["in_channels"]
+    labels = torch.where(theirs == 0, IGNORE, theirs.int() - 1).to(torch.uint8)
+    arguments = {"resolution": [64, 256], "target": [16, 32], "channels": 8}
+    encoder = convert({COND_STAGE + k: v for k, v in weights.items()}, {ENCODER: Part("semantic_map", arguments)})[
+        ENCODER
+    ]
+    assert encoder.halvings == [tuple(s) for s in about["config"]["strides"]]
+    assert distance(encoder(labels), tensors["output"]) < tolerance(about["f32_vs_f64"])

@@ -1,0 +1,289 @@
+"""LiDM's released files as checkpoints: small ones end to end, the published ones by all their keys."""
+
+import copy
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file
+from torch import Tensor
+from typer.testing import CliRunner
+
+from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint
+from lidar_synth.errors import DataError, FileError
+from lidar_synth.generator import load_generator
+from lidar_synth.importers.lidm import read_lidm
+from lidar_synth.importers.lidm_names import FIRST_STAGE, UNET, UNET_EMA, peer_names
+from lidar_synth.nets import build_network
+from lidar_synth.nets.diffusion import schedule_times
+
+DDCONFIG = {"double_z": False, "z_channels": 4, "in_channels": 1, "out_ch": 1, "ch": 8, "ch_mult": [1, 2],
+            "strides": [[2, 2]], "num_res_blocks": 1, "attn_levels": [], "dropout": 0.0}  # fmt: skip
+FIRST = {"embed_dim": 4, "n_embed": 16, "lib_name": "lidm", "use_mask": False, "ddconfig": DDCONFIG}
+UNET_PARAMS = {"image_size": [4, 16], "in_channels": 4, "out_channels": 4, "model_channels": 16,
+               "attention_resolutions": [2, 1], "num_res_blocks": 1, "channel_mult": [1, 2], "num_head_channels": 8,
+               "lib_name": "lidm"}  # fmt: skip
+DATASET = {"size": [8, 32], "fov": [3, -25], "depth_range": [1.0, 56.0], "depth_scale": 56, "log_scale": False}
+UNCONDITIONAL = {"linear_start": 0.0015, "linear_end": 0.0195, "timesteps": 1000,
+                 "first_stage_config": {"params": FIRST}, "unet_config": {"params": UNET_PARAMS},
+                 "cond_stage_config": "__is_unconditional__"}  # fmt: skip
+SEMANTIC = UNCONDITIONAL | {
+    "unet_config": {"params": UNET_PARAMS | {"in_channels": 7}},
+    "cond_stage_config": {
+        "target": "lidm.modules.encoders.modules.SpatialRescaler",
+        "params": {"strides": [[2, 2]], "in_channels": 20, "out_channels": 3},
+    },
+}
+CAMERA = UNCONDITIONAL | {
+    "unet_config": {"params": UNET_PARAMS | {"use_spatial_transformer": True, "context_dim": 12}},
+    "cond_stage_config": {
+        "target": "lidm.modules.encoders.modules.FrozenClipMultiImageEmbedder",
+        "params": {"model": "ViT-L/14", "out_dim": 12, "split_per_view": 4},
+    },
+}
+MODELS = {"first stage": FIRST, "unconditional": UNCONDITIONAL, "semantic": SEMANTIC, "camera": CAMERA}
+
+
+def config_of(model: dict[str, Any], target: str = "lidm.data.kitti.KITTI360Train", **dataset: Any) -> dict[str, Any]:
+    data = {"dataset": DATASET | dataset, "aug": {"camera_drop": 0.5}, "train": {"target": target}}
+    return copy.deepcopy({"model": {"target": "some.Model", "params": model}, "data": {"params": data}})
+
+
+def schedule(start: float = 0.0015, end: float = 0.0195) -> dict[str, Tensor]:
+    times = schedule_times(start, end, 1000)
+    signal = ((1 - times) ** 2 / ((1 - times) ** 2 + times**2)).float()
+    return {"betas": torch.zeros(1000), "alphas_cumprod": signal, "logvar": torch.zeros(1000)}
+
+
+def random_weights(model: dict[str, Any], folder: Path) -> dict[str, Tensor]:
+    """Of random numbers, in the shapes that the peer has; its attention's projections are convolutions."""
+    from lidar_synth.importers.lidm import _parts
+
+    torch.manual_seed(0)
+    parts = _parts(model, DATASET, {}, folder)[0]
+    nested, weights = set(parts) != {CODEC}, schedule() if model is not FIRST else {}
+    for name, part in parts.items():
+        state = build_network(*part).state_dict()
+        for ours, theirs in peer_names(name, part, nested).items():
+            shape = [state[ours].shape[0] // len(theirs), *state[ours].shape[1:]]
+            if ours == "view_embedding":
+                shape = [1, *shape]
+            if name == CODEC and ".middle.1." in ours and len(shape) == 2:
+                shape += [1, 1]
+            elif name == VELOCITY and theirs[0].endswith(("1.qkv.weight", "1.proj_out.weight", "1.proj_in.weight")):
+                shape += [1, 1] if part.arguments["context_channels"] else [1]
+            weights |= {one: torch.randn(shape) * 0.1 for one in theirs}
+    if nested:
+        for key in [k for k in weights if k.startswith(UNET)]:
+            weights[UNET_EMA + key.removeprefix("model.").replace(".", "")] = torch.randn_like(weights[key]) * 0.1
+        weights |= {f"{UNET_EMA}decay": torch.tensor(0.9999), f"{UNET_EMA}num_updates": torch.tensor(7)}
+    if model is CAMERA:
+        weights["cond_stage_model.model.visual.proj"] = torch.zeros(3, 3)  # frozen CLIP, which is not ours to keep
+    return weights
+
+
+def release(folder: Path, config: dict[str, Any], weights: dict[str, Tensor]) -> Path:
+    """A release as a user downloads it, with what training left in it."""
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    optimizer = {"state": {0: {"step": 1, "exp_avg": torch.zeros(3)}}, "param_groups": [{"lr": 1e-6}]}
+    torch.save(
+        {"epoch": 3, "global_step": 9, "state_dict": weights, "optimizer_states": [optimizer]}, folder / "model.ckpt"
+    )
+    return folder / "model.ckpt"
+
+
+def run_import(path: Path, out: Path) -> str:
+    from lidar_synth.cli import app
+
+    result = CliRunner().invoke(app, ["import", str(path), str(out), "--peer", "lidm"])
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_release_becomes_a_checkpoint(name: str, tmp_path: Path) -> None:
+    weights = random_weights(MODELS[name], tmp_path) | {"loss.discriminator.main.0.weight": torch.zeros(4)}
+    path = release(tmp_path, config_of(MODELS[name]), weights)
+    out = tmp_path / "out.safetensors"
+    said = run_import(path, out)
+    header, networks, digest = load_checkpoint(out)
+    assert digest in said
+    expected = {
+        "first stage": {CODEC}, "unconditional": {VELOCITY, CODEC},
+        "semantic": {VELOCITY, CODEC, ENCODER}, "camera": {VELOCITY, CODEC, ENCODER},
+    }  # fmt: skip
+    assert set(networks) == expected[name]
+    assert (header.channels, header.sensor.shape, header.sensor.range_max) == (("range",), (8, 32), 56.0)
+    assert (header.normalisation.kind, header.normalisation.divisor) == ("linear", 56.0)
+    assert list(header.conditioning) == ([name] if name in ("semantic", "camera") else [])
+    assert header.provenance["data"] == "KITTI-360"
+    if VELOCITY in networks:  # the averaged weights are taken, not the last ones
+        head = networks[VELOCITY].state_dict()["head.bias"]
+        assert torch.equal(head, weights[f"{UNET_EMA}diffusion_modelout2bias"])
+
+
+def test_imported_models_generate(tmp_path: Path) -> None:
+    for name, condition in (("unconditional", None), ("semantic", torch.full((8, 32), 3, dtype=torch.uint8))):
+        folder = tmp_path / name
+        folder.mkdir()
+        out = folder / f"{name}.safetensors"
+        run_import(release(folder, config_of(MODELS[name]), random_weights(MODELS[name], folder)), out)
+        generator = load_generator(out)
+        [scan] = generator.scans(0, [1], condition, steps=3)
+        assert scan.id == f"{name}/0/1"
+        assert (scan.label is None) == (condition is None)
+
+
+def test_other_configurations(tmp_path: Path) -> None:
+    config = config_of(FIRST, "lidm.data.kitti.SemanticKITTITrain", log_scale=True, depth_scale=5.84)
+    header, _ = read_lidm(release(tmp_path, config, random_weights(FIRST, tmp_path)))
+    assert header.provenance["data"] == "SemanticKITTI"
+    assert (header.normalisation.kind, header.normalisation.divisor, header.normalisation.offset) == (
+        "log",
+        5.84,
+        1.0001,
+    )
+
+
+def test_weights_without_an_average_are_taken_as_they_are(tmp_path: Path) -> None:
+    weights = {k: v for k, v in random_weights(UNCONDITIONAL, tmp_path).items() if not k.startswith(UNET_EMA)}
+    _, networks = read_lidm(release(tmp_path, config_of(UNCONDITIONAL), weights))
+    assert torch.equal(networks[VELOCITY].state_dict()["head.bias"], weights[f"{UNET}out.2.bias"])
+
+
+# --- the published networks ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["vqvae", "uncond", "sem2lidar", "cam2lidar"])
+def test_all_keys_of_the_published_networks(name: str, golden: Path, tmp_path: Path) -> None:
+    """Up to 395 M parameters by name and shape; one number stands for each tensor."""
+    published = json.loads((golden / f"lidm_{name}_full_keys.json").read_text())
+    zero = torch.zeros(())
+    weights = {key: zero.expand(shape) for key, shape, *_ in published["keys"] if not key.startswith(UNET_EMA)}
+    if name != "vqvae":
+        start, end = (published["config"][key] for key in ("linear_start", "linear_end"))
+        weights |= schedule(start, end)
+        for key in [k for k in weights if k.startswith(UNET)]:
+            weights[UNET_EMA + key.removeprefix("model.").replace(".", "")] = weights[key]
+        weights |= {f"{UNET_EMA}decay": zero, f"{UNET_EMA}num_updates": torch.tensor(0)}
+        assert sum(k.startswith(UNET_EMA) for k in weights) == published["groups"]["model_ema"]["tensors"]
+    config = config_of(published["config"], size=[64, 1024])
+    header, networks = read_lidm(release(tmp_path, config, weights))
+    count = {part: sum(p.numel() for p in network.parameters()) for part, network in networks.items()}
+    if name == "vqvae":
+        assert count == {CODEC: published["parameters"]}
+    else:
+        assert count[VELOCITY] == published["unet_parameters"]
+        assert count[CODEC] == published["groups"]["first_stage_model"]["elements"]
+    assert header.sensor.shape == (64, 1024)
+
+
+# --- files that do not fit -------------------------------------------------------------------------------------------
+
+
+def drop(weights: dict[str, Tensor]) -> None:
+    del weights[f"{FIRST_STAGE}decoder.up.1.block.0.norm1.bias"]
+
+
+def drop_average(weights: dict[str, Tensor]) -> None:
+    del weights[f"{UNET_EMA}diffusion_modelout2bias"]
+
+
+def add(weights: dict[str, Tensor]) -> None:
+    weights["model.extra.weight"] = torch.zeros(2)
+
+
+def reshape(weights: dict[str, Tensor]) -> None:
+    weights[f"{FIRST_STAGE}quantize.embedding.weight"] = torch.zeros(8, 4)
+
+
+def rescale(weights: dict[str, Tensor]) -> None:
+    weights["scale_factor"] = torch.tensor(0.18)
+
+
+def reschedule(weights: dict[str, Tensor]) -> None:
+    weights |= schedule(end=0.012)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (drop, r"missing keys \['first_stage_model.decoder.up.1.block.0.norm1.bias'\], unexpected keys \[\]"),
+        (drop_average, r"missing keys \['model.diffusion_model.out.2.bias'\]"),
+        (add, r"missing keys \[\], unexpected keys \['model.extra.weight'\]"),
+        (reshape, r"other shapes: codebook.codes \(8, 4\) for \(16, 4\)"),
+        (rescale, r"latents scaled by 0.18"),
+        (reschedule, r"another schedule of noise than its config.yaml"),
+    ],
+)
+def test_weights_that_do_not_fit(spoil: Callable[[dict[str, Tensor]], None], message: str, tmp_path: Path) -> None:
+    weights = random_weights(UNCONDITIONAL, tmp_path)
+    spoil(weights)
+    with pytest.raises(DataError, match=message) as caught:
+        read_lidm(release(tmp_path, config_of(UNCONDITIONAL), weights))
+    assert "model.ckpt" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (FIRST | {"use_mask": True}, "an autoencoder with"),
+        (FIRST | {"ddconfig": DDCONFIG | {"attn_levels": [1]}}, r"an autoencoder with \{'attn_levels': \[1\]\}"),
+        (UNCONDITIONAL | {"unet_config": {"params": UNET_PARAMS | {"lib_name": "ldm"}}}, "a U-Net with"),
+        (UNCONDITIONAL | {"cond_stage_config": {"target": "x.FrozenCLIPTextEmbedder"}}, "by FrozenCLIPTextEmbedder"),
+        ({"linear_start": 1}, "KeyError.'first_stage_config'"),
+    ],
+)
+def test_configurations_that_do_not_fit(model: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=message):
+        read_lidm(release(tmp_path, config_of(model), {}))
+
+
+def test_the_configuration_has_to_lie_beside(tmp_path: Path) -> None:
+    path = release(tmp_path, config_of(FIRST), random_weights(FIRST, tmp_path))
+    (tmp_path / "config.yaml").write_text("[")
+    with pytest.raises(DataError, match=r"config.yaml is not YAML"):
+        read_lidm(path)
+    (tmp_path / "config.yaml").unlink()
+    with pytest.raises(FileError, match=r"config.yaml cannot be read"):
+        read_lidm(path)
+
+
+class Evil:
+    """Leaves a trace where it is unpickled."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.trace),)
+
+
+def test_code_in_a_pickle_does_not_run(tmp_path: Path) -> None:
+    path = release(tmp_path, config_of(FIRST), {})
+    torch.save({"state_dict": {}, "callbacks": Evil(tmp_path / "ran")}, path)
+    with pytest.raises(DataError, match=r"calls for \w+\.mkdir .*was not loaded"):
+        read_lidm(path)
+    assert not (tmp_path / "ran").exists()
+    torch.save([1], path)
+    with pytest.raises(DataError, match="state_dict among its keys"):
+        read_lidm(path)
+
+
+def test_golden_through_file_and_checkpoint(golden: Path, tmp_path: Path) -> None:
+    """.ckpt -> import -> checkpoint -> autoencoder gives the peer's own numbers."""
+    about = json.loads((golden / "lidm_vqvae_tiny.json").read_text())
+    tensors = load_file(golden / "lidm_vqvae_tiny.safetensors")
+    weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}
+    out = tmp_path / "codec.safetensors"
+    run_import(release(tmp_path, config_of(about["config"], size=about["size"]), weights), out)
+    codec: Any = load_checkpoint(out).networks[CODEC]
+    with torch.no_grad():
+        error = (codec.decode(codec.encode(tensors["input.x"])) - tensors["output"]).norm() / tensors["output"].norm()
+    assert float(error) < 6e-5

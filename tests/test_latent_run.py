@@ -1,0 +1,302 @@
+"""The latent path from configurations: autoencoder, conditioned teacher, student, scans; by the commands of pixels."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from accelerate.state import AcceleratorState
+from conftest import random_scan
+from PIL import Image
+from typer.testing import CliRunner
+
+from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint, read_header
+from lidar_synth.cli import app
+from lidar_synth.cli.plan import make_plan, open_data
+from lidar_synth.config import DistillConfig, load_config
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.formats import WRITERS
+from lidar_synth.generator import load_generator
+from lidar_synth.sensor import Sensor
+
+SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+RECIPE = {"iterations": 8, "batch": 4, "warmup": 2, "rate": 1e-3, "ema_every": 1}
+CODEC_NETWORK = {
+    "architecture": "vqvae",
+    "arguments": {
+        "latent_channels": 4, "codes": 16, "codebook": "ema", "width": 8, "multipliers": [1, 2], "strides": [[1, 2]],
+        "blocks": 1, "attention": False, "patch": [2, 2], "groups": 4,
+    },
+}  # fmt: skip
+UNET = {
+    "architecture": "unet",
+    "arguments": {
+        "width": 16, "multipliers": [1, 2], "blocks": 1, "attention": [1], "head_channels": 8, "groups": 4,
+    },
+}  # fmt: skip
+SEMANTIC = {"kind": "semantic", "arguments": {"channels": 3, "method": "patches"}, "dropout": 0.2}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+    AcceleratorState._reset_state(True)
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of small labelled scans, and the sensor's file."""
+    folder = tmp_path_factory.mktemp("scans")
+    writer = WRITERS["npz"](folder / "scans")
+    for i in range(5):
+        writer.write(random_scan(SENSOR, 400, i), i)
+    values = SENSOR.to_dict()
+    (folder / "sensor.yaml").write_text(yaml.safe_dump({values.pop("name"): values}))
+    return folder
+
+
+def write_config(scans: Path, folder: Path, name: str, **values: Any) -> Path:
+    config = {
+        "output": str(folder / name),
+        "licence": "MIT",
+        "data": {"licence": "none", "path": str(scans / "scans"), "flip": True} | values.pop("data", {}),
+        "recipe": RECIPE | values.pop("recipe", {}),
+        "save_every": 4,
+        "samples": {"every": 0},
+    }
+    if "teacher" not in values and "codec" not in values:
+        config |= {"sensor": str(scans / "sensor.yaml"), "channels": ["range", "reflectance", "label"]}
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(config | values))
+    return path
+
+
+def call(*arguments: str | Path) -> str:
+    """The command line in this process; errors come out as they are."""
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.fixture(scope="module")
+def codec(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("codec")
+    losses = {"geometric": 1.0, "adversarial": 0.1, "discriminator_width": 4}
+    config = write_config(
+        scans,
+        folder,
+        "codec",
+        network=CODEC_NETWORK,
+        losses=losses,
+        samples={"every": 8, "count": 2},
+        recipe={"metric": "l1"},
+    )
+    call("train", config)
+    assert (folder / "codec" / "samples" / "0000008.png").exists()
+    return folder / "codec" / "codec.safetensors"
+
+
+@pytest.fixture(scope="module")
+def teacher(scans: Path, codec: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("teacher")
+    values = {"network": UNET, "condition": SEMANTIC, "steps": 5, "samples": {"every": 8, "count": 2}}
+    call("train", write_config(scans, folder, "teacher", codec=str(codec), **values))
+    assert (folder / "teacher" / "samples" / "0000008.png").exists()
+    return folder / "teacher" / "teacher.safetensors"
+
+
+def test_an_autoencoder_is_a_checkpoint_without_a_flow(codec: Path) -> None:
+    header, networks, _ = load_checkpoint(codec)
+    assert set(networks) == {CODEC}
+    assert header.channels == ("range", "reflectance", "label")
+    assert float(networks[CODEC].scale.mean()) != 1  # type: ignore[arg-type, union-attr]  # the latents' statistics
+    with pytest.raises(DataError, match="is an autoencoder; expected a model that generates"):
+        load_generator(codec)
+
+
+def test_a_latent_model_of_label_maps_generates(codec: Path, teacher: Path) -> None:
+    header, networks, _ = load_checkpoint(teacher)
+    assert set(networks) == {VELOCITY, CODEC, ENCODER}
+    assert header.networks[VELOCITY].arguments["channels"] == 4
+    assert header.networks[VELOCITY].arguments["resolution"] == [4, 8]
+    assert header.networks[VELOCITY].arguments["condition_channels"] == 3
+    assert header.conditioning == {"semantic": {"dropout": 0.2}}
+    assert header.provenance["codec"] == load_checkpoint(codec).hash
+    for a, b in zip(networks[CODEC].parameters(), load_checkpoint(codec).networks[CODEC].parameters(), strict=True):
+        assert torch.equal(a, b)  # it is frozen
+    generator = load_generator(teacher)
+    real = random_scan(SENSOR, 400, 9)
+    [scan] = generator.scans(3, [1], real)
+    [guided] = generator.scans(3, [1], real, guidance=2.0)
+    assert (scan.id, scan.sensor) == ("teacher/3/1", SENSOR)
+    assert scan.label is not None and scan.confidence is not None  # of its own: the tensor carries labels
+    assert len(scan) > 0 and not np.array_equal(scan.points, guided.points)
+    together = torch.cat(list(replace(generator, batch=2).samples(3, [5, 1], real)))
+    [alone] = generator.samples(3, [1], real)
+    assert torch.allclose(together[1], alone[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("guidance", [1.0, 2.0])
+def test_it_is_distilled_on_timesteps_selected_with_its_conditions(
+    guidance: float, scans: Path, teacher: Path, tmp_path: Path
+) -> None:
+    selection = {"candidates": 8, "trajectories": 3}
+    config = write_config(
+        scans, tmp_path, "student", teacher=str(teacher), steps=2, selection=selection, guidance=guidance
+    )
+    call("distill", config)
+    header, _ = read_header(tmp_path / "student" / "student.safetensors")
+    with np.load(tmp_path / "student" / "selection.npz") as found:
+        assert header.time_grid == tuple(found["grid"]) and len(header.time_grid) == 5
+    [scan] = load_generator(tmp_path / "student" / "student.safetensors").scans(0, [0], random_scan(SENSOR, 400, 1))
+    assert len(scan) > 0
+    call("distill", config, "--resume", "recipe.iterations=10")
+    assert read_header(tmp_path / "student" / "student.safetensors")[0].provenance["iterations"] == 10
+
+
+def test_runs_go_on_as_if_nothing_had_happened(scans: Path, codec: Path, tmp_path: Path) -> None:
+    """A codebook of moving averages, a discriminator and a condition's encoder are part of what is saved."""
+    kinds = {
+        "autoencoder": {"network": CODEC_NETWORK, "losses": {"adversarial": 0.1, "discriminator_width": 4}},
+        "flow": {"network": UNET, "condition": SEMANTIC, "codec": str(codec)},
+    }
+    for name, values in kinds.items():
+        whole = write_config(scans, tmp_path, f"{name}_whole", **values)
+        parts = write_config(scans, tmp_path, f"{name}_parts", **values)
+        call("train", whole)
+        call("train", parts, "--minutes", "0")
+        call("train", parts, "--resume")
+        a, b = (load_checkpoint(tmp_path / p.stem / f"{p.stem}.safetensors") for p in (whole, parts))
+        for part, network in a.networks.items():
+            other = b.networks[part].state_dict()
+            assert all(torch.equal(value, other[key]) for key, value in network.state_dict().items()), (name, part)
+
+
+def test_fine_tuning_a_latent_model(scans: Path, teacher: Path, codec: Path, tmp_path: Path) -> None:
+    config = write_config(scans, tmp_path, "more", network=UNET, recipe={"iterations": 1, "rate": 1e-9})
+    values = yaml.safe_load(config.read_text())
+    for key in ("sensor", "channels", "network"):
+        del values[key]  # they are the checkpoint's
+    config.write_text(yaml.safe_dump(values | {"init": str(teacher)}))
+    call("train", config)
+    start, end = load_checkpoint(teacher), load_checkpoint(tmp_path / "more" / "more.safetensors")
+    assert set(end.networks) == set(start.networks)
+    assert end.header.conditioning == start.header.conditioning
+    for part in start.networks:
+        for a, b in zip(start.networks[part].parameters(), end.networks[part].parameters(), strict=True):
+            assert torch.allclose(a, b, atol=1e-6)
+    with pytest.raises(ConfigError, match="expected a checkpoint of the same kind"):
+        call("train", config, f"init={codec}", f"output={tmp_path / 'other'}")
+
+
+def test_a_pixel_model_of_label_maps(scans: Path, tmp_path: Path) -> None:
+    """The condition does not care for the codec."""
+    network = {"architecture": "hdit", "arguments": {
+        "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2], "patch": [2, 2], "window": [3, 3],
+    }}  # fmt: skip
+    call(
+        "train",
+        write_config(scans, tmp_path, "pixel", network=network, condition=SEMANTIC, channels=["range"], steps=3),
+    )
+    generator = load_generator(tmp_path / "pixel" / "pixel.safetensors")
+    [scan] = generator.scans(0, [0], random_scan(SENSOR, 400, 1))
+    assert generator.fields == {"label", "confidence"}
+    assert scan.label is not None
+
+
+def test_a_latent_transformer(scans: Path, codec: Path, tmp_path: Path) -> None:
+    """Any velocity network lives on latents, which look where their cells look."""
+    network = {"architecture": "hdit", "arguments": {
+        "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2], "patch": [1, 1], "window": [3, 3],
+    }}  # fmt: skip
+    call("train", write_config(scans, tmp_path, "latent", network=network, codec=str(codec), steps=3))
+    [scan] = load_generator(tmp_path / "latent" / "latent.safetensors").scans(0, [0])
+    assert scan.label is not None
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """KITTI-360's layout with scans and images."""
+    folder = tmp_path_factory.mktemp("kitti360")
+    writer: Any = WRITERS["kitti360"](folder)
+    for i in range(3):
+        image = np.random.default_rng(i).integers(0, 256, (40, 80, 3), dtype=np.uint8)
+        writer.write(random_scan(SENSOR, 400, i), i, image=image)
+    writer.finish()
+    return folder
+
+
+def test_a_camera_model(scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
+    condition = {
+        "kind": "camera", "dropout": 0.1, "view_dropout": 0.5, "image": [40, 80],
+        "arguments": {"resolution": [16, 32], "views": 2, "channels": 8, "widths": [4, 8]},
+    }  # fmt: skip
+    config = write_config(scans, tmp_path, "camera", network=UNET, condition=condition, codec=str(codec), steps=3,
+                          data={"path": str(kitti), "layout": "kitti360", "split": "all"})  # fmt: skip
+    call("train", config)
+    generator = load_generator(tmp_path / "camera" / "camera.safetensors")
+    images = sorted(kitti.rglob("*.png"))
+    given = np.asarray(Image.open(images[0]).resize((32, 16), Image.Resampling.BICUBIC)).transpose(2, 0, 1)
+    [scan] = generator.scans(0, [0], given.copy())
+    [same] = generator.scans(0, [0], replace(random_scan(SENSOR, 400, 0), image_path=images[0]))
+    assert np.allclose(scan.points, same.points)
+    with pytest.raises(ConfigError, match="roll with the condition 'camera'"):
+        call("train", config, "data.roll=true", f"output={tmp_path / 'rolled'}")
+
+
+def test_what_does_not_fit_together(scans: Path, codec: Path, teacher: Path, tmp_path: Path) -> None:
+    def refuse(message: str, *overrides: str, **values: Any) -> None:
+        with pytest.raises(ConfigError, match=message):
+            call("train", write_config(scans, tmp_path, "bad", **({"network": UNET} | values)), *overrides)
+
+    refuse("an autoencoder with a codec or a condition", network=CODEC_NETWORK, condition=SEMANTIC)
+    refuse("of a latent model", codec=str(codec), recipe={"weights": {"label": 0.5}})
+    refuse(f"channels .*expected that of {codec}", codec=str(codec), channels=["range"])
+    refuse("expected the checkpoint of an autoencoder", codec=str(pixel_checkpoint(tmp_path)))
+    refuse("unknown key 'condition.colour'", condition=SEMANTIC | {"colour": 1})
+    refuse("one of semantic_map", condition=SEMANTIC | {"encoder": "views"})
+    refuse(r"network.arguments with \['condition_channels'\]", condition=SEMANTIC,
+           network={"architecture": "unet", "arguments": UNET["arguments"] | {"condition_channels": 3}})  # fmt: skip
+    refuse(
+        "unexpected keyword argument 'context_channels'", condition={"kind": "camera"}, network={"architecture": "hdit"}
+    )
+    student = write_config(scans, tmp_path, "student", teacher=str(codec))
+    with pytest.raises(ConfigError, match="an autoencoder; expected a model that generates"):
+        call("distill", student)
+    with pytest.raises(ConfigError, match="of a latent model"):
+        call("distill", student, f"teacher={teacher}", "recipe.weights={range: 2.0}")
+
+
+def pixel_checkpoint(folder: Path) -> Path:
+    from test_checkpoint import HEADER, network
+
+    from lidar_synth.checkpoint import save_checkpoint
+
+    path = folder / "pixel.safetensors"
+    save_checkpoint(path, HEADER, {VELOCITY: network()})
+    return path
+
+
+def test_conditions_reach_the_batches_of_teacher_and_student(scans: Path, teacher: Path, tmp_path: Path) -> None:
+    from accelerate import Accelerator
+
+    accelerator = Accelerator(cpu=True)
+    config = load_config(DistillConfig, write_config(
+        scans, tmp_path, "student", teacher=str(teacher), grid=[1, 0.5, 0], intervals=2, steps=1,
+    ))  # fmt: skip
+    plan = make_plan(config, accelerator)
+    data = open_data(config, plan, accelerator.device)
+    batch = data(range(3))
+    assert batch.y0.shape == (3, 4, 4, 8) == batch.y1.shape
+    assert batch.cond is not None and batch.cond.shape == (3, 8, 32)
+    example = plan.task(batch)
+    assert example.cond is batch.cond

@@ -1,0 +1,73 @@
+"""How fast the networks of LiDAR-Flow's latent models are at full size, beside a plain large matrix product.
+
+    python tools/bench/latent.py [--rounds N] [--threads N] [--busy]
+
+LiDM's U-Net (257.8 M parameters, 171.7 GFLOP) on a latent of 8 x 16 x 128, its autoencoder (15.1 M; 93 GFLOP to encode
+and 120 to decode) at 64 x 1024, and the small ones of configs/town_*.yaml. Random weights. Everything takes turns with
+everything else. With --busy processor time is counted in place of the clock's, for a machine that does other things.
+"""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from timing import print_table, time_in_turns
+from torch import nn
+
+from lidar_synth.nets import assemble, build_network
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def network(architecture: str, **arguments: Any) -> Any:
+    """With fresh weights, laid out in memory as a checkpoint's are."""
+    torch.manual_seed(0)
+    fresh: nn.Module = build_network(architecture, arguments)
+    return assemble(architecture, arguments, fresh.state_dict(), architecture)
+
+
+def small(name: str) -> dict[str, Any]:
+    """The arguments of a configuration's network."""
+    arguments: dict[str, Any] = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())["network"]["arguments"]
+    return arguments
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--busy", action="store_true", help="count processor time")
+    given = parser.parse_args()
+    torch.set_num_threads(given.threads)
+    full, codec = network("unet", resolution=(16, 128)), network("vqvae", resolution=(64, 1024))
+    town = network("vqvae", resolution=(64, 1024), channels=7, **small("town_codec"))
+    town_flow = network(
+        "unet", resolution=town.latent_shape[1:], channels=town.latent_shape[0], condition_channels=32,
+        **small("town_semantic_teacher"),
+    )  # fmt: skip
+    a = torch.randn(4096, 4096)
+    image, latent = torch.randn(1, 1, 64, 1024), torch.randn(1, 8, 16, 128)
+    town_image, town_latent = torch.randn(1, 7, 64, 1024), torch.randn(1, *town.latent_shape)
+    maps = torch.randn(1, 32, *town.latent_shape[1:])
+    calls = {
+        "product of 4096 x 4096 (137 GFLOP)": lambda: a @ a,
+        "LiDM's U-Net, one evaluation": lambda: full(latent, 0.5),
+        "LiDM's autoencoder, encode": lambda: codec.encode(image),
+        "LiDM's autoencoder, decode": lambda: codec.decode(latent),
+        "town's U-Net, one evaluation": lambda: town_flow(town_latent, 0.5, maps),
+        "town's autoencoder, encode": lambda: town.encode(town_image),
+        "town's autoencoder, decode": lambda: town.decode(town_latent),
+    }
+    with torch.inference_mode():
+        seconds = time_in_turns(calls, given.rounds, time.process_time if given.busy else time.perf_counter)
+    what = "processor time" if given.busy else "wall time"
+    title = f"Latent models on the CPU, {given.threads} threads, float32, batch 1, {what}; torch {torch.__version__}"
+    print_table(title, seconds, next(iter(calls)))
+
+
+if __name__ == "__main__":
+    main()

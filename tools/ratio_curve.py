@@ -1,0 +1,93 @@
+"""Does it help, and how much of it? mIoU of a segmenter over the share of synthetic scans in its training.
+
+    python tools/ratio_curve.py [ROOT] [--model town] [--labelled 40] [--epochs 20] [--seeds 3] [--plot OUT.png]
+
+A few labelled scans of the town (or of ROOT, SemanticKITTI for instance) are given in every epoch; synthetic scans are
+added until they make 10, 25 and 50 % of the samples, so that these runs take more iterations. "real, as long" trains
+on the real scans alone for as many iterations as the longest of them. Every row is run with several seeds of the
+weights, the order and the choice of synthetic scans; held out is another town (or the split val of ROOT).
+"""
+
+import argparse
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from tqdm import tqdm
+from train_segmenter import fit, town
+
+from lidar_synth import MixedScans, Scan, Source, load_generator, open_scans
+from lidar_synth.files import write_file
+from lidar_synth.metrics.segmentation import class_ious, mean_iou
+
+RATIOS = (0.0, 0.1, 0.25, 0.5)
+BATCH = 4
+
+
+def run(real: Source, synthetic: list[Scan], ratio: float, steps: int, held_out: Source, seed: int) -> np.ndarray:
+    """The confusion of one training."""
+    # Of the synthetic scans, every seed gets others.
+    apart = np.random.default_rng(seed).permutation(len(synthetic))
+    source = [synthetic[i] for i in apart] if ratio else None
+    mixed = MixedScans(real, source, ratio, seed=seed, collate="range")
+    _, table = fit(mixed, held_out, steps, BATCH, 0, seed)
+    return table
+
+
+def plot(path: Path, rows: dict[str, list[float]]) -> None:
+    """Means and spreads."""
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
+    for place, (_, values) in enumerate(rows.items()):
+        axes.errorbar(place, 100 * np.mean(values), 100 * np.std(values), fmt="o", capsize=4, color="tab:blue")
+        axes.plot([place] * len(values), 100 * np.asarray(values), ".", color="tab:gray", alpha=0.7)
+    axes.set_xticks(range(len(rows)), rows)
+    axes.set_ylabel("mIoU on held-out scans, %")
+    axes.grid(axis="y", alpha=0.3)
+    write_file(path, lambda file: figure.savefig(file, format="png", dpi=110))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("root", nargs="?", help="a labelled dataset; without it the town")
+    parser.add_argument("--model", default="town")
+    parser.add_argument("--labelled", type=int, default=40, help="real scans that are trained on")
+    parser.add_argument("--held-out", type=int, default=200)
+    parser.add_argument("--epochs", type=int, default=20, help="over the real scans")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--plot", type=Path)
+    given = parser.parse_args()
+
+    if given.root:
+        source, other = open_scans(given.root, split="train"), open_scans(given.root, split="val")
+        real = [source[int(i)] for i in np.linspace(0, len(source) - 1, given.labelled)]
+        held_out = [other[int(i)] for i in np.linspace(0, len(other) - 1, given.held_out)]
+    else:
+        # Twenty neighbouring scans share a stretch of road: few scans, but of many stretches.
+        real, held_out = town(0, 10 * given.labelled)[::10], town(1, given.held_out)
+    generator, needed = load_generator(given.model), 10 * given.labelled
+    synthetic = [generator.scans(0, [i])[0] for i in tqdm(range(needed), desc="synthetic", unit="scan")]
+    steps = {ratio: round(given.epochs * given.labelled / (1 - ratio) / BATCH) for ratio in RATIOS}
+    settings = {f"{100 * ratio:.0f} %": (ratio, steps[ratio]) for ratio in RATIOS}
+    settings["real, as long"] = (0.0, steps[RATIOS[-1]])
+    rows: dict[str, list[float]] = {}
+    print(f"{given.labelled} real scans, {given.epochs} epochs, batch {BATCH}, {len(held_out)} held out\n")
+    print("| share synthetic | iterations | mIoU, % | seeds | car, person, pole, % |\n|---|---:|---:|---|---|")
+    for name, (ratio, count) in settings.items():
+        tables = [run(real, synthetic, ratio, count, held_out, seed) for seed in range(given.seeds)]
+        rows[name] = [mean_iou(table) for table in tables]
+        mean, spread = 100 * np.mean(rows[name]), 100 * np.std(rows[name])
+        some = 100 * np.mean([class_ious(table)[[0, 5, 17]] for table in tables], 0)
+        each = ", ".join(f"{100 * v:.1f}" for v in rows[name])
+        print(
+            f"| {name} | {count} | {mean:.1f} ± {spread:.1f} | {each} | {', '.join(f'{v:.0f}' for v in some)} |",
+            flush=True,
+        )
+    if given.plot:
+        plot(given.plot, rows)
+
+
+if __name__ == "__main__":
+    main()
