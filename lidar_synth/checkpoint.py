@@ -203,7 +203,7 @@ def save_checkpoint(
             tensors[f"{name}.{key}"] = tensor.to(dtype if key in parameters else None).contiguous()
     _check_finite(tensors, "the network")
     try:
-        text = json.dumps({**header.to_dict(), "weights": _sum(tensors)}, sort_keys=True, allow_nan=False)
+        text = json.dumps({**header.to_dict(), "weights": weights_hash(tensors)}, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"a header with a value that JSON does not hold ({error})", "plain, finite values") from error
     write_file(path, save(tensors, {"lidar_synth": text}), durable=True)
@@ -223,7 +223,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
             its header.
     """
     text, header, tensors = _read(Path(path))
-    if json.loads(text).get("weights") != _sum(tensors):
+    if json.loads(text).get("weights") != weights_hash(tensors):
         raise DataError(f"{path}: the weights do not have the sum in the header", "a whole file", "Copy it again.")
     _check_finite(tensors, str(path))
     networks = {}
@@ -277,8 +277,8 @@ def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
         raise DataError(f"{what} has NaN or infinity in {bad}", "finite weights and ray angles")
 
 
-def _sum(tensors: Mapping[str, Tensor]) -> str:
-    """sha256 of names, types, shapes and bytes."""
+def weights_hash(tensors: Mapping[str, Tensor]) -> str:
+    """sha256 of the names, types, shapes and bytes of tensors on the CPU, in hexadecimal."""
     digest = hashlib.sha256()
     for key in sorted(tensors):
         tensor = tensors[key]

@@ -181,6 +181,18 @@ def test_runs_go_on_as_if_nothing_had_happened(scans: Path, codec: Path, tmp_pat
             assert all(torch.equal(value, other[key]) for key, value in network.state_dict().items()), (name, part)
 
 
+def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(scans: Path, tmp_path: Path) -> None:
+    network = {"architecture": "autoencoder", "arguments": {"widths": [8, 8], "depth": 2, "fine": 8}}
+    call("train", write_config(scans, tmp_path, "codec", network=network, samples={"every": 8, "count": 2}))
+    hdit = {"architecture": "hdit", "arguments": {"width": 16, "depths": [1], "heads": [2], "patch": [1, 1]}}
+    values = {"codec": str(tmp_path / "codec" / "codec.safetensors"), "network": hdit}
+    data = {"latents": True, "cache": str(tmp_path / "cache")}
+    call("train", write_config(scans, tmp_path, "teacher", data=data, **values))
+    assert [p.name[:8] for p in (tmp_path / "cache").glob("latents*")] == ["latents-"]
+    [scan] = load_generator(tmp_path / "teacher" / "teacher.safetensors").scans(0, [3])
+    assert len(scan) and scan.label is not None and scan.confidence is not None
+
+
 def test_fine_tuning_a_latent_model(scans: Path, teacher: Path, codec: Path, tmp_path: Path) -> None:
     config = write_config(scans, tmp_path, "more", network=UNET, recipe={"iterations": 1, "rate": 1e-9})
     values = yaml.safe_load(config.read_text())

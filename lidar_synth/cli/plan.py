@@ -12,7 +12,17 @@ from torch import nn
 from tqdm import tqdm
 
 from lidar_synth import __version__
-from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Checkpoint, Header, join, load_checkpoint, split
+from lidar_synth.checkpoint import (
+    CODEC,
+    ENCODER,
+    VELOCITY,
+    Checkpoint,
+    Header,
+    join,
+    load_checkpoint,
+    split,
+    weights_hash,
+)
 from lidar_synth.codec import Codec, make_codec
 from lidar_synth.conditions import CONDITIONS, Conditioned, blank
 from lidar_synth.config import DistillConfig, Run, TrainConfig
@@ -31,6 +41,7 @@ from lidar_synth.train import (
     Other,
     Task,
     autoencoder_loss,
+    cache_latents,
     cache_scans,
     reconstruction_task,
     student_task,
@@ -144,7 +155,11 @@ def open_data(config: Run, plan: Plan, device: torch.device) -> Batches:
     source = config.data.open(sensor)
     cache = cache_scans(source, sensor, channels, folder, config.data.describe(), others=others)
     codec = plan.codec() if plan.autoencoder is not None else None
-    return Batches(cache, tensors, config.seed, config.data.flip, config.data.roll, device, codec, conditioning)
+    data = Batches(cache, tensors, config.seed, config.data.flip, config.data.roll, device, codec, conditioning)
+    if codec is None or not config.data.latents:
+        return data
+    held = {key: value.cpu() for key, value in plan.parts(plan.network)[CODEC].state_dict().items()}
+    return replace(data, latents=cache_latents(cache, tensors, codec, device, folder, weights_hash(held)))
 
 
 def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, Any]) -> Callable[[Any], Any]:

@@ -38,6 +38,8 @@ class Data(Section):
         cache: folder of the projected scans; by default ``cache`` beside the run's output.
         flip: mirror every other sample.
         roll: turn every sample by a random number of columns.
+        latents: keep what an autoencoder makes of the scans in the cache too: where it takes longer than a look at
+            the disk, and scans are not turned.
     """
 
     licence: str
@@ -51,6 +53,7 @@ class Data(Section):
     cache: Path | None = None
     flip: bool = False
     roll: bool = False
+    latents: bool = False
 
     def open(self, sensor: Sensor) -> Source:
         """The scans.
@@ -68,7 +71,7 @@ class Data(Section):
     def describe(self) -> dict[str, Any]:
         """What tells these scans from others, plain values."""
         keys = {"seed", "interval"} if self.path else {"path", "layout", "split", "on_bad"}
-        return self.model_dump(mode="json", exclude=keys | {"cache", "flip", "roll"})
+        return self.model_dump(mode="json", exclude=keys | {"cache", "flip", "roll", "latents"})
 
 
 class Samples(Section):

@@ -10,13 +10,13 @@ from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Part
 from lidar_synth.conditions import CONDITIONS
 from lidar_synth.config.sections import Condition, Count, Network, Run, Section
 from lidar_synth.errors import ConfigError
-from lidar_synth.nets import build_network
+from lidar_synth.nets import AUTOENCODERS, build_network
 from lidar_synth.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.train import Losses
 
 
 class TrainConfig(Run):
-    """A teacher, a rectified flow from noise to scans; or, with the architecture "vqvae", the autoencoder of one.
+    """A teacher, a rectified flow from noise to scans; or, with one of ``AUTOENCODERS``, the autoencoder of one.
 
     Args:
         sensor: a preset's name or a YAML file.
@@ -47,7 +47,7 @@ class TrainConfig(Run):
     @property
     def autoencodes(self) -> bool:
         """Whether an autoencoder is trained, and no flow."""
-        return self.network.architecture == "vqvae"
+        return self.network.architecture in AUTOENCODERS
 
     def tensors(self) -> TensorFormat:
         """Layout of the network's tensors.

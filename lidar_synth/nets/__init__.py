@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.nets.autoencoder import Autoencoder
 from lidar_synth.nets.denoiser import Denoiser
 from lidar_synth.nets.diffusion import DiffusionUNet
 from lidar_synth.nets.encoders import ClipViewEncoder, SemanticMapEncoder, ViewEncoder
@@ -24,11 +25,15 @@ NETWORKS: dict[str, type[nn.Module]] = {
     "unet": UNet,
     "diffusion_unet": DiffusionUNet,
     "vqvae": VQVAE,
+    "autoencoder": Autoencoder,
     "semantic_map": SemanticMapEncoder,
     "views": ViewEncoder,
     "clip_views": ClipViewEncoder,
 }
 """Architectures by the name that a checkpoint holds: velocity networks, autoencoders, encoders of conditions."""
+
+AUTOENCODERS = ("vqvae", "autoencoder")
+"""Those of them that make latents of range images."""
 
 
 def build_network(architecture: str, arguments: dict[str, Any]) -> nn.Module:

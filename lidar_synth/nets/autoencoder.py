@@ -14,6 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.nets.codebook import follow
+from lidar_synth.nets.convolution import check_shape, pair, reduced
 from lidar_synth.nets.layers import EPS
 
 DETAIL = (2, 4)
@@ -71,8 +73,8 @@ class Autoencoder(nn.Module):
 
     Args:
         resolution: H, W of the image, multiples of 4 and 8.
-        values: V, channels of the image that are numbers: the range first, then such as reflectance.
-        bits: channels of the image after them that are an analog code (``normalize.encode_labels``).
+        channels: C of the image: the range first, then other numbers such as reflectance, then ``bits``.
+        bits: channels of the image that are an analog code (``normalize.encode_labels``).
         codes: K, how many codes there are.
         latent_channels: Z.
         widths: channels on patches of 2 x 4 cells and of 4 x 8.
@@ -89,7 +91,7 @@ class Autoencoder(nn.Module):
     def __init__(
         self,
         resolution: Sequence[int],
-        values: int = 2,
+        channels: int = 7,
         bits: int = 5,
         codes: int = 20,
         latent_channels: int = 8,
@@ -98,18 +100,18 @@ class Autoencoder(nn.Module):
         fine: int = 24,
     ) -> None:
         super().__init__()
-        rows, columns = resolution
-        if rows % DOWN[0] or columns % DOWN[1] or not 2**bits >= codes > 2 ** (bits - 1) - (bits == 0) or depth < 2:
+        self.resolution = pair(resolution)
+        rows = self.resolution[0]
+        if (bits and not 2**bits >= codes > 1) or (not bits and codes) or channels <= bits or depth < 2:
             raise ConfigError(
-                f"resolution {tuple(resolution)}, {codes} codes in {bits} bits, depth {depth}",
-                f"multiples of {DOWN}, as many bits as the codes need, and depth >= 2",
+                f"{channels} channels, {codes} codes in {bits} bits, depth {depth}",
+                "a range beside the bits, as many bits as the codes need (0 for 0), and depth >= 2",
             )
         outer, inner = widths
-        self.resolution, self.values, self.bits, self.fine = (rows, columns), values, bits, fine
-        self.channels = values + bits
-        self.latent_shape = (latent_channels, rows // DOWN[0], columns // DOWN[1])
+        self.channels, self.values, self.bits, self.fine = channels, channels - bits, bits, fine
+        self.latent_shape = (latent_channels, *reduced(self.resolution, [DOWN], "an image"))
         """Channels, rows and columns of a latent."""
-        # What lies where is known by row: on the road, a beam's elevation gives its range.
+        # What lies where is known by row: on a road, a beam's elevation gives its range.
         self.place_stem = _rows(outer, rows // DETAIL[0])
         self.place_latent = _rows(inner, rows // DOWN[0])
         self.place_outer = _rows(outer, rows // DETAIL[0])
@@ -125,10 +127,18 @@ class Autoencoder(nn.Module):
         self.decode_outer = nn.Sequential(*(Residual(outer) for _ in range(depth - 1)))
         self.spread = nn.Conv2d(outer, DETAIL[0] * DETAIL[1] * fine, 1)
         self.refine = CircularConv(fine)
-        self.heads = nn.Conv2d(fine, values + 1 + codes, 1)
+        self.heads = nn.Conv2d(fine, self.values + 1 + codes, 1)
         # Latents leave with mean 0 and variance 1 per channel, as a flow from standard normal noise likes them.
         self.register_buffer("shift", torch.zeros(latent_channels))
         self.register_buffer("scale", torch.ones(latent_channels))
+
+    def forward(self, x: Tensor, noise: Tensor) -> Heads:
+        """Images (B, C, H, W) there and back with ``noise`` (B, *latent_shape) on the bounded latents; in training, the
+        latents' statistics move."""
+        z = self.squeeze(x)
+        if self.training:
+            follow(z.detach(), self.shift, self.scale)
+        return self.expand(z + noise)
 
     def encode(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of mean 0 and variance 1
@@ -138,6 +148,7 @@ class Autoencoder(nn.Module):
     def decode(self, z: Tensor) -> Tensor:
         """Latents (B, *latent_shape) to images (B, C, H, W): the range -1 where there is no return; the bits as logits
         of the likeliest code, which are as far from 0 as this one is likely."""
+        check_shape(z, self.latent_shape, "a latent")
         said = self.expand(z * _channel(self.scale) + _channel(self.shift))
         distance = torch.where(said.returned > 0, said.values[:, :1], -1.0)
         if not self.bits:
@@ -148,6 +159,8 @@ class Autoencoder(nn.Module):
 
     def squeeze(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) to bounded latents in (-1, 1), float32."""
+        check_shape(x, (self.channels, *self.resolution), "an image")
+        x = x.to(self.stem.weight.dtype)
         returned = (x[:, :1] > -1).to(x.dtype)
         h = self.stem(torch.cat([x, returned], 1).contiguous(memory_format=torch.channels_last))
         h = self.encode_outer(h + self.place_stem)

@@ -77,3 +77,12 @@ class Codebook(nn.Module):
         self.sums[dead] = tokens[places][dead]
         self.counts[dead] = 1.0
         self.codes.copy_(self.sums / self.counts[:, None])
+
+
+@torch.no_grad()
+def follow(z: Tensor, shift: Tensor, scale: Tensor) -> None:
+    """Moves the mean and the standard deviation (K,) of maps towards those of z (B, K, h, w), in place."""
+    spread, mean = torch.std_mean(z.float(), (0, 2, 3))
+    fresh = bool((scale == 1).all() & (shift == 0).all())
+    shift.lerp_(mean, 1.0 if fresh else 1 - DECAY)
+    scale.lerp_(spread.clamp(min=1e-4), 1.0 if fresh else 1 - DECAY)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.nets.attention import Grid
-from lidar_synth.nets.codebook import CODEBOOKS, DECAY, Codebook
+from lidar_synth.nets.codebook import CODEBOOKS, Codebook, follow
 from lidar_synth.nets.convolution import (
     GROUPS,
     Attention,
@@ -143,7 +143,7 @@ class VQVAE(nn.Module):
         """Images (B, C, H, W) there and back; in training an "ema" codebook and the latents' statistics move."""
         z = self._encode(x)
         if self.training:
-            self._follow(z.detach())
+            follow(z.detach(), self.shift, self.scale)
         quantised, index = self.codebook(z)
         if self.training:
             self.codebook.follow(z.detach(), index)
@@ -159,14 +159,6 @@ class VQVAE(nn.Module):
 
     def _decode(self, z: Tensor) -> Tensor:
         return unfold(self.decoder(self.from_latent(z), self.gradient_checkpointing), self.patch)
-
-    @torch.no_grad()
-    def _follow(self, z: Tensor) -> None:
-        """Moving mean and standard deviation of the latents (B, K, h, w)."""
-        spread, mean = torch.std_mean(z.float(), (0, 2, 3))
-        fresh = bool((self.scale == 1).all() & (self.shift == 0).all())
-        self.shift.lerp_(mean, 1.0 if fresh else 1 - DECAY)
-        self.scale.lerp_(spread.clamp(min=1e-4), 1.0 if fresh else 1 - DECAY)
 
 
 class Encoder(nn.Module):

@@ -8,7 +8,7 @@ from lidar_synth.train.autoencoder import (
     reconstruction_figures,
     reconstruction_task,
 )
-from lidar_synth.train.cache import ImageCache, Other, cache_scans
+from lidar_synth.train.cache import ImageCache, Other, cache_latents, cache_scans
 from lidar_synth.train.data import Batch, Batches, Conditioning, micro_batches
 from lidar_synth.train.loop import Loss, Record, Task, steps, student_task, teacher_task
 from lidar_synth.train.schedules import SCHEDULES
@@ -29,6 +29,7 @@ __all__ = [
     "Task",
     "Training",
     "autoencoder_loss",
+    "cache_latents",
     "cache_scans",
     "micro_batches",
     "reconstruct",

@@ -11,8 +11,12 @@ It runs in the same loop as everything else: one network, one optimiser, one los
                      High-Resolution Image Synthesis", CVPR 2021). Both sides are trained in every step: the
                      autoencoder's term goes through the discriminator as it stands, the discriminator's own looks at
                      detached reconstructions
+
+The architecture "autoencoder" says of every cell whether there is a return and how likely each class is. Its loss is
+that of these: l1 of the values where there is a return, cross-entropies of return and class.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -23,6 +27,7 @@ from torch import Tensor, nn
 from lidar_synth.codec import Latent, expected
 from lidar_synth.errors import ConfigError
 from lidar_synth.flow import Example, Metric
+from lidar_synth.nets.autoencoder import Autoencoder, Heads
 from lidar_synth.nets.convolution import Norm, WrapConv
 from lidar_synth.nets.vqvae import VQVAE, Encoding
 from lidar_synth.normalize import CHANNELS, TensorFormat
@@ -46,6 +51,7 @@ class Losses:
         geometric: of the points.
         adversarial: of the discriminator's verdict.
         discriminator_width: channels of the discriminator.
+        noise: standard deviation of what is added to the latents of an "autoencoder", which lie in (-1, 1).
 
     Raises:
         ConfigError: on a negative weight.
@@ -58,9 +64,10 @@ class Losses:
     geometric: float = 0.0
     adversarial: float = 0.0
     discriminator_width: int = 32
+    noise: float = 0.07
 
     def __post_init__(self) -> None:
-        if min(self.commitment, self.codebook, self.geometric, self.adversarial) < 0:
+        if min(self.commitment, self.codebook, self.geometric, self.adversarial, self.noise) < 0:
             raise ConfigError(f"{self}", "weights of at least 0")
 
 
@@ -80,7 +87,7 @@ class Autoencoding(nn.Module):
 
     def __init__(
         self,
-        network: VQVAE,
+        network: VQVAE | Autoencoder,
         tensors: TensorFormat,
         sensor: Sensor,
         losses: Losses,
@@ -94,8 +101,13 @@ class Autoencoding(nn.Module):
         directions = torch.from_numpy(sensor.ray_directions().copy()).movedim(-1, 0) / sensor.range_max
         self.register_buffer("rays", directions, persistent=False)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """The loss of a batch of tensors (B, C, H, W), a scalar."""
+    def forward(self, x: Tensor, noise: Tensor | None = None) -> Tensor:
+        """The loss of a batch of tensors (B, C, H, W), a scalar; ``noise`` is standard normal, of the same shape."""
+        if isinstance(self.network, Autoencoder):
+            shape = self.network.latent_shape
+            noise = torch.zeros_like(x) if noise is None else noise
+            some = noise.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
+            return self._told(self.network(x, self.losses.noise * some), x)
         encoding: Encoding = self.network(x)
         output = encoding.output.float()
         loss = self.reconstruction(output, x) + self.losses.commitment * encoding.gap.mean()
@@ -114,6 +126,21 @@ class Autoencoding(nn.Module):
             label = name == "label"
             part = F.binary_cross_entropy_with_logits(a, (b + 1) / 2) if label else self.metric(a, b).mean()
             loss = loss + self.weights.get(name, 1.0) * part
+        return loss
+
+    def _told(self, heads: Heads, x: Tensor) -> Tensor:
+        """The loss of what an ``Autoencoder`` says, a scalar."""
+        returned = (x[:, :1] > -1).float()
+        error = (heads.values.float() - x[:, : heads.values.shape[1]]).abs() * returned
+        loss = F.binary_cross_entropy_with_logits(heads.returned.float(), returned)
+        names = [name for name in self.tensors.channels if name != "label"]
+        for name, part in zip(names, error.sum((0, 2, 3)) / returned.sum().clamp(min=1), strict=True):
+            loss = loss + self.weights.get(name, 1.0) * part
+        if heads.classes.shape[1]:
+            code = torch.zeros_like(x[:, 0], dtype=torch.long)
+            for bit in x[:, heads.values.shape[1] :].unbind(1):
+                code = 2 * code + (bit > 0)
+            loss = loss + self.weights.get("label", 1.0) * F.cross_entropy(heads.classes.float(), code)
         return loss
 
     def _points(self, x: Tensor) -> Tensor:
@@ -154,13 +181,13 @@ class Discriminator(nn.Module):
 
 
 def reconstruction_task(batch: Batch) -> Example:
-    """The answer to an image is the image."""
-    return Example(batch.y0, batch.u, batch.y0)
+    """The answer to an image is the image; noise goes with it."""
+    return Example(batch.y0, batch.u, batch.y0, cond=batch.y1)
 
 
 def autoencoder_loss(network: nn.Module, example: Example, metric: Metric) -> Tensor:
     """The loss of ``Autoencoding``, which knows its metric itself."""
-    loss: Tensor = network(example.y)
+    loss: Tensor = network(example.y, example.cond)
     return loss
 
 

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from lidar_synth.codec import Codec
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
+from lidar_synth.normalize import TensorFormat
 from lidar_synth.projection import project
 from lidar_synth.scan import RangeImage, Scan, Source
 from lidar_synth.sensor import Sensor
@@ -125,6 +127,48 @@ def cache_scans(
                 values.flush()  # type: ignore[attr-defined]  # a memmap
             _note(folder, facts, i + 1)
     return cache
+
+
+def cache_latents(
+    cache: ImageCache,
+    tensors: TensorFormat,
+    codec: Codec,
+    device: torch.device | str,
+    folder: Path | None = None,
+    codec_hash: str = "",
+    progress: bool = True,
+) -> NDArray[np.float16]:
+    """The latents of all scans of a cache, as they are and mirrored: an autoencoder that stands still need not look
+    at the same scan in every epoch.
+
+    Args:
+        cache: of N scans.
+        tensors: layout of the codec's tensors.
+        codec: of the latents.
+        device: where it is.
+        folder: keep them there; a second call with the same ``codec_hash`` finds them. By default in memory.
+        codec_hash: of the codec's weights.
+        progress: show a bar.
+
+    Returns:
+        (2, N, *codec.shape) float16; the second half is of the mirrored scans.
+
+    Raises:
+        FileError: where the folder cannot be written.
+    """
+    shape = (2, len(cache), *codec.shape)
+    path = None if folder is None else folder / f"latents-{codec_hash[:16]}.npy"
+    if path is not None and path.exists():
+        found: NDArray[np.float16] = np.load(path, mmap_mode="r")
+        if found.shape == shape:
+            return found
+    latents = np.empty(shape, np.float16)
+    for i in tqdm(range(len(cache)), desc="latents", disable=not progress):
+        x = tensors.encode(cache.read([i])).to(device)
+        latents[:, i] = codec.encode(torch.cat([x, x.flip(-1)])).float().cpu().numpy()
+    if path is not None:
+        write_file(path, lambda file: np.save(file, latents))
+    return latents
 
 
 def _open_folder(folder: Path, facts: dict[str, Any], layout: Layout, sensor: Sensor) -> tuple[ImageCache, int]:

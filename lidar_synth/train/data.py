@@ -71,10 +71,11 @@ class Batches:
         roll: turn every sample about the vertical by a random whole number of columns.
         device: where the noise is made and the tensors are put together.
         codec: makes states of tensors; None = they are the states.
+        latents: (2, N, *codec.shape) what it makes of the scans (``cache_latents``), in place of ``codec``.
         conditioning: which field of the cache is the condition; None = there is none.
 
     Raises:
-        ConfigError: where scans shall be turned, and the condition cannot.
+        ConfigError: where scans shall be turned, and the condition or the latents cannot.
     """
 
     cache: ImageCache
@@ -85,8 +86,11 @@ class Batches:
     device: torch.device | str = "cpu"
     codec: Codec | None = None
     conditioning: Conditioning | None = None
+    latents: NDArray[np.float16] | None = None
 
     def __post_init__(self) -> None:
+        if self.roll and self.latents is not None:
+            raise ConfigError("roll with latents that were made before", "data.latents=false, or roll=false")
         if self.roll and self.conditioning and not CONDITIONS[self.conditioning.name].turns:
             raise ConfigError(f"roll with the condition {self.conditioning.name!r}", "roll=false: it does not turn")
 
@@ -99,28 +103,32 @@ class Batches:
         """The samples at these positions of the sequence."""
         seed = self.seed + _TRAINING
         chance = uniform(seed, positions, (5,))
-        fields = {n: v.to(self.device) for n, v in self.cache.read(self.scans_at(positions)).items()}
-        y0 = self.tensors.encode(fields)
-        cond = fields[CONDITIONS[self.conditioning.name].field] if self.conditioning else None
-        if self.flip:
-            y0 = _where(chance[:, 1] < 0.5, y0.flip(-1), y0)
-            cond = cond if cond is None else _where(chance[:, 1] < 0.5, cond.flip(-1), cond)
-        if self.roll:
-            columns = (chance[:, 2] * y0.shape[-1]).long().tolist()
-            y0 = _rolled(y0, columns)
-            cond = cond if cond is None else _rolled(cond, columns)
-        if self.codec is not None:
-            y0 = self.codec.encode(y0)
+        scans = self.scans_at(positions)
+        mirrored = (chance[:, 1] < 0.5) & self.flip
+        columns = (chance[:, 2] * self.cache.sensor.columns).long().tolist()
+
+        def moved(x: Tensor) -> Tensor:
+            x = _where(mirrored, x.flip(-1), x)
+            return _rolled(x, columns) if self.roll else x
+
+        if self.latents is not None:
+            y0 = torch.from_numpy(self.latents[mirrored.long().numpy(), scans]).to(self.device, torch.float32)
+        else:
+            y0 = moved(self.tensors.encode(self.cache.read(scans)).to(self.device))
+            y0 = y0 if self.codec is None else self.codec.encode(y0)
+        cond = None if self.conditioning is None else moved(self._stored(scans))
         if cond is not None:
             cond = self._dropped(cond, chance)
         return Batch(y0, gaussian(seed, positions, y0.shape[1:], self.device), chance[:, 0].to(self.device), cond)
 
     def conditions(self, positions: Sequence[int]) -> Tensor | None:
         """The whole conditions (B, ...) of the scans at these positions, neither blank nor turned; None without."""
-        if self.conditioning is None:
-            return None
-        field = CONDITIONS[self.conditioning.name].field
-        values = self.cache.fields[field][np.asarray(self.scans_at(positions), np.int64)]
+        return None if self.conditioning is None else self._stored(self.scans_at(positions))
+
+    def _stored(self, scans: Sequence[int]) -> Tensor:
+        """Conditions (B, ...) of these scans."""
+        assert self.conditioning is not None
+        values = self.cache.fields[CONDITIONS[self.conditioning.name].field][np.asarray(scans, np.int64)]
         return torch.from_numpy(values).to(self.device)
 
     def _dropped(self, cond: Tensor, chance: Tensor) -> Tensor:

@@ -1,0 +1,169 @@
+"""The small autoencoder: what it says of every cell, its loss, and latents that are made once."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_scan
+from torch import Tensor
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.codec import make_codec
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.flow import METRICS
+from lidar_synth.nets import build_network
+from lidar_synth.nets.autoencoder import Autoencoder
+from lidar_synth.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.projection import project
+from lidar_synth.sensor import Sensor
+from lidar_synth.train import Autoencoding, Batches, Losses, cache_latents, cache_scans
+
+SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+TENSORS = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow"])
+SCANS = [random_scan(SENSOR, 300, i) for i in range(4)]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def network(**arguments: Any) -> Autoencoder:
+    torch.manual_seed(0)
+    net = build_network(
+        "autoencoder", {"resolution": [8, 32], "channels": 7, "widths": [12, 16], "fine": 8} | arguments
+    )
+    assert isinstance(net, Autoencoder)
+    with torch.no_grad():  # residual blocks begin as nothing
+        for name, weight in net.named_parameters():
+            if "second" in name or "place" in name:
+                weight.normal_(0, 0.1)
+    return net.eval()
+
+
+def tensors() -> Tensor:
+    return TENSORS.from_images([project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS])
+
+
+def test_columns_turn_together_in_image_and_latent() -> None:
+    net, x = network(), tensors()
+    z = net.encode(x)
+    assert z.shape[1:] == net.latent_shape == (8, 2, 4)
+    assert torch.allclose(net.encode(x.roll(8, -1)), z.roll(1, -1), atol=1e-5)
+    assert torch.allclose(net.decode(z.roll(1, -1)), net.decode(z).roll(8, -1), atol=1e-5)
+
+
+def test_rows_are_told_apart() -> None:
+    net = network()
+    same = net.decode(torch.zeros(1, *net.latent_shape))
+    assert not torch.allclose(same[..., 0, :], same[..., 4, :], atol=1e-3)
+
+
+def test_what_leaves_the_codec_is_what_was_said() -> None:
+    net, x = network(), tensors()
+    with torch.no_grad():
+        net.shift.normal_()
+        net.scale.uniform_(0.5, 2)
+    codec = make_codec(net, TENSORS, SENSOR.shape)
+    z = codec.encode(x)
+    assert torch.allclose(z * net.scale.view(1, -1, 1, 1) + net.shift.view(1, -1, 1, 1), net.squeeze(x), atol=1e-5)
+    said = net.expand(net.squeeze(x))
+    fields = TENSORS.decode(codec.decode(z))
+    seen = fields["range"] > 0
+    assert not seen[(said.returned <= 0)[:, 0]].any()
+    assert seen.any() and not seen.all()
+    metres = TENSORS.normalisation.decode(said.values[:, 0])
+    assert torch.allclose(fields["range"][seen], metres[seen], rtol=1e-4)
+    likely, code = said.classes.softmax(1).max(1)
+    expected = torch.where(code == 19, IGNORE, code)
+    assert torch.equal(fields["label"][seen].long(), expected[seen])
+    assert torch.allclose(fields["confidence"][seen], likely[seen].clamp(max=0.9999), atol=1e-4)
+
+
+def test_the_loss_by_hand() -> None:
+    net, x = network(), tensors()
+    trained = Autoencoding(net, TENSORS, SENSOR, Losses(noise=0.0), METRICS["l1"], {"range": 5.0, "label": 2.0}).eval()
+    said = net.expand(net.squeeze(x))
+    images = [project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS]
+    mask = torch.from_numpy(np.stack([image.mask for image in images]))
+    label = torch.from_numpy(np.stack([image.channels["label"] for image in images]).astype(np.int64))
+    label = torch.where(label == IGNORE, 19, label)
+    values = (said.values - x[:, :2]).abs()
+    by_hand = (
+        torch.nn.functional.binary_cross_entropy_with_logits(said.returned[:, 0], mask.float())
+        + 5 * values[:, 0][mask].mean()
+        + values[:, 1][mask].mean()
+        + 2 * torch.nn.functional.cross_entropy(said.classes, label)
+    )
+    assert trained(x).item() == pytest.approx(by_hand.item(), rel=1e-5)
+    assert trained(x, torch.randn_like(x)).item() == pytest.approx(by_hand.item(), rel=1e-5), "noise of deviation 0"
+    noisy = Autoencoding(net, TENSORS, SENSOR, Losses(noise=0.5), METRICS["l1"], {}).eval()
+    assert noisy(x, torch.randn_like(x)).item() != pytest.approx(noisy(x).item(), rel=1e-3)
+
+
+def test_it_learns_scans_and_its_latents_have_variance_one() -> None:
+    net, x = network(), tensors()
+    trained = Autoencoding(net.train(), TENSORS, SENSOR, Losses(), METRICS["l1"], {})
+    optimizer = torch.optim.Adam(net.parameters(), 3e-3)
+    losses = []
+    for _ in range(150):
+        loss = trained(x, torch.randn_like(x))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.6 * losses[0]
+    z = net.eval().encode(x)
+    assert abs(z.mean().item()) < 0.3 and 0.7 < z.std().item() < 1.5
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"resolution": [8, 30]},
+        {"bits": 4},
+        {"bits": 0},
+        {"codes": 40},
+        {"channels": 5},
+        {"depth": 1},
+    ],
+)
+def test_values_that_do_not_fit_together_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        network(**wrong)
+
+
+def test_images_and_latents_of_other_shapes_are_refused() -> None:
+    net = network()
+    with pytest.raises(DataError, match="an image of shape"):
+        net.encode(torch.zeros(1, 7, 8, 16))
+    with pytest.raises(DataError, match="a latent of shape"):
+        net.decode(torch.zeros(1, 8, 2, 8))
+
+
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_latents_that_were_made_before_are_those_that_are_made_on_the_way(on_disk: bool, tmp_path: Any) -> None:
+    cache = cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False)
+    codec = make_codec(network(), TENSORS, SENSOR.shape)
+    folder = tmp_path if on_disk else None
+    latents = cache_latents(cache, TENSORS, codec, "cpu", folder, "a", progress=False)
+    again = cache_latents(cache, TENSORS, codec, "cpu", folder, "a", progress=False)
+    assert isinstance(again, np.memmap) == on_disk
+    live = Batches(cache, TENSORS, flip=True, codec=codec)(range(12))
+    held = Batches(cache, TENSORS, flip=True, codec=codec, latents=again)(range(12))
+    assert np.array_equal(latents, again)
+    assert torch.allclose(held.y0, live.y0, atol=2e-3)
+    assert torch.equal(held.y1, live.y1) and torch.equal(held.u, live.u)
+    other = make_codec(network(depth=2), TENSORS, SENSOR.shape)
+    assert not np.array_equal(cache_latents(cache, TENSORS, other, "cpu", folder, "b", progress=False), latents)
+
+
+def test_latents_cannot_be_turned() -> None:
+    cache = cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False)
+    with pytest.raises(ConfigError, match="latents=false"):
+        Batches(cache, TENSORS, roll=True, latents=np.zeros((2, 4, 8, 2, 4), np.float16))
