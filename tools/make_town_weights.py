@@ -1,13 +1,12 @@
-"""The recipe of the weights that ship: teacher, timesteps, student, on scans of the town only.
+"""The recipe of the weights that ship: autoencoder, teacher, timesteps, student, on scans of the town only.
 
-    python tools/make_town_weights.py WORK [--minutes 60] [--teacher-share 0.7]
-        [--teacher KEY=VALUE ...] [--student KEY=VALUE ...]
+    python tools/make_town_weights.py WORK [--codec 60] [--teacher 180] [--student 30] [--set RUN.KEY=VALUE ...]
 
-Both runs have a budget of time in place of iterations: at a constant rate until three quarters of it are over, then
-the rate falls to zero over a third of the steps done so far (the schedule "trapezoid"). A run that was stopped or
-killed goes on when the same is typed again, with the budget anew. KEY=VALUE changes the configurations
-(configs/town_teacher.yaml and town_student.yaml), such as recipe.batch=16; data has to stay the same in both. On a
-machine that does other things too, set OMP_WAIT_POLICY=passive.
+The numbers are minutes: every run has a budget of time in place of iterations. It goes on at a constant rate until
+three quarters of it are over, then the rate falls to zero over a third of the steps done so far (the schedule
+"trapezoid"). A run that was stopped or killed goes on when the same is typed again, with the budget anew. --set changes
+the configurations (configs/town_codec.yaml, town_teacher.yaml, town_student.yaml), such as teacher.recipe.batch=16;
+data has to stay the same in all. On a machine that does other things too, set OMP_WAIT_POLICY=passive.
 """
 
 import argparse
@@ -29,22 +28,25 @@ LIMIT = 16e6
 """Bytes that weights in the package may have."""
 
 
+RUNS = {"codec": TrainConfig, "teacher": TrainConfig, "student": DistillConfig}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path, help="folder of the runs")
-    parser.add_argument("--minutes", type=float, default=60, help="for teacher and student together")
-    parser.add_argument("--teacher-share", type=float, default=0.7, help="of the minutes")
-    parser.add_argument("--teacher", nargs="*", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--student", nargs="*", default=[], metavar="KEY=VALUE")
+    for name, minutes in (("codec", 60), ("teacher", 180), ("student", 30)):
+        parser.add_argument(f"--{name}", type=float, default=minutes, metavar="MINUTES")
+    parser.add_argument("--set", nargs="*", default=[], metavar="RUN.KEY=VALUE")
     parser.add_argument("--out", type=Path, default=ROOT / "lidar_synth" / "weights" / "town.safetensors")
     given = parser.parse_args()
 
-    cache = f"data.cache={given.work / 'cache'}"
-    minutes = given.minutes * given.teacher_share
-    teacher = train(TrainConfig, given.work / "town_teacher", minutes, [cache, *given.teacher])
-    overrides = [cache, f"teacher={teacher}", *given.student]
-    student = train(DistillConfig, given.work / "town_student", given.minutes - minutes, overrides)
-    ship(student, given.out)
+    made: dict[str, Path] = {}
+    for name, kind in RUNS.items():
+        changes = [change.partition(".")[2] for change in given.set if change.startswith(f"{name}.")]
+        before = {"codec": [], "teacher": ["codec"], "student": ["teacher"]}[name]
+        changes = [f"data.cache={given.work / 'cache'}", *(f"{key}={made[key]}" for key in before), *changes]
+        made[name] = train(kind, given.work / f"town_{name}", getattr(given, name), changes)
+    ship(made["student"], given.out)
 
 
 def train(kind: type[TrainConfig] | type[DistillConfig], folder: Path, minutes: float, overrides: list[str]) -> Path:

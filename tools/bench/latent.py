@@ -44,7 +44,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     full, codec = network("unet", resolution=(16, 128)), network("vqvae", resolution=(64, 1024))
-    town = network("vqvae", resolution=(64, 1024), channels=7, **small("town_codec"))
+    town = network("autoencoder", resolution=(64, 1024), channels=7, **small("town_codec"))
     town_flow = network(
         "unet", resolution=town.latent_shape[1:], channels=town.latent_shape[0], condition_channels=32,
         **small("town_semantic_teacher"),
