@@ -17,18 +17,22 @@ _HOME = {
     "KITTIObject": "formats",
     "KITTIRaw": "formats",
     "LidarSynthError": "errors",
+    "Linear": "mixing",
     "MixedScans": "mixing",
     "MixedStream": "mixing",
     "NuScenes": "formats",
+    "ObjectBank": "labels",
     "RangeImage": "scan",
     "RollingBank": "service",
     "Scan": "scan",
     "SemanticKITTI": "formats",
     "Sensor": "sensor",
     "Source": "scan",
+    "Sources": "mixing",
     "Town": "town",
     "load_generator": "generator",
     "load_sensor": "sensor",
+    "make_policy": "labels",
     "open_scans": "formats",
     "project": "projection",
     "unfold": "projection",
@@ -48,8 +52,12 @@ if TYPE_CHECKING:
     from lidar_synth.formats import open_scans as open_scans
     from lidar_synth.generator import Generator as Generator
     from lidar_synth.generator import load_generator as load_generator
+    from lidar_synth.labels import ObjectBank as ObjectBank
+    from lidar_synth.labels import make_policy as make_policy
+    from lidar_synth.mixing import Linear as Linear
     from lidar_synth.mixing import MixedScans as MixedScans
     from lidar_synth.mixing import MixedStream as MixedStream
+    from lidar_synth.mixing import Sources as Sources
     from lidar_synth.projection import project as project
     from lidar_synth.projection import unfold as unfold
     from lidar_synth.projection import unproject as unproject
