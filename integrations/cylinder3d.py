@@ -1,0 +1,95 @@
+"""Cylinder3D: a point dataset that mixes, and a launcher that runs its own training script::
+
+    cd Cylinder3D
+    LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py \\
+        --config_path config/mixed.yaml
+
+with ``pc_dataset_type: "SemKITTI_mixed"`` in that configuration. Cylinder3D turns points in place, so every sample is
+memory of its own, and tells nobody which epoch begins, so the launcher gives it a loader that does.
+"""
+
+import runpy
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lidar_synth.integrations.mixture import (
+    EpochLoader,
+    class_ids,
+    id_table,
+    mix,
+    points_of,
+    read_settings,
+    refuse_unlabelled,
+)
+
+from lidar_synth.errors import LibraryError
+from lidar_synth.scan import Scan
+
+NAME = "SemKITTI_mixed"
+_IDS = id_table(1, 0, np.uint8)
+
+
+@cache
+def register() -> Any:
+    """Register ``SemKITTI_mixed`` with Cylinder3D and return the class.
+
+    Raises:
+        LibraryError: where Cylinder3D is not on the path.
+    """
+    try:
+        from dataloader.pc_dataset import SemKITTI_sk, register_dataset
+    except ImportError as error:
+        raise LibraryError(
+            f"Cylinder3D's dataloader cannot be imported ({error})", "its checkout on the path", "cd Cylinder3D"
+        ) from error
+
+    class Mixed(SemKITTI_sk):  # type: ignore[misc]
+        """``SemKITTI_sk`` whose training set has synthetic scans among its own: (xyz, label (N, 1) uint8, strength)."""
+
+        def __init__(self, data_path: str, imageset: str = "train", **options: Any) -> None:
+            super().__init__(data_path, imageset, **options)
+            self.mixed = None
+            if imageset == "train":
+                settings = read_settings()
+                refuse_unlabelled(settings, "Cylinder3D")
+                self.mixed = mix(len(self.im_idx), settings, lambda scan, rng: scan)
+
+        def set_epoch(self, epoch: int) -> None:
+            """Choose the epoch; workers are told."""
+            if self.mixed is not None:
+                self.mixed.set_epoch(epoch)
+
+        def __len__(self) -> int:
+            return super().__len__() if self.mixed is None else len(self.mixed)
+
+        def __getitem__(self, index: int) -> Any:
+            sample = index if self.mixed is None else self.mixed[index]
+            if not isinstance(sample, Scan):
+                return super().__getitem__(sample)
+            points, label = points_of(sample), class_ids(sample, _IDS)[:, None]
+            return (points[:, :3], label, points[:, 3]) if self.return_ref else (points[:, :3], label)
+
+    Mixed.__name__ = NAME
+    return register_dataset(Mixed)
+
+
+def main() -> None:
+    """Run Cylinder3D's training script with the dataset registered."""
+    import torch.utils.data
+
+    if len(sys.argv) < 2 or not Path(sys.argv[1]).is_file():
+        raise SystemExit(
+            "usage, in Cylinder3D: python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py ARGUMENTS"
+        )
+    sys.argv = sys.argv[1:]
+    sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
+    register()
+    torch.utils.data.DataLoader = EpochLoader  # type: ignore[misc]
+    runpy.run_path(sys.argv[0], run_name="__main__")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""What detectors want beside points and boxes: the ground plane, the camera's view, difficulty, a database of objects.
+
+KITTI's trainers see the part of a scan that camera 2 sees, with the boxes there, and shift pasted objects to the ground
+by a plane ``a x + b y + c z + d = 0`` in the rectified camera frame, whose normal points up (b < 0).
+"""
+
+import pickle
+import re
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import DataError
+from lidar_synth.files import write_file
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.kitti_object import OBJECT_CAMERA
+from lidar_synth.labels import ObjectBank
+from lidar_synth.labels.ground import GROUND
+from lidar_synth.scan import Boxes, Scan
+
+NEAR = 40.0
+"""Metres within which the ground counts."""
+
+LEVELS = ((40, 0.15, 0), (25, 0.30, 1), (25, 0.50, 2))
+"""KITTI's easy, moderate and hard: least height in pixels, most truncation, most occlusion (devkit's readme)."""
+
+Origin = Literal["gravity", "bottom"]
+"""What of a box its place names: the centre of gravity (OpenPCDet) or the middle of its floor (MMDetection3D)."""
+
+
+def ground_plane(scan: Scan) -> NDArray[np.float64]:
+    """(4,) a, b, c, d of the ground's plane in the sensor frame, (a, b, c) of length 1 and pointing up.
+
+    Fitted to the returns that are labelled as ground, or without labels to the lowest in each square of 2 m, without
+    those that miss it by more than 0.3 m.
+
+    Raises:
+        DataError: where there is no ground.
+    """
+    near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < NEAR
+    points = scan.points[near].astype(np.float64)
+    label = None if scan.label is None else scan.label[near]
+    if label is not None and (label != IGNORE).any():
+        points = points[GROUND[label]]
+    elif len(points):
+        points = _lowest(points)
+    fit = np.array([0, 0, np.median(points[:, 2])]) if len(points) else np.zeros(3)
+    sides = np.c_[points[:, :2], np.ones(len(points))]
+    for reach in (1.0, 0.5, 0.3, 0.3):
+        close = np.abs(points[:, 2] - sides @ fit) < reach
+        if close.sum() < 10:
+            raise DataError(f"scan {scan.id!r} has {close.sum()} returns of the ground", "ground for a plane")
+        fit = np.linalg.lstsq(sides[close], points[close, 2], rcond=None)[0]
+    plane: NDArray[np.float64] = np.array([-fit[0], -fit[1], 1, -fit[2]]) / np.linalg.norm([fit[0], fit[1], 1])
+    return plane
+
+
+def _lowest(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    cell = np.floor(points[:, :2] / 2).astype(np.int64) @ (1, 1 << 20)
+    order = np.lexsort((points[:, 2], cell))
+    return points[order[np.r_[True, np.diff(cell[order]) != 0]]]
+
+
+def plane_in_camera(plane: NDArray[np.float64], camera: Calibration) -> NDArray[np.float64]:
+    """(4,) a plane of the sensor frame in the camera's."""
+    moved: NDArray[np.float64] = plane @ camera.sensor_from_camera
+    return moved
+
+
+def in_view(scan: Scan, camera: Calibration) -> Scan:
+    """What a camera sees of a scan: the points in its picture, and the boxes whose centre is.
+
+    Raises:
+        DataError: where the camera's image size is not known.
+    """
+    size = camera.image_size
+    if size is None:
+        raise DataError("a camera without image size", "width and height, from image_2")
+
+    def seen(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        pixels, depth = camera.pixels(points)
+        with np.errstate(invalid="ignore"):
+            inside: NDArray[np.bool_] = (pixels >= 0).all(1) & (pixels < np.array(size)).all(1) & (depth > 0)
+        return inside
+
+    part = scan[seen(scan.points)]
+    if scan.boxes is not None:
+        part.boxes = scan.boxes[seen(scan.boxes.values[:, :3])]
+    return part
+
+
+def difficulty(boxes: Boxes) -> NDArray[np.int32]:
+    """(M,) KITTI's level of each box: 0 easy, 1 moderate, 2 hard, -1 none of them, or occlusion not known.
+
+    The height in the picture, where it is not known, is that which KITTI's focal length gives it at its distance.
+    """
+    known = (boxes.image_box >= 0).all(1)
+    distance = np.maximum(np.hypot(boxes.values[:, 0], boxes.values[:, 1]), 1)
+    apparent = OBJECT_CAMERA.projection[1, 1] * boxes.values[:, 5] / distance
+    height = np.where(known, boxes.image_box[:, 3] - boxes.image_box[:, 1], apparent)
+    level = np.full(len(boxes), -1, np.int32)
+    for number, (least, truncated, occluded) in reversed(list(enumerate(LEVELS))):
+        fits = (height >= least) & (boxes.truncation <= truncated) & (boxes.occlusion <= occluded)
+        level[fits & (boxes.occlusion >= 0)] = number
+    return level
+
+
+def write_gt_database(
+    objects: ObjectBank, root: str | Path, *, origin: Origin, folder: str = "gt_database", infos: str
+) -> Path:
+    """A bank of objects as the database from which a trainer's GT sampling draws.
+
+    Points stand relative to the box's place, as each trainer wants it. Both trainers read the list of objects as a
+    pickle, which is the reason why one is written; the package itself never reads one.
+
+    Args:
+        objects: of any source with boxes, ``ObjectBank.from_scans(source)``.
+        root: the trainer's data folder.
+        origin: ``"gravity"`` for OpenPCDet, ``"bottom"`` for MMDetection3D.
+        folder: of the points, under the root.
+        infos: name of the list, such as ``kitti_dbinfos_train.pkl``.
+
+    Returns:
+        The list's file.
+
+    Raises:
+        FileError: where it cannot be written.
+    """
+    root, found, level = Path(root), dict[str, list[dict[str, Any]]](), difficulty(objects.boxes)
+    for i, name in enumerate(objects.boxes.names):
+        part = slice(objects.start[i], objects.start[i + 1])
+        box, points = objects.boxes.values[i].copy(), objects.points[part].copy()
+        if origin == "bottom":
+            box[2] -= box[5] / 2
+            points[:, 2] += box[5] / 2
+        scan = re.sub(r"\W+", "_", str(objects.scan[i]))
+        path = f"{folder}/{scan}_{name}_{objects.number[i]}.bin"
+        content = np.column_stack([points, objects.reflectance[part]]).astype("<f4").tobytes()
+        write_file(root / path, content)
+        facts = {"name": name, "path": path, "image_idx": scan, "gt_idx": int(objects.number[i]), "box3d_lidar": box}
+        facts |= {"num_points_in_gt": len(points), "difficulty": int(level[i]), "group_id": i, "score": -1.0}
+        found.setdefault(name, []).append(facts | {"bbox": objects.boxes.image_box[i]})
+    write_file(root / infos, pickle.dumps(found))
+    return root / infos

@@ -1,0 +1,106 @@
+"""The way that every trainer takes: a mixture written once as SemanticKITTI's or KITTI's folders.
+
+What is written is complete: labels for every scan (a missing ``.label`` is read as "car" by some trainers), and for
+detectors label_2, calib, image_2, planes and ImageSets, so that a trainer's stock loader and converter read it.
+"""
+
+from pathlib import Path
+from typing import Literal
+
+from lidar_synth.integrations.detection import ground_plane, plane_in_camera
+from lidar_synth.integrations.mmdet3d_lists import write_plane
+from tqdm import tqdm
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files import write_file
+from lidar_synth.formats import KITTIObject
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.kitti_object import OBJECT_CAMERA, KITTIObjectWriter
+from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
+from lidar_synth.formats.writer import Writer
+from lidar_synth.mixing import MixedScans
+from lidar_synth.scan import Scan
+
+MANIFEST = "mixture.csv"
+
+
+def export_mixture(
+    mixed: MixedScans,
+    out: str | Path,
+    layout: Literal["semantic_kitti", "kitti"],
+    *,
+    epoch: int = 0,
+    calibration: Calibration | None = None,
+    progress: bool = True,
+) -> int:
+    """Write what a mixture gives in an epoch; a rerun goes on where it stopped.
+
+    Scans are numbered by their positions, in sequence 00 or in ``training``. ``mixture.csv`` tells frame, domain and id
+    of each, with the plan's hash.
+
+    Args:
+        mixed: of scans, with ``to_sample=lambda scan, rng: scan``.
+        out: folder to write to.
+        layout: ``"semantic_kitti"`` or ``"kitti"`` (the object set).
+        epoch: whose plan.
+        calibration: camera 2, for ``"kitti"``; by default an ideal one at the sensor.
+        progress: show a bar.
+
+    Returns:
+        How many scans were written now.
+
+    Raises:
+        ConfigError: on another layout, or a mixture whose samples are no scans.
+        DataError: on a scan without labels (``"semantic_kitti"``) or boxes (``"kitti"``).
+        FileError: where the folder cannot be written.
+    """
+    if layout not in ("semantic_kitti", "kitti"):
+        raise ConfigError(f"layout {layout!r}", "'semantic_kitti' or 'kitti'")
+    root = Path(out)
+    camera = calibration or OBJECT_CAMERA
+    writer: Writer = SemanticKITTIWriter(root) if layout == "semantic_kitti" else KITTIObjectWriter(root)
+    rows, written = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"], 0
+    for position in tqdm(range(mixed.length(epoch)), unit="scan", disable=not progress):
+        scan = mixed.sample(epoch, position)
+        if not isinstance(scan, Scan):
+            raise ConfigError(f"samples of the type {type(scan).__name__}", "scans: to_sample=lambda scan, rng: scan")
+        rows.append(f"{position:06d},{scan.domain},{scan.id}")
+        if writer.complete(position):
+            continue
+        needed = "label" if layout == "semantic_kitti" else "boxes"
+        if getattr(scan, needed) is None:
+            raise DataError(f"scan {scan.id!r} has no {needed}", f"{needed} for {layout!r}", "Choose a label policy.")
+        if layout == "kitti":
+            _write_plane(root, f"{position:06d}", scan, camera)
+        writer.write(scan, position, calibration=None if layout == "semantic_kitti" else camera)
+        written += 1
+    writer.finish()
+    write_file(root / MANIFEST, "".join(f"{row}\n" for row in rows).encode())
+    return written
+
+
+def write_planes(root: str | Path, split: str = "trainval") -> int:
+    """Fit the ground planes that KITTI's folder lacks (``training/planes``), as GT sampling wants them.
+
+    Returns:
+        How many were written.
+
+    Raises:
+        DataError: on a scan without ground or calibration.
+        FileError: where they cannot be written.
+    """
+    scans, written = KITTIObject(root, split), 0
+    for number, name in enumerate(tqdm(scans.ids, "fitting planes", unit="scan", leave=False, disable=None)):
+        frame = name.split("/")[1]
+        if not (Path(root) / "training" / "planes" / f"{frame}.txt").is_file():
+            camera = scans.calibration(number)
+            if camera is None:
+                raise DataError(f"scan {name} of {root} has no calibration", f"training/calib/{frame}.txt")
+            _write_plane(Path(root), frame, scans[number], camera)
+            written += 1
+    return written
+
+
+def _write_plane(root: Path, frame: str, scan: Scan, camera: Calibration) -> None:
+    path = root / "training" / "planes" / f"{frame}.txt"
+    write_plane(path, plane_in_camera(ground_plane(scan), camera))

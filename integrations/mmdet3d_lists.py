@@ -1,0 +1,114 @@
+"""Info lists of real scans for MMDetection3D 1.1 and later, from the datasets' own folders: what its ``create_data.py``
+writes, as far as training reads it, in JSON and without its compiled operators."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lidar_synth.integrations.detection import difficulty, ground_plane, in_view, plane_in_camera
+
+from lidar_synth.errors import DataError
+from lidar_synth.files import read_text, write_file
+from lidar_synth.formats import KITTIObject, SemanticKITTI
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.kitti_labels import boxes_to_camera
+from lidar_synth.scan import Boxes, Scan
+
+CLASSES = ("Pedestrian", "Cyclist", "Car", "Van", "Truck", "Person_sitting", "Tram", "Misc")
+"""``KittiDataset``'s, in its order."""
+
+
+def semantic_kitti_list(root: str | Path, out: str | Path, split: str = "train") -> Path:
+    """The list of a SemanticKITTI folder; its paths are relative to ``root``.
+
+    Raises:
+        DataError, FileError: where the scans cannot be found, or the list cannot be written.
+    """
+    scans = SemanticKITTI(root, split)
+    entries = []
+    for number, (sequence, frame) in enumerate(name.split("/") for name in scans.ids):
+        base = f"sequences/{sequence}"
+        entry: dict[str, Any] = {"sample_idx": number, "sample_id": f"{sequence}{frame}"}
+        entry["lidar_points"] = {"lidar_path": f"{base}/velodyne/{frame}.bin", "num_pts_feats": 4}
+        entries.append(entry | {"pts_semantic_mask_path": f"{base}/labels/{frame}.label"})
+    return _write(out, "SemanticKITTI", entries, {})
+
+
+def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: str = "velodyne_reduced") -> Path:
+    """The list of a KITTI object folder; its paths are relative to ``<root>/training/<points>``.
+
+    ``velodyne_reduced`` is written where it is missing. The ground plane is that of ``planes``, or fitted to the scan.
+
+    Args:
+        root: the folder that holds ``training`` and ``ImageSets``.
+        out: the list's file.
+        split: ``train``, ``val`` or ``trainval``.
+        points: folder of the points.
+
+    Raises:
+        DataError, FileError: where a scan, its boxes or its calibration cannot be read, or the list not be written.
+    """
+    scans, entries = KITTIObject(root, split), []
+    for number in range(len(scans)):
+        scan, camera = scans[number], scans.calibration(number)
+        if camera is None or camera.image_size is None or scan.boxes is None:
+            raise DataError(f"{scan.id} of {root} has no calibration, image or boxes", "calib, image_2 and label_2")
+        part, frame = scan.id.split("/")
+        seen = in_view(scan, camera)
+        file = Path(root) / part / points / f"{frame}.bin"
+        if points == "velodyne_reduced" and not file.is_file():
+            write_file(file, np.column_stack([seen.points, seen.reflectance]).astype("<f4").tobytes())
+        planes = Path(root) / part / "planes" / f"{frame}.txt"
+        plane = read_plane(planes) if planes.is_file() else plane_in_camera(ground_plane(scan), camera)
+        entries.append(_entry(frame, scan, seen, camera) | {"plane": plane.tolist()})
+    return _write(out, "KITTI", entries, {name: i for i, name in enumerate(CLASSES)})
+
+
+def read_plane(path: Path) -> Any:
+    """(4,) a, b, c, d of a plane's file: the fourth line, as KITTI's planes are passed around."""
+    lines = read_text(path).splitlines()
+    if len(lines) < 4:
+        raise DataError(f"{path} has {len(lines)} lines", "four, the plane in the last one")
+    return np.array(lines[3].split(), np.float64)
+
+
+def write_plane(path: Path, plane: Any) -> None:
+    """The inverse of ``read_plane``."""
+    values = " ".join(f"{value:.12e}" for value in plane)
+    write_file(path, f"# Matrix\nWIDTH 4\nHEIGHT 1\n{values}\n".encode())
+
+
+def _entry(frame: str, scan: Scan, seen: Scan, camera: Calibration) -> dict[str, Any]:
+    assert camera.image_size is not None and scan.boxes is not None
+    cam2img = np.vstack([camera.projection, (0, 0, 0, 1)])
+    lidar2cam = camera.camera_from_sensor
+    image = {"img_path": f"{frame}.png", "height": camera.image_size[1], "width": camera.image_size[0]}
+    image |= {k: v.tolist() for k, v in (("cam2img", cam2img), ("lidar2cam", lidar2cam))}
+    image["lidar2img"] = (cam2img @ lidar2cam).tolist()
+    return {
+        "sample_idx": int(frame),
+        "images": {"CAM2": image},
+        "lidar_points": {"num_pts_feats": 4, "lidar_path": f"{frame}.bin"},
+        "instances": _instances(scan.boxes, seen, camera),
+    }
+
+
+def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, Any]]:
+    floor, size, turn = boxes_to_camera(boxes.values, camera)
+    counts, levels = boxes.contain(seen.points).sum(1), difficulty(boxes)
+    found = []
+    for i, name in enumerate(boxes.names):
+        label = CLASSES.index(name) if name in CLASSES else -1
+        box = [*floor[i], size[i, 2], size[i, 0], size[i, 1], turn[i]]  # place, length, height, width, turn
+        facts = {"bbox": boxes.image_box[i], "bbox_label": label, "bbox_3d": box, "bbox_label_3d": label}
+        facts |= {"depth": floor[i, 2], "num_lidar_pts": counts[i], "difficulty": levels[i]}
+        facts |= {"truncated": boxes.truncation[i], "occluded": boxes.occlusion[i], "alpha": boxes.alpha[i]}
+        found.append({k: np.asarray(v).tolist() for k, v in facts.items()} | {"score": 0.0, "index": i, "group_id": i})
+    return found
+
+
+def _write(out: str | Path, name: str, entries: list[dict[str, Any]], categories: dict[str, int]) -> Path:
+    meta = {"dataset": name, "categories": categories, "info_version": "1.1"}
+    write_file(Path(out), json.dumps({"metainfo": meta, "data_list": entries}).encode())
+    return Path(out)

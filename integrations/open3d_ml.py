@@ -1,0 +1,124 @@
+"""Open3D-ML: SemanticKITTI with synthetic scans in its training split::
+
+    from lidar_synth.integrations.open3d_ml import dataset_class, tell_epochs
+    tell_epochs()
+    dataset = dataset_class()(dataset_path="/data/SemanticKitti", mixture={"synthetic": "bank/", "ratio": 0.25})
+    pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, ...)
+
+Its cache knows a sample by its name alone and would keep an epoch's synthetic scans for ever: ``use_cache`` is refused.
+"""
+
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from lidar_synth.integrations.mixture import (
+    EpochLoader,
+    class_ids,
+    id_table,
+    mix,
+    points_of,
+    read_settings,
+    refuse_unlabelled,
+)
+
+from lidar_synth.errors import ConfigError, LibraryError
+from lidar_synth.scan import Scan
+
+_IDS = id_table(1, 0, np.int32)
+
+
+@cache
+def dataset_class(package: str = "open3d.ml.datasets") -> Any:
+    """The class ``MixedSemanticKITTI``, registered with Open3D-ML under that name.
+
+    Args:
+        package: where its datasets are: in Open3D, or ``"ml3d.datasets"`` in a checkout of Open3D-ML.
+
+    Raises:
+        LibraryError: where it cannot be imported.
+    """
+    try:
+        stock = import_module(f"{package}.semantickitti")
+    except ImportError as error:
+        raise LibraryError(
+            f"{package} cannot be imported ({error})", "Open3D with its ML part", "pip install open3d"
+        ) from error
+
+    class MixedSplit(stock.SemanticKITTISplit):  # type: ignore[misc, name-defined]
+        """The training split: real scans as they are and synthetic ones among them."""
+
+        def __init__(self, dataset: Any, split: str = "training") -> None:
+            # The sampler, which the base makes, asks for the length.
+            self.mixed = mix(len(dataset.get_split_list(split)), dataset.mixture, lambda scan, rng: scan)
+            super().__init__(dataset, split=split)
+
+        def set_epoch(self, epoch: int) -> None:
+            """Choose the epoch; workers are told."""
+            self.mixed.set_epoch(epoch)
+
+        def __len__(self) -> int:
+            return len(self.mixed)
+
+        def get_data(self, idx: int) -> dict[str, Any]:
+            """Points (N, 3), features (N, 1) float32 and labels (N,) int32, 0 = unlabelled."""
+            sample = self.mixed[idx]
+            if not isinstance(sample, Scan):
+                data: dict[str, Any] = super().get_data(sample)
+                return data
+            points = points_of(sample)
+            return {"point": points[:, :3], "feat": points[:, 3:], "label": class_ids(sample, _IDS)}
+
+        def get_attr(self, idx: int) -> dict[str, Any]:
+            """Name and path; a synthetic scan's name tells its number, so that no two have the same."""
+            made = self.mixed.plan()
+            number = int(made.index[idx])
+            if not self.mixed.domain(idx):
+                attr: dict[str, Any] = super().get_attr(number)
+                return attr | {"idx": idx}
+            return {"idx": idx, "name": f"synthetic_{number}", "path": "", "split": self.split}
+
+    class MixedSemanticKITTI(stock.SemanticKITTI):  # type: ignore[misc, name-defined]
+        """Open3D-ML's ``SemanticKITTI`` with a mixed training split.
+
+        Args:
+            dataset_path: as there.
+            mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them.
+            options: as there.
+
+        Raises:
+            ConfigError: with ``use_cache``, or settings that cannot be served.
+        """
+
+        def __init__(self, dataset_path: str, mixture: Any = None, **options: Any) -> None:
+            if options.get("use_cache"):
+                raise ConfigError("use_cache=True for a mixture, whose scans change from epoch to epoch", "False")
+            super().__init__(dataset_path, **options)
+            self.mixture = read_settings(mixture)
+            refuse_unlabelled(self.mixture, "Open3D-ML")
+
+        def get_split(self, split: str) -> Any:
+            """A split; the training split is mixed."""
+            return MixedSplit(self, split) if split in ("train", "training") else super().get_split(split)
+
+    stock.DATASET._register_module(MixedSemanticKITTI)
+    return MixedSemanticKITTI
+
+
+def tell_epochs(pipeline: str = "open3d.ml.torch.pipelines") -> None:
+    """Have Open3D-ML's segmentation pipeline tell its training split which epoch begins.
+
+    Args:
+        pipeline: where its pipelines are; ``"ml3d.torch.pipelines"`` in a checkout.
+
+    Raises:
+        LibraryError: where they cannot be imported.
+    """
+    try:
+        module = import_module(f"{pipeline}.semantic_segmentation")
+    except ImportError as error:
+        raise LibraryError(
+            f"{pipeline} cannot be imported ({error})", "Open3D with its ML part", "pip install open3d"
+        ) from error
+    module.DataLoader = EpochLoader  # type: ignore[attr-defined]

@@ -1,0 +1,99 @@
+"""Pointcept: SemanticKITTI with synthetic scans among its own, registered when a configuration imports this module::
+
+    custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False)
+    hooks = [dict(type="SynthEpoch"), ...]
+    data["train"] |= dict(type="MixedSemanticKITTI", mixture=dict(synthetic="bank/", ratio=0.25))
+
+A synthetic scan always brings its labels: Pointcept reads a missing ``.label`` as zeros, which mean "car".
+"""
+
+from typing import Any
+
+import numpy as np
+from lidar_synth.integrations.mixture import (
+    class_ids,
+    id_table,
+    inner,
+    mix,
+    points_of,
+    read_settings,
+    refuse_unlabelled,
+)
+
+from lidar_synth.errors import ConfigError, LibraryError
+from lidar_synth.scan import Scan
+
+try:
+    from pointcept.datasets.builder import DATASETS
+    from pointcept.datasets.semantic_kitti import SemanticKITTIDataset
+    from pointcept.engines.hooks.builder import HOOKS
+    from pointcept.engines.hooks.default import HookBase
+except ImportError as error:
+    raise LibraryError(
+        f"pointcept cannot be imported ({error})", "a checkout of Pointcept", "PYTHONPATH=/path/to/Pointcept"
+    ) from error
+
+
+@DATASETS.register_module()
+class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
+    """``SemanticKITTIDataset`` with synthetic samples, for training.
+
+    Args:
+        mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them.
+        options: as for ``SemanticKITTIDataset``. ``cache`` is refused: it knows a sample by its name alone.
+
+    Raises:
+        ConfigError: on settings that cannot be served, ``test_mode`` or ``cache``.
+    """
+
+    def __init__(self, mixture: Any = None, **options: Any) -> None:
+        if options.get("test_mode") or options.get("cache"):
+            raise ConfigError("MixedSemanticKITTI with test_mode or cache", "training without a cache")
+        super().__init__(**options)
+        settings = read_settings(mixture)
+        refuse_unlabelled(settings, "Pointcept")
+        self._ids = id_table(0, self.ignore_index, np.int32)
+        self.mixed = mix(len(self.data_list), settings, lambda scan, rng: scan)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch; workers are told, persistent ones too."""
+        self.mixed.set_epoch(epoch)
+
+    def domain(self, index: int) -> int:
+        """0 where a real sample stands in this epoch, 1 where a synthetic one does."""
+        return int(self.mixed.domain(index % len(self.mixed)))
+
+    def __len__(self) -> int:
+        return int(len(self.mixed) * self.loop)
+
+    def get_data(self, idx: int) -> dict[str, Any]:
+        """Coordinates (N, 3), strength (N, 1) float32, segment (N,) int32 and a name, as Pointcept reads them."""
+        sample = self.mixed[idx % len(self.mixed)]
+        if not isinstance(sample, Scan):
+            data: dict[str, Any] = super().get_data(sample)
+            return data
+        points = points_of(sample)
+        return {
+            "coord": points[:, :3],
+            "strength": points[:, 3:],
+            "segment": class_ids(sample, self._ids),
+            "name": f"synthetic_{sample.id}",
+        }
+
+
+@HOOKS.register_module()
+class SynthEpoch(HookBase):  # type: ignore[misc]
+    """Tells the dataset the next epoch when one ends: Pointcept's loader asks for its scans before hooks are called."""
+
+    def before_train(self) -> None:
+        """The epoch in which training begins."""
+        self._tell(self.trainer.start_epoch)
+
+    def after_epoch(self) -> None:
+        """The epoch that comes."""
+        self._tell(self.trainer.epoch + 1)
+
+    def _tell(self, epoch: int) -> None:
+        for each in inner(self.trainer.train_loader.dataset):
+            if isinstance(each, MixedSemanticKITTI):
+                each.set_epoch(epoch)

@@ -1,0 +1,375 @@
+# ruff: noqa: NPY002 - what trainers draw from
+"""What the adapters share, and the traps that need no trainer to fall into; each trainer has a test file of its own."""
+
+import csv
+import importlib
+import json
+from collections import Counter
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from lidar_synth.integrations.detection import (
+    difficulty,
+    ground_plane,
+    in_view,
+    plane_in_camera,
+    write_gt_database,
+)
+from lidar_synth.integrations.folders import MANIFEST, export_mixture, write_planes
+from lidar_synth.integrations.mixture import (
+    VARIABLE,
+    EpochLoader,
+    class_ids,
+    id_table,
+    mix,
+    open_synthetic,
+    points_of,
+    read_settings,
+    refuse_unlabelled,
+)
+from lidar_synth.integrations.mmdet3d_infos import read_url
+from lidar_synth.integrations.mmdet3d_lists import kitti_list, read_plane, semantic_kitti_list
+from lidar_synth.integrations.rangenet import write_parser
+from mixtures import SENSOR as SMALL
+from mixtures import Endless, Scans
+from streets import CAMERA, held, kitti, semantic_kitti, street, synthetic
+from torch.utils.data import DataLoader, Dataset
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError, LibraryError
+from lidar_synth.formats import KITTIObject, open_scans
+from lidar_synth.labels import ObjectBank
+from lidar_synth.mixing import MixedScans
+from lidar_synth.scan import Boxes, Scan
+
+
+def as_is(scan: Scan, rng: np.random.Generator) -> Scan:
+    return scan
+
+
+def test_synthetic_scans_by_name(tmp_path: Path) -> None:
+    folder = synthetic(tmp_path / "scans", 2)
+    made = open_synthetic(folder)
+    assert len(made) == 2 and made.sensor == made[0].sensor
+    given = Endless()
+    assert open_synthetic(given) is given
+    with pytest.raises(ConfigError, match="no such model"):
+        open_synthetic("no such model")
+
+
+def test_real_samples_of_a_mixture_are_numbers(tmp_path: Path) -> None:
+    mixed = mix(6, {"synthetic": Endless(), "ratio": 0.4, "seed": 1}, as_is)
+    samples = [mixed[i] for i in range(len(mixed))]
+    assert sorted(s for s in samples if isinstance(s, int)) == list(range(6))
+    assert sum(isinstance(s, Scan) for s in samples) == 4
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"synthetic": "bank", "rate": 0.5}, "settings .'rate'."),
+        ({"ratio": 0.5}, "without synthetic scans"),
+        ({"synthetic": Endless(), "ratio": 2}, "ratio 2"),
+        ({"synthetic": Endless(fields=("reflectance",))}, "a model or bank with labels"),
+    ],
+)
+def test_settings_that_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        mix(4, settings, as_is)
+
+
+def test_settings_come_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = {"synthetic": "bank", "ratio": 0.5, "label_options": {"kind": "objects"}}
+    path = tmp_path / "mix.yaml"
+    path.write_text(yaml.safe_dump({"SYNTHETIC": "bank", "RATIO": 0.5, "LABEL_OPTIONS": {"KIND": "objects"}}))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    with pytest.raises(ConfigError, match=f"{VARIABLE}=mix.yaml"):
+        read_settings()
+    monkeypatch.setenv(VARIABLE, str(path))
+    assert read_settings() == read_settings(path) == read_settings(wanted) == wanted
+    path.write_text("- 1")
+    with pytest.raises(ConfigError, match="a dict of synthetic, ratio"):
+        read_settings(path)
+
+
+def test_a_batch_without_a_label_is_prevented() -> None:
+    """Trap: the mean of a loss over no label is NaN."""
+    scan = Scans("s", 1)[0]
+    logits, loss = torch.zeros(len(scan), 19, requires_grad=True), torch.nn.CrossEntropyLoss(ignore_index=-1)
+    nothing = replace(scan, label=np.full(len(scan), IGNORE, np.uint8))
+    table = id_table(0, -1, np.int64)
+    assert torch.isnan(loss(logits, torch.from_numpy(table[nothing.label])))  # type: ignore[index]
+    assert torch.isfinite(loss(logits, torch.from_numpy(class_ids(scan, table))))
+    for bare in (nothing, replace(scan, label=None)):
+        with pytest.raises(DataError, match="no valid label"):
+            class_ids(bare, table)
+    for labels in ("none", "ignore"):
+        with pytest.raises(ConfigError, match="is NaN"):
+            refuse_unlabelled({"labels": labels}, "a trainer")
+    refuse_unlabelled({}, "a trainer")
+
+
+@pytest.mark.parametrize(("first", "ignore"), [(0, 19), (0, -1), (1, 0)])
+def test_class_ids(first: int, ignore: int) -> None:
+    table = id_table(first, ignore, np.int32)
+    assert table[:19].tolist() == list(range(first, first + 19)) and (table[19:] == ignore).all()
+
+
+def test_points_are_memory_of_their_own() -> None:
+    """Trap: trainers turn points in place."""
+    scan = Scans("s", 1)[0]
+    points, before = points_of(scan), scan.points.copy()
+    points[:] = 0
+    assert np.array_equal(scan.points, before)
+
+
+class Wrapped(Dataset[Any]):
+    def __init__(self, dataset: Any) -> None:
+        self.point_cloud_dataset = dataset
+
+    def __len__(self) -> int:
+        return len(self.point_cloud_dataset)
+
+    def __getitem__(self, index: int) -> Any:
+        return self.point_cloud_dataset[index]
+
+
+@pytest.mark.parametrize("persistent", [False, True])
+def test_the_loader_tells_the_epoch(persistent: bool) -> None:
+    """Trap: an attribute set in the main process never reaches workers that persist."""
+    mixed = mix(6, {"synthetic": Endless(), "ratio": 0.4}, as_is)
+    loader = EpochLoader(
+        Wrapped(mixed), batch_size=2, num_workers=2, collate_fn=list, persistent_workers=persistent, shuffle=True
+    )
+    seen = []
+    for epoch in range(3):
+        samples = [sample for batch in loader for sample in batch]
+        names = {s.id for s in samples if isinstance(s, Scan)}
+        made = mixed.plan(epoch)
+        assert names == {f"s{n}" for n in made.index[made.domain]}
+        assert Counter(isinstance(s, Scan) for s in samples) == {False: 6, True: 4}
+        seen.append(names)
+    assert not seen[0] & seen[1] and not seen[1] & seen[2]
+
+
+def test_trainers_generators_do_not_decide_on_scans() -> None:
+    """Trap: some seed their workers the same in every epoch."""
+    mixed = mix(6, {"synthetic": Endless(), "ratio": 0.4}, as_is)
+    given = []
+    for seed in (0, 1):
+        np.random.seed(seed)
+        torch.manual_seed(seed)
+        given.append([s.id if isinstance(s, Scan) else s for s in (mixed[i] for i in range(len(mixed)))])
+    assert given[0] == given[1]
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_the_ground_plane(labelled: bool) -> None:
+    scan = street(3)
+    tilt = np.array([0.03, -0.02])
+    lifted = scan.points + np.c_[np.zeros((len(scan), 2)), scan.points[:, :2] @ tilt].astype(np.float32)
+    tilted = replace(scan, points=lifted, label=scan.label if labelled else None, raw_label=None)
+    plane = ground_plane(tilted)
+    normal = np.array([-tilt[0], -tilt[1], 1]) / np.linalg.norm([*tilt, 1])
+    assert np.allclose(plane[:3], normal, atol=5e-3) and abs(plane[3] - 1.73) < 0.05
+    seen = plane_in_camera(plane, CAMERA)
+    assert seen[1] < -0.99 and abs(seen[3] - 1.73) < 0.05
+    on_it = tilted.points[tilted.label == 8][0] if labelled else (0, 0, -plane[3] / plane[2])
+    moved = CAMERA.camera_from_sensor @ [*on_it, 1]
+    assert abs(seen @ moved) < 0.05
+    with pytest.raises(DataError, match="returns of the ground"):
+        ground_plane(scan[:3])
+
+
+def test_difficulty_is_kittis() -> None:
+    boxes = Boxes(
+        np.tile(np.array([10, 0, 0, 4, 2, 1.5, 0], np.float32), (6, 1)), ("Car",) * 6,
+        truncation=np.array([0, 0.2, 0.4, 0.6, 0, 0]), occlusion=np.array([0, 1, 2, 0, -1, 3]),
+        image_box=np.array([[0, 0, 100, 100]] * 6),
+    )  # fmt: skip
+    assert difficulty(boxes).tolist() == [0, 1, 2, -1, -1, -1]
+    far = replace(boxes, values=boxes.values + np.array([100, 0, 0, 0, 0, 0, 0], np.float32))
+    assert difficulty(replace(far, image_box=None)).tolist() == [-1] * 6  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("origin", ["gravity", "bottom"])
+def test_the_object_database(tmp_path: Path, origin: Any) -> None:
+    import pickle
+
+    objects = ObjectBank.from_scans([street(i) for i in range(3)])
+    path = write_gt_database(objects, tmp_path, origin=origin, infos="dbinfos.pkl")
+    found = pickle.loads(path.read_bytes())["Car"]  # as the trainers read it
+    assert len(found) == len(objects) == 9
+    for i, info in enumerate(found):
+        points = np.fromfile(tmp_path / info["path"], "<f4").reshape(-1, 4)
+        assert len(points) == info["num_points_in_gt"] and info["difficulty"] == 0
+        assert np.allclose(points[:, :3] + info["box3d_lidar"][:3], objects[i].scan.points, atol=1e-5)
+        lift = 0 if origin == "gravity" else info["box3d_lidar"][5] / 2
+        assert np.isclose(info["box3d_lidar"][2] + lift, objects.boxes.values[i, 2], atol=1e-5)
+
+
+def test_a_detectors_mixture_has_boxes_by_the_mix_policy(tmp_path: Path) -> None:
+    """As a configuration says it: a bank of objects by its file, scans without a box."""
+    ObjectBank.from_scans([street(i) for i in range(6)]).save(tmp_path / "objects.npz")
+    settings = {
+        "synthetic": synthetic(tmp_path / "bare", 4, boxes=False), "ratio": 0.5, "labels": "mix",
+        "label_options": {"objects": str(tmp_path / "objects.npz"), "count": 4},
+    }  # fmt: skip
+    given = mix(4, settings, as_is)
+    scans = [s for s in (given[i] for i in range(len(given))) if isinstance(s, Scan)]
+    assert len(scans) == 4
+    found = [boxes for s in scans if (boxes := s.boxes) is not None]
+    assert len(found) == 4 and sum(map(len, found)) >= 4
+    for scan, boxes in zip(scans, found, strict=True):
+        assert (held(boxes, scan.points) >= 5).all() and set(boxes.names) <= {"Car"}
+        assert (difficulty(boxes) >= 0).all() and (boxes.occlusion >= 0).all()
+
+
+@pytest.fixture
+def mixed(tmp_path: Path) -> MixedScans:
+    real = [replace(street(i), domain=0) for i in range(3)]
+    return MixedScans(real, open_synthetic(synthetic(tmp_path / "synthetic", 4)), ratio=0.4, seed=2, to_sample=as_is)
+
+
+def test_a_mixture_as_semantic_kitti(mixed: MixedScans, tmp_path: Path) -> None:
+    """Trap: trainers read a missing ``.label`` as zeros, "car" for one of them: every scan has its own."""
+    assert export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 5
+    read = open_scans(tmp_path / "out", split="train")
+    for i, scan in enumerate(read):
+        assert np.array_equal(scan.points, mixed[i].points) and np.array_equal(scan.label, mixed[i].label)
+    labels = list((tmp_path / "out" / "sequences" / "00" / "labels").iterdir())
+    assert len(labels) == len(read) == 5
+    rows = list(csv.reader((tmp_path / "out" / MANIFEST).read_text().splitlines()[1:]))
+    assert [int(row[1]) for row in rows] == [mixed.domain(i) for i in range(5)]
+    assert export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 0
+
+
+def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:
+    root = tmp_path / "out"
+    assert export_mixture(mixed, root, "kitti", calibration=CAMERA, progress=False) == 5
+    for kind, suffix in [
+        ("velodyne", "bin"),
+        ("label_2", "txt"),
+        ("calib", "txt"),
+        ("image_2", "png"),
+        ("planes", "txt"),
+    ]:
+        assert sorted(p.name for p in (root / "training" / kind).iterdir()) == [f"{i:06d}.{suffix}" for i in range(5)]
+    assert (root / "ImageSets" / "train.txt").read_text().split() == [f"{i:06d}" for i in range(5)]
+    for i, scan in enumerate(KITTIObject(root, "train")):
+        assert scan.boxes is not None and len(scan.boxes) == 2
+        seen = in_view(mixed[i], CAMERA)
+        assert seen.boxes is not None
+        assert np.abs(scan.boxes.values - seen.boxes.values).max() < 0.02  # two decimals
+        assert abs(read_plane(root / "training" / "planes" / f"{i:06d}.txt")[3] - 1.73) < 0.05
+
+
+def test_scans_without_labels_are_not_exported(tmp_path: Path) -> None:
+    """Trap: KITTI-360 has no label per scan."""
+    real = [replace(street(i), label=None, raw_label=None) for i in range(2)]
+    mixed = MixedScans(real, Scans("s", 3, street(0).sensor, 1), ratio=0.5, to_sample=as_is)
+    with pytest.raises(DataError, match="has no label.*label policy"):
+        export_mixture(mixed, tmp_path, "semantic_kitti", progress=False)
+    with pytest.raises(ConfigError, match="to_sample"):
+        export_mixture(MixedScans(real, Scans("s", 3, street(0).sensor, 1)), tmp_path, "kitti", progress=False)
+    with pytest.raises(ConfigError, match="'semantic_kitti' or 'kitti'"):
+        export_mixture(mixed, tmp_path, "kitti360")  # type: ignore[arg-type]
+
+
+def test_missing_planes_are_fitted(tmp_path: Path) -> None:
+    root = kitti(tmp_path, 2)
+    planes = sorted((root / "training" / "planes").iterdir())
+    planes[0].write_text("# Matrix\nWIDTH 4\nHEIGHT 1\n0 -1 0 1.5\n")
+    planes[1].unlink()
+    assert write_planes(root) == 1
+    assert read_plane(planes[0]).tolist() == [0, -1, 0, 1.5]
+    planes[1].write_text("0 -1 0 1.5")
+    with pytest.raises(DataError, match="four, the plane in the last one"):
+        read_plane(planes[1])
+
+
+def test_lists_for_mmdetection3d(tmp_path: Path) -> None:
+    root = kitti(tmp_path / "kitti", 2)
+    entries = json.loads(kitti_list(root, tmp_path / "k.json").read_text())["data_list"]
+    for i, entry in enumerate(entries):
+        scan = KITTIObject(root, "train")[i]
+        assert scan.boxes is not None and len(entry["instances"]) == len(scan.boxes) == 2
+        place, dims = np.array(entry["instances"][0]["bbox_3d"][:3]), entry["instances"][0]["bbox_3d"][3:6]
+        centre = CAMERA.sensor_from_camera @ [*(place - [0, dims[1] / 2, 0]), 1]
+        assert np.allclose(centre[:3], scan.boxes.values[0, :3], atol=1e-4)
+        assert np.allclose(dims, scan.boxes.values[0, [3, 5, 4]], atol=1e-5)
+        reduced = np.fromfile(root / "training" / "velodyne_reduced" / entry["lidar_points"]["lidar_path"], "<f4")
+        assert np.array_equal(reduced.reshape(-1, 4)[:, :3], in_view(scan, CAMERA).points)
+    listed = semantic_kitti_list(semantic_kitti(tmp_path / "sk", 2), tmp_path / "s.json")
+    for entry in json.loads(listed.read_text())["data_list"]:
+        assert (tmp_path / "sk" / entry["lidar_points"]["lidar_path"]).is_file()
+        assert (tmp_path / "sk" / entry["pts_semantic_mask_path"]).is_file()
+
+
+def test_urls_of_a_folder_of_scans(tmp_path: Path) -> None:
+    folder = synthetic(tmp_path / "scans", 2)
+    scan = open_scans(folder)[1]
+    points = np.frombuffer(read_url(f"lsynth://{folder}/000001.bin"), "<f4").reshape(-1, 4)
+    assert np.array_equal(points, points_of(scan))
+    bare = synthetic(tmp_path / "bare", 1, labels=False)
+    with pytest.raises(DataError, match="no valid label"):
+        read_url(f"lsynth://{bare}/000000.label")
+
+
+def test_a_parser_for_range_view_trainers(tmp_path: Path) -> None:
+    (tmp_path / "mix.yaml").write_text("synthetic: bank\n")
+    path = write_parser(tmp_path / "mix.yaml", tmp_path / "mixed")
+    assert path.name == "parser.py" and str(tmp_path / "mix.yaml") in path.read_text()
+    compile(path.read_text(), str(path), "exec")
+    with pytest.raises(ConfigError, match="as the settings"):
+        (tmp_path / "mix.yaml").write_text("")
+        write_parser(tmp_path / "mix.yaml", tmp_path / "mixed")
+
+
+@pytest.mark.parametrize("trainer", ["mmdet3d", "pointcept", "lightning"])
+def test_a_missing_trainer_is_named(trainer: str) -> None:
+    if find_spec(trainer) is not None:
+        pytest.skip(f"{trainer} is installed")
+    with pytest.raises(LibraryError, match=f"{trainer} cannot be imported"):
+        importlib.import_module(f"lidar_synth.integrations.{trainer}")
+
+
+def test_other_missing_trainers_are_named() -> None:
+    from lidar_synth.integrations import cylinder3d, open3d_ml, openpcdet, rangenet
+
+    if any(find_spec(name) for name in ("dataloader", "pcdet", "tasks", "ml3d")):
+        pytest.skip("a checkout is on the path")
+    for call in (cylinder3d.register, openpcdet.dataset_class, rangenet.dataset_class):
+        with pytest.raises(LibraryError, match="cannot be imported"):
+            call()
+    with pytest.raises(LibraryError, match="ml3d.datasets cannot be imported"):
+        open3d_ml.dataset_class("ml3d.datasets")
+
+
+def test_the_stand_in_for_torch_scatter() -> None:
+    path = Path(__file__).parent.parent / "tools" / "stand_ins" / "torch_scatter.py"
+    from importlib.util import module_from_spec, spec_from_file_location
+
+    spec = spec_from_file_location("stand_in_scatter", path)
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    values, index = torch.randn(20, 3), torch.randint(0, 4, (20,))
+    index[:4] = torch.arange(4)
+    for i in range(4):
+        assert torch.equal(module.scatter_max(values, index, dim=0)[0][i], values[index == i].amax(0))
+        assert torch.allclose(module.scatter_mean(values, index, dim=0)[i], values[index == i].mean(0))
+
+
+def test_loaders_take_a_mixture_of_plain_items() -> None:
+    """Trap: collate wants the same keys in every sample, with labels, boxes and confidence or without."""
+    real = [replace(s, label=None, raw_label=None) if i % 2 else s for i, s in enumerate(Scans("r", 6))]
+    mixed = MixedScans(Scans("r", 0, SMALL) or real, Endless(), ratio=0.4)
+    loader = DataLoader(mixed, batch_size=5, collate_fn=mixed.collate)
+    assert [sorted(batch) for batch in loader] == [sorted(mixed.collate([mixed[0], mixed[1]]))] * 2

@@ -1,0 +1,139 @@
+# ruff: noqa: E402, NPY001, NPY002 - imports wait for what they need; Cylinder3D is of numpy's older days
+"""Cylinder3D's own voxels, augmentation and collate code on mixed scans: CYLINDER3D_ROOT is a checkout."""
+
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from checkouts import checkout, stand_in
+from streets import semantic_kitti, synthetic
+
+ROOT = checkout("CYLINDER3D_ROOT", "Cylinder3D")
+sys.path.append(str(ROOT))
+np.int = int  # type: ignore[attr-defined]  # Cylinder3D is written for numpy before 1.24
+stand_in("strictyaml")
+
+from dataloader.dataset_semantickitti import collate_fn_BEV, get_model_class
+from dataloader.pc_dataset import SemKITTI_sk, get_pc_model_class
+from lidar_synth.integrations.cylinder3d import NAME, register
+from lidar_synth.integrations.mixture import VARIABLE, EpochLoader
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.formats import open_scans
+
+REAL, EXTRA = 6, 4
+LABELS = str(ROOT / "config/label_mapping/semantic-kitti.yaml")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("cylinder3d")
+    semantic_kitti(root / "sk", REAL)
+    for sequence in ("01", "02", "03", "04", "05", "06", "07", "09", "10"):
+        (root / "sk" / "sequences" / sequence / "velodyne").mkdir(parents=True)
+    synthetic(root / "synthetic", 11)
+    (root / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(root / "synthetic"), "ratio": 0.4, "seed": 3}))
+    return root
+
+
+@pytest.fixture
+def points(made: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setenv(VARIABLE, str(made / "mix.yaml"))
+    register()
+    return get_pc_model_class(NAME)(f"{made}/sk/sequences", "train", return_ref=True, label_mapping=LABELS)
+
+
+def voxels(dataset: Any, augment: bool = True) -> Any:
+    options = dict.fromkeys(("flip_aug", "rotate_aug", "scale_aug", "transform_aug"), augment)
+    return get_model_class("cylinder_dataset")(
+        dataset, [48, 36, 8], fixed_volume_space=True, ignore_label=0, return_test=True, **options
+    )
+
+
+def test_two_epochs_see_exactly_the_planned_scans(made: Path, points: Any) -> None:
+    loader = EpochLoader(voxels(points), batch_size=2, shuffle=True, num_workers=2, collate_fn=list)
+    seen = []
+    for epoch in (0, 1):
+        indices = [sample[-1] for batch in loader for sample in batch]
+        assert sorted(indices) == list(range(REAL + EXTRA)) and points.mixed.epoch == epoch
+        assert Counter(points.mixed.domain(i) for i in indices) == {0: REAL, 1: EXTRA}
+        made_plan = points.mixed.plan(epoch)
+        seen.append(set(made_plan.index[made_plan.domain].tolist()))
+    assert not seen[0] & seen[1] and len(seen[0]) == EXTRA
+
+
+def test_workers_give_the_scans_of_their_epoch(made: Path, points: Any) -> None:
+    source = open_scans(made / "synthetic")
+    loader = EpochLoader(points, batch_size=1, num_workers=2, collate_fn=list)
+    for epoch in (0, 1):
+        made_plan = points.mixed.plan(epoch)
+        for position, [(xyz, _, _)] in enumerate(loader):
+            if made_plan.domain[position]:
+                assert np.array_equal(xyz, source[int(made_plan.index[position])].points)
+
+
+def test_real_samples_are_the_trainers_own(made: Path, points: Any) -> None:
+    own = SemKITTI_sk(f"{made}/sk/sequences", "train", return_ref=True, label_mapping=LABELS)
+    for position in (i for i in range(len(points)) if not points.mixed.domain(i)):
+        for a, b in zip(points[position], own[points.mixed[position]], strict=True):
+            assert a.dtype == b.dtype and np.array_equal(a, b)
+
+
+def test_labels_arrive_in_the_trainers_ids(made: Path, points: Any) -> None:
+    source = open_scans(made / "synthetic")
+    for position in (i for i in range(len(points)) if points.mixed.domain(i)):
+        xyz, label, strength = points[position]
+        scan = source[int(points.mixed.plan().index[position])]
+        assert label.dtype == np.uint8 and label.shape == (len(scan), 1) and scan.label is not None
+        assert np.array_equal(label[:, 0], np.where(scan.label == 255, 0, scan.label + 1))
+        assert np.array_equal(xyz, scan.points) and np.array_equal(strength, scan.reflectance)
+
+
+def test_turning_in_place_does_not_reach_the_source(made: Path, points: Any) -> None:
+    """Trap: Cylinder3D turns and flips the array that it is handed."""
+    from lidar_synth.scan import Scan
+
+    kept = {i: points.mixed[i] for i in range(len(points)) if points.mixed.domain(i)}
+    before = {i: scan.points.copy() for i, scan in kept.items()}
+    inner = points.mixed.sample
+    points.mixed.sample = lambda epoch, i: kept.get(i, inner(epoch, i))
+    np.random.seed(0)
+    turned = voxels(points)
+    for position in kept:
+        turned[position]
+        assert isinstance(kept[position], Scan) and np.array_equal(kept[position].points, before[position])
+
+
+def test_batches_go_through_its_collate(points: Any) -> None:
+    dataset = get_model_class("cylinder_dataset")(points, [48, 36, 8], fixed_volume_space=True, ignore_label=0)
+    for batch in EpochLoader(dataset, batch_size=5, collate_fn=collate_fn_BEV):
+        assert batch[0].shape == (5, 3, 48, 36, 8) and (batch[1] > 0).any()
+
+
+def test_validation_is_the_trainers_own(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, str(made / "mix.yaml"))
+    (made / "sk" / "sequences" / "08").exists() or (made / "sk" / "sequences" / "08").symlink_to("00")
+    val = register_once()(f"{made}/sk/sequences", "val", return_ref=True, label_mapping=LABELS)
+    assert len(val) == REAL and val.mixed is None
+
+
+def register_once() -> Any:
+    return register()
+
+
+def test_missing_and_unlabelled_mixtures_are_refused(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    with pytest.raises(ConfigError, match=VARIABLE):
+        register()(f"{made}/sk/sequences", "train", label_mapping=LABELS)
+    bare = synthetic(tmp_path / "bare", 3, labels=False)
+    for labels in ("generated", "none"):
+        (tmp_path / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(bare), "labels": labels}))
+        monkeypatch.setenv(VARIABLE, str(tmp_path / "mix.yaml"))
+        with pytest.raises(ConfigError, match="labels"):
+            register()(f"{made}/sk/sequences", "train", label_mapping=LABELS)

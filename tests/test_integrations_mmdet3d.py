@@ -1,0 +1,412 @@
+# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
+"""MMDetection3D's own datasets, transforms and loaders on mixed lists; skipped where it is not installed."""
+
+import json
+import os
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mmengine", reason="mmengine is not installed: bash tools/install_mmdet3d.sh")
+pytest.importorskip("mmcv", reason="mmcv is not installed: bash tools/install_mmdet3d.sh")
+import mmcv_ext
+
+mmcv_ext.install()
+pytest.importorskip("mmdet3d", reason="mmdet3d is not installed: bash tools/install_mmdet3d.sh")
+
+import lidar_synth.integrations.mmdet3d as adapter
+import mmdet3d
+import torch
+from layouts import write_all
+from lidar_synth.integrations.detection import in_view, write_gt_database
+from lidar_synth.integrations.mmdet3d_infos import Folder, open_folder, read_url, write_infos
+from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
+from mmdet3d.registry import DATASETS, TRANSFORMS
+from mmengine.config import Config
+from mmengine.dataset import pseudo_collate
+from mmengine.fileio import get
+from mmengine.registry import init_default_scope
+from streets import CAMERA, held, kitti, semantic_kitti, street, synthetic
+from torch.utils.data import DataLoader
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.formats import open_scans
+from lidar_synth.labels import ObjectBank
+from lidar_synth.scan import Boxes, Scan
+
+REAL, EXTRA, SYNTHETIC = 6, 4, 11
+"""Real scans, synthetic samples of an epoch, synthetic scans that there are."""
+MIX = {"ratio": 0.4, "seed": 3}
+CONFIGS = Path(__file__).parent.parent / "configs" / "mmdet3d"
+DETECTION = "pointpillars_kitti.py"
+DATA_KEYS = ("type", "data_root", "ann_file", "data_prefix", "pts", "filter_empty_gt")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def scope() -> None:
+    init_default_scope("mmdet3d")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Real and synthetic scans, a GT database, and mixed lists for both tasks."""
+    root = tmp_path_factory.mktemp("mmdet3d")
+    settings = MIX | {"synthetic": synthetic(root / "synthetic", SYNTHETIC)}
+    semantic_kitti_list(semantic_kitti(root / "sk", REAL), root / "sk" / "train.json")
+    write_infos(root / "seg", root / "sk" / "train.json", settings, data_root=root / "sk")
+    kitti_list(kitti(root / "kitti", REAL), root / "kitti" / "train.json")
+    write_infos(
+        root / "det", root / "kitti" / "train.json", settings,
+        data_root=root / "kitti", points="training/velodyne_reduced",
+    )  # fmt: skip
+    objects = ObjectBank.from_scans(open_scans(root / "synthetic"))
+    write_gt_database(objects, root / "kitti", origin="bottom", folder="kitti_gt_database", infos="dbinfos.pkl")
+    return root
+
+
+def train_set(config: str) -> dict[str, Any]:
+    """The training dataset of one of our configurations, without what repeats it."""
+    loaded = Config.fromfile(str(CONFIGS / config)).train_dataloader.dataset
+    return loaded.get("dataset", loaded).to_dict()  # type: ignore[no-any-return]
+
+
+def segmentation(made: Path, pipeline: list[dict[str, Any]] | None = None, **options: Any) -> Any:
+    loaded = train_set("minkunet_semantickitti.py") | {"ann_file": str(made / "seg" / "infos.json")} | options
+    if pipeline is not None:
+        loaded["pipeline"] = loaded["pipeline"][:3] + pipeline
+    return DATASETS.build(loaded)
+
+
+def detection(made: Path, pipeline: list[dict[str, Any]] | None = None, **options: Any) -> Any:
+    loaded = train_set(DETECTION) | {"ann_file": str(made / "det" / "infos.json")} | options
+    for step in loaded["pipeline"]:
+        if step["type"] == "ObjectSample":
+            step["db_sampler"] |= {
+                "data_root": str(made / "kitti"), "info_path": str(made / "kitti" / "dbinfos.pkl"),
+                "classes": ["Car"], "sample_groups": {"Car": 5},
+                "prepare": {"filter_by_difficulty": [-1], "filter_by_min_points": {"Car": 5}},
+            }  # fmt: skip
+    if pipeline is not None:
+        loaded["pipeline"] = loaded["pipeline"][:2] + pipeline
+    return DATASETS.build(loaded)
+
+
+PACK = {"type": "Pack3DDetInputs", "keys": ["points", "pts_semantic_mask"], "meta_keys": ["lidar_path"]}
+PACK_BOXES = {
+    "type": "Pack3DDetInputs",
+    "keys": ["points", "gt_labels_3d", "gt_bboxes_3d"],
+    "meta_keys": ["lidar_path"],
+}
+
+
+def is_synthetic(sample: Any) -> bool:
+    return str(sample.lidar_path).startswith("lsynth://")
+
+
+@pytest.mark.parametrize("make", [segmentation, detection])
+def test_two_epochs_see_exactly_the_planned_scans(made: Path, make: Any) -> None:
+    """Through a loader with persistent workers, which keep what they have read of the folder."""
+    packed = PACK if make is segmentation else PACK_BOXES
+    dataset = make(made, [packed])
+    folder = open_folder(made / ("seg" if make is segmentation else "det"))
+    loader = DataLoader(
+        dataset, batch_size=2, num_workers=2, shuffle=True, persistent_workers=True, collate_fn=pseudo_collate
+    )
+    source = open_scans(made / "synthetic")
+    ids = {scan.reflectance[:50].tobytes() if make is segmentation else i: i for i, scan in enumerate(source)}
+    seen: list[set[int]] = []
+    for epoch in (0, 1):
+        folder.epoch = epoch
+        samples = [s for batch in loader for s in zip(batch["data_samples"], batch["inputs"]["points"], strict=True)]
+        assert Counter(is_synthetic(s) for s, _ in samples) == {False: REAL, True: EXTRA}
+        planned = folder.mixed.plan(epoch)
+        wanted = set(planned.index[planned.domain].tolist())
+        if make is segmentation:
+            given = {ids[p[:50, 3].numpy().tobytes()] for s, p in samples if is_synthetic(s)}
+            assert given == wanted
+        seen.append(wanted)
+    assert not seen[0] & seen[1]
+    folder.epoch = 0
+
+
+def test_real_samples_are_the_trainers_own(made: Path) -> None:
+    stock = train_set("minkunet_semantickitti.py") | {
+        "ann_file": str(made / "sk" / "train.json"), "data_root": str(made / "sk"),
+    }  # fmt: skip
+    stock["pipeline"] = [*stock["pipeline"][:3], PACK]
+    ours, theirs = segmentation(made, [PACK]), DATASETS.build(stock)
+    for i in range(REAL):
+        assert torch.equal(ours[i]["inputs"]["points"], theirs[i]["inputs"]["points"])
+        mine, own = (d[i]["data_samples"].gt_pts_seg.pts_semantic_mask for d in (ours, theirs))
+        assert np.array_equal(mine, own)
+
+
+def test_real_boxes_are_the_trainers_own(made: Path) -> None:
+    stock = train_set(DETECTION) | {
+        "type": "KittiDataset", "ann_file": str(made / "kitti" / "train.json"), "data_root": str(made / "kitti"),
+        "data_prefix": {"pts": "training/velodyne_reduced"},
+    }  # fmt: skip
+    stock["pipeline"] = [*stock["pipeline"][:2], PACK_BOXES]
+    ours, theirs = detection(made, [PACK_BOXES]), DATASETS.build(stock)
+    for i in range(REAL):
+        assert torch.equal(ours[i]["inputs"]["points"], theirs[i]["inputs"]["points"])
+        boxes = [d[i]["data_samples"].gt_instances_3d.bboxes_3d.tensor for d in (ours, theirs)]
+        assert torch.equal(*boxes) and len(boxes[0]) == 2
+
+
+def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
+    dataset, folder = segmentation(made, [PACK]), open_folder(made / "seg")
+    for slot in range(EXTRA):
+        sample, scan = dataset[REAL + slot], folder.scan(slot)
+        points, mask = sample["inputs"]["points"], sample["data_samples"].gt_pts_seg.pts_semantic_mask
+        assert np.array_equal(points, np.c_[scan.points, scan.reflectance])
+        assert np.array_equal(mask, np.where(scan.label == IGNORE, 19, scan.label))  # type: ignore[arg-type]
+
+
+def inside(sample: Any) -> list[int]:
+    """Points in each box after the trainer's transforms; its boxes are ours, by their corners."""
+    boxes = sample["data_samples"].gt_instances_3d.bboxes_3d
+    ours = Boxes(np.c_[boxes.gravity_center, boxes.dims, boxes.yaw], ("Car",) * len(boxes))
+    assert np.allclose(np.sort(boxes.corners, 1), np.sort(ours.corners(), 1), atol=1e-4)
+    return [int(c) for c in held(ours, sample["inputs"]["points"][:, :3].numpy())]
+
+
+def test_boxes_hold_their_points_after_the_trainers_transforms(made: Path) -> None:
+    """Flip, turn, scale and range filters of stock PointPillars."""
+    torch.manual_seed(0)
+    np.random.seed(0)  # the trainer's own generators
+    steps = train_set(DETECTION)["pipeline"]
+    dataset, folder = detection(made, steps[3:]), open_folder(made / "det")
+    for slot in range(EXTRA):
+        scan = folder.scan(slot)
+        assert scan.boxes is not None and len(scan.boxes) == 2  # the third stands behind the camera
+        sample = dataset[REAL + slot]
+        counts, before = inside(sample), held(scan.boxes, scan.points)
+        assert before.min() >= 10 and np.abs(counts - before).max() <= 3  # those on a face
+        assert sample["data_samples"].gt_instances_3d.labels_3d.tolist() == [2, 2]
+
+
+def test_objects_are_sampled_into_synthetic_scans_on_their_ground(made: Path) -> None:
+    """The whole stock pipeline. (Its ``ObjectSample`` clears the room of an object by a box turned the other way round,
+    which costs the neighbours some points, in real scans alike.)"""
+    torch.manual_seed(0)
+    np.random.seed(0)
+    dataset = detection(made)
+    for slot in range(EXTRA):
+        counts = inside(dataset[REAL + slot])
+        assert len(counts) >= 2 and min(counts) >= 1
+
+
+def test_boxes_are_bottom_centred_and_planes_point_up(made: Path) -> None:
+    dataset, folder = detection(made, [PACK_BOXES]), open_folder(made / "det")
+    for slot in range(EXTRA):
+        info, scan = dataset.get_data_info(REAL + slot), folder.scan(slot)
+        boxes = info["ann_info"]["gt_bboxes_3d"].numpy()
+        assert scan.boxes is not None
+        floor = scan.boxes.values[:, 2] - scan.boxes.values[:, 5] / 2
+        assert np.allclose(boxes[:, 2], floor, atol=1e-6) and np.array_equal(boxes[:, :2], scan.boxes.values[:, :2])
+        assert (
+            info["plane"][2] > 0.99 and abs(info["plane"][3] - 1.73) < 0.05
+        )  # the sensor stands 1.73 m above the road
+        real = dataset.get_data_info(slot)["plane"]
+        assert np.allclose(real, info["plane"], atol=0.05)
+
+
+@pytest.mark.parametrize("mixer", ["LaserMix", "PolarMix", "FrustumMix"])
+def test_partners_are_real_and_synthetic(made: Path, mixer: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trap: partners come from the inner dataset, so that of two joined ones each would mix with itself only."""
+    load = train_set("minkunet_semantickitti.py")["pipeline"][:3]
+    step: dict[str, Any] = {"type": mixer, "pre_transform": load, "prob": 1.0}
+    if mixer == "FrustumMix":
+        pytest.importorskip("frnet.datasets.transforms", reason="FRNet's repository is not on the path")
+        step |= {"H": 32, "W": 256, "fov_up": 3.0, "fov_down": -25.0, "num_areas": [4]}
+    elif mixer == "LaserMix":
+        step |= {"num_areas": [4], "pitch_angles": [-25, 3]}
+    else:
+        step |= {"instance_classes": [0], "swap_ratio": 1.0}
+    dataset = segmentation(made, [step, PACK])
+    drawn, inner = [], dataset.get_data_info
+    monkeypatch.setattr(dataset, "get_data_info", lambda i: drawn.append(i) or inner(i))
+    np.random.seed(0)  # the trainer draws partners from it
+    for i in range(len(dataset)):
+        assert dataset[i]["inputs"]["points"].shape[0] > 100
+    partners = drawn[1::2]
+    assert {p >= REAL for p in partners} == {False, True}
+
+
+def test_scans_without_a_box_are_not_replaced(made: Path, tmp_path: Path) -> None:
+    """Trap: the stock setting replaces them, before ObjectSample can give them any, and the ratio is gone."""
+    settings = MIX | {"synthetic": synthetic(tmp_path / "bare", 5, boxes=False)}
+    where = {"data_root": made / "kitti", "points": "training/velodyne_reduced"}
+    path = write_infos(tmp_path / "det", made / "kitti" / "train.json", settings, **where)
+    dataset = detection(made, ann_file=str(path))
+    samples = [dataset[i] for i in range(REAL + EXTRA)]
+    assert [len(s["data_samples"].gt_instances_3d.labels_3d) > 0 for s in samples] == [True] * (REAL + EXTRA)
+    bare = detection(made, [PACK_BOXES], ann_file=str(path))
+    counts = [len(bare[i]["data_samples"].gt_instances_3d.labels_3d) for i in range(REAL + EXTRA)]
+    assert [c > 0 for c in counts] == [True] * REAL + [False] * EXTRA
+    with pytest.raises(ConfigError, match="filter_empty_gt=False"):
+        detection(made, ann_file=str(path), filter_empty_gt=True)
+
+
+def test_a_bank_is_read_by_url(made: Path) -> None:
+    source = open_scans(made / "synthetic")
+    url = f"lsynth://{made / 'synthetic'}/3"
+    points = np.frombuffer(get(f"{url}.bin"), "<f4").reshape(-1, 4)
+    assert np.array_equal(points[:, :3], source[3].points)
+    labels = np.frombuffer(get(f"{url}.label"), "<u4") & 0xFFFF
+    assert set(labels.tolist()) == {10, 40, 50}
+    for wrong in (f"{url}.png", "lsynth://3.bin", f"{url}x.bin"):
+        with pytest.raises(DataError, match="lsynth://<folder or bank>"):
+            read_url(wrong)
+
+
+def test_what_cannot_be_trained_on_is_refused_before(made: Path, tmp_path: Path) -> None:
+    listed, root = made / "sk" / "train.json", {"data_root": made / "sk"}
+    for labels in ("none", "ignore"):
+        with pytest.raises(ConfigError, match="its loss, a mean over none, is NaN"):
+            write_infos(tmp_path / "a", listed, MIX | {"synthetic": made / "synthetic", "labels": labels}, **root)
+    unlabelled = synthetic(tmp_path / "unlabelled", 2, labels=False)
+    with pytest.raises(ConfigError, match="a model or bank with labels"):
+        write_infos(tmp_path / "b", listed, MIX | {"synthetic": unlabelled}, **root)
+    with pytest.raises(ConfigError, match="a list is read once"):
+        write_infos(tmp_path / "c", listed, MIX | {"synthetic": made / "synthetic", "ratio": [0.1, 0.5]}, **root)
+    with pytest.raises(ConfigError, match="settings .'rate'."):
+        write_infos(tmp_path / "d", listed, MIX | {"synthetic": made / "synthetic", "rate": 1}, **root)
+    (tmp_path / "old.json").write_text("[]")
+    with pytest.raises(DataError, match="no 'data_list'"):
+        write_infos(tmp_path / "e", tmp_path / "old.json", MIX | {"synthetic": made / "synthetic"})
+    boxless = Path(tmp_path / "boxless")
+    write_all("npz", boxless, [replace(street(i), boxes=None) for i in range(3)])
+    with pytest.raises(DataError, match="no boxes.*labels='mix'"):
+        write_infos(
+            tmp_path / "g", made / "kitti" / "train.json", MIX | {"synthetic": boxless},
+            data_root=made / "kitti", points="training/velodyne_reduced",
+        )  # fmt: skip
+    entries = json.loads((made / "kitti" / "train.json").read_text())
+    del entries["data_list"][0]["images"]
+    (tmp_path / "bare.json").write_text(json.dumps(entries))
+    with pytest.raises(DataError, match="images.CAM2"):
+        write_infos(tmp_path / "f", tmp_path / "bare.json", MIX | {"synthetic": made / "synthetic"})
+
+
+def test_other_synthetic_scans_than_the_lists_are_noticed(made: Path, tmp_path: Path) -> None:
+    source = synthetic(tmp_path / "s", 3)
+    write_infos(tmp_path / "seg", made / "sk" / "train.json", MIX | {"synthetic": source}, data_root=made / "sk")
+    next(source.rglob("*.npz")).unlink()
+    with pytest.raises(DataError, match="not those of the list"):
+        Folder.open(tmp_path / "seg")
+
+
+class FakeLoader:
+    batch_size = 2
+
+    def __init__(self, dataset: Any) -> None:
+        self.dataset = dataset
+
+
+class FakeRunner:
+    world_size, epoch, iter = 1, 7, 0
+    train_loop: Any = None
+
+    def __init__(self, dataset: Any) -> None:
+        self.train_dataloader = FakeLoader(dataset)
+
+
+def test_the_hook_tells_the_epoch_through_wrappers(made: Path) -> None:
+    wrapped = DATASETS.build({"type": "RepeatDataset", "times": 2, "dataset": segmentation(made, [PACK])})
+    hook, runner = adapter.SynthEpochHook(), FakeRunner(wrapped)
+    hook.before_train(runner)
+    assert open_folder(made / "seg").epoch == 7
+    runner.epoch = 8
+    hook.before_train_epoch(runner)
+    assert open_folder(made / "seg").epoch == 8
+    open_folder(made / "seg").epoch = 0
+
+
+class IterBasedTrainLoop:
+    """By its name, as the hook knows it."""
+
+
+def test_the_hook_counts_passes_where_there_are_no_epochs(made: Path) -> None:
+    hook, runner, folder = adapter.SynthEpochHook(), FakeRunner(segmentation(made, [PACK])), open_folder(made / "seg")
+    runner.train_loop = IterBasedTrainLoop()
+    steps = (REAL + EXTRA) // 2
+    for runner.iter, wanted in ((steps + 1, 1), (2 * steps, 2)):
+        hook.before_train(runner)
+        assert folder.epoch == wanted
+    hook.before_train_iter(runner, 0)
+    runner.iter = 3 * steps - 1
+    hook.before_train_iter(runner, 0)
+    assert folder.epoch == 2
+    runner.iter += 1
+    hook.before_train_iter(runner, 0)
+    assert folder.epoch == 3
+    folder.epoch = 0
+
+
+def test_classes_that_do_not_fit_are_refused(made: Path) -> None:
+    dataset = segmentation(made, [PACK])
+    adapter.SynthEpochHook().before_train(FakeRunner(dataset))
+    meta = train_set("minkunet_semantickitti.py")["metainfo"]
+    meta = {**meta, "seg_label_mapping": {**meta["seg_label_mapping"], 10: 4}}
+    with pytest.raises(ConfigError, match="SemanticKITTI's 19 classes"):
+        adapter.SynthEpochHook().before_train(FakeRunner(segmentation(made, [PACK], metainfo=meta)))
+    with pytest.raises(ConfigError, match="without a mixed list"):
+        adapter.SynthEpochHook().before_train(FakeRunner(object()))
+
+
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    """{dotted key: value} of a configuration."""
+    if not isinstance(config, dict):
+        return {prefix: config}
+    return {key: value for name in config for key, value in flat(config[name], f"{prefix}.{name}").items()}
+
+
+def bare(value: Any) -> Any:
+    """A value without mmengine's notes of whose configuration it comes from."""
+    if isinstance(value, dict):
+        return {key: bare(item) for key, item in value.items() if key != "_scope_"}
+    return [bare(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.py")), ids=lambda p: p.stem)
+def test_configurations_change_data_only(path: Path) -> None:
+    if path.stem.startswith("frnet"):
+        pytest.importorskip("frnet", reason="FRNet's repository is not on the path (PYTHONPATH and FRNET_ROOT)")
+    config = Config.fromfile(str(path))
+    stock = path.read_text().split('_base_ = ["')[1].split('"]')[0]
+    stock = stock.replace("mmdet3d::", f"{Path(mmdet3d.__file__).parent}/.mim/configs/")
+    ours = flat(bare(config.to_dict()))
+    stock = stock.replace("{{$FRNET_ROOT:.}}", os.environ.get("FRNET_ROOT", "."))
+    theirs = flat(bare(Config.fromfile(stock).to_dict()))
+    changed = {key for key in ours if ours[key] != theirs.get(key)} | set(theirs) - set(ours)
+    assert all(key.startswith((".train_dataloader", ".custom")) for key in changed)
+    names = {key.rpartition(".")[2] for key in changed}
+    assert names <= {"imports", "allow_failed_imports", "custom_hooks", *DATA_KEYS}, changed
+    assert {"type": "SynthEpochHook"} in [dict(h) for h in config.custom_hooks]
+
+
+def test_the_view_is_the_cameras(made: Path) -> None:
+    scan = Scan(
+        np.array([(10, 0, 0), (-10, 0, 0), (10, 30, 0), (0.1, 0, -1)], np.float32),
+        np.zeros(4, np.float32),
+        open_scans(made / "synthetic").sensor,
+    )
+    assert np.array_equal(in_view(scan, CAMERA).points, scan.points[:1])
+
+
+def test_the_database_is_drawn_from(made: Path) -> None:
+    sampler = {
+        "type": "DataBaseSampler", "data_root": str(made / "kitti"), "info_path": str(made / "kitti" / "dbinfos.pkl"),
+        "rate": 1.0, "prepare": {"filter_by_difficulty": [-1], "filter_by_min_points": {"Car": 5}},
+        "classes": ["Car"], "sample_groups": {"Car": 3},
+        "points_loader": {"type": "LoadPointsFromFile", "coord_type": "LIDAR", "load_dim": 4, "use_dim": 4},
+    }  # fmt: skip
+    found = TRANSFORMS.build(sampler).sample_all(np.zeros((0, 7), np.float32), np.zeros(0, np.int64))
+    assert found is not None and len(found["gt_labels_3d"]) >= 1

@@ -1,0 +1,109 @@
+"""Trains stock PointPillars and FRNet for a few iterations on a real and synthetic mixture and prints the losses.
+
+The scans are the town's: one seed stands for the real dataset, in KITTI's and SemanticKITTI's own layouts, another for
+the synthetic one. So this shows that the trainer takes the mixture, not that it helps. Run by ``try_mmdet3d.sh``.
+"""
+
+import argparse
+import os
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lidar_synth.integrations.detection import write_gt_database
+from lidar_synth.integrations.folders import write_planes
+from lidar_synth.integrations.mmdet3d_infos import write_infos
+from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
+from mmengine.config import Config
+from mmengine.hooks import Hook
+from mmengine.registry import HOOKS, init_default_scope
+from mmengine.runner import Runner
+
+from lidar_synth.convert import convert
+from lidar_synth.formats import WRITERS, open_scans
+from lidar_synth.labels import ObjectBank
+from lidar_synth.town import Town, export_town
+
+CONFIGS = Path(__file__).parent.parent / "configs" / "mmdet3d"
+
+
+@HOOKS.register_module()
+class Report(Hook):  # type: ignore[misc]
+    """Prints each iteration's loss and which of its scans were synthetic."""
+
+    def after_train_iter(self, runner: Any, batch_idx: int, data_batch: Any = None, outputs: Any = None) -> None:
+        losses = {key: float(np.asarray(value.detach())) for key, value in outputs.items()}
+        kinds = Counter(
+            "synthetic" if str(s.lidar_path).startswith("lsynth://") else "real" for s in data_batch["data_samples"]
+        )
+        print(f"epoch {runner.epoch} iteration {runner.iter + 1}: loss {losses['loss']:.3f}, {dict(kinds)}", flush=True)
+
+
+def prepare(out: Path, real: int, synthetic: int) -> None:
+    """Datasets, lists and GT database under ``out``."""
+    for layout in ("kitti", "semantic_kitti"):
+        export_town(Town(seed=1, scans=real), out / layout, layout, camera=False)
+    made = out / "synthetic"
+    convert(Town(seed=2, scans=synthetic), WRITERS["npz"](made))
+    settings = {"synthetic": made, "ratio": 0.5, "seed": 0}
+    write_planes(out / "kitti")
+    kitti_list(out / "kitti", out / "kitti" / "train.json")
+    write_infos(
+        out / "det", out / "kitti" / "train.json", settings, data_root=out / "kitti", points="training/velodyne_reduced"
+    )
+    objects = ObjectBank.from_scans(open_scans(made))
+    write_gt_database(objects, out / "kitti", origin="bottom", folder="kitti_gt_database", infos="dbinfos.pkl")
+    semantic_kitti_list(out / "semantic_kitti", out / "semantic_kitti" / "train.json")
+    root = {"data_root": out / "semantic_kitti"}
+    write_infos(out / "seg", out / "semantic_kitti" / "train.json", settings, **root)
+
+
+def train(name: str, folder: Path, iterations: int, gt_root: Path) -> None:
+    """A few iterations of a configuration on the mixed list in a folder."""
+    config = Config.fromfile(str(CONFIGS / name))
+    loader = config.train_dataloader
+    dataset = loader.dataset.dataset if loader.dataset.type == "RepeatDataset" else loader.dataset
+    dataset.ann_file = str(folder / "infos.json")
+    loader.update(batch_size=2, num_workers=1)
+    for step in dataset.pipeline:
+        if step.type == "ObjectSample":
+            step.db_sampler.update(data_root=str(gt_root), info_path=str(gt_root / "dbinfos.pkl"))
+    dataset.pipeline[-1].meta_keys = ("lidar_path", "num_points", "box_type_3d", "box_mode_3d")
+    config.train_cfg = {"type": "IterBasedTrainLoop", "max_iters": iterations, "val_interval": 10**6}
+    config.optim_wrapper = {"type": "OptimWrapper", "optimizer": {"type": "AdamW", "lr": 1e-3}}
+    config.param_scheduler = []
+    for key in ("val_cfg", "val_dataloader", "val_evaluator", "test_cfg", "test_dataloader", "test_evaluator"):
+        config[key] = None
+    config.custom_hooks = [*config.custom_hooks, {"type": "Report"}]
+    config.work_dir = str(folder / "work")
+    config.default_hooks.checkpoint = None
+    config.log_level = "WARNING"
+    init_default_scope("mmdet3d")
+    print(f"{name}: {config.model.type}, {iterations} iterations", flush=True)
+    Runner.from_cfg(config).train()
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path, help="folder for the scans")
+    parser.add_argument("--iterations", type=int, default=4)
+    parser.add_argument("--scans", type=int, default=8, help="real ones, and as many synthetic")
+    parser.add_argument("--only", choices=["pointpillars", "frnet"], help="one of the two")
+    options = parser.parse_args()
+    out = options.out.resolve()
+    if not (out / "seg" / "infos.json").is_file():
+        prepare(out, options.scans, options.scans)
+    if options.only != "frnet":
+        train("pointpillars_kitti.py", out / "det", options.iterations, out / "kitti")
+    if options.only == "pointpillars":
+        return
+    if os.environ.get("FRNET_ROOT"):
+        train("frnet_semantickitti.py", out / "seg", options.iterations, out / "kitti")
+    else:
+        print("FRNET_ROOT is not set to a checkout of FRNet: skipped")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,20 @@
+#!/usr/bin/env bash
+# Trains stock PointPillars (KITTI) and FRNet (SemanticKITTI) for a few iterations on the CPU, on a mixture of two towns.
+#
+#   bash tools/install_mmdet3d.sh .venv --ops
+#   FRNET_ROOT=/path/to/FRNet bash tools/try_mmdet3d.sh .venv OUT [--iterations 4] [--scans 8]
+#
+# FRNet is a repository of its own (github.com/Xiangxu-0103/FRNet). Where torch_scatter is not installed, tools/stand_ins
+# has the two functions of it that FRNet calls.
+set -euo pipefail
+
+venv="${1:?usage: try_mmdet3d.sh VENV OUT [OPTIONS]}"
+here="$(cd "$(dirname "$0")" && pwd)"
+shift
+path="${PYTHONPATH:-}"
+if [ -n "${FRNET_ROOT:-}" ]; then
+    path="$FRNET_ROOT:$path"
+    "$venv/bin/python" -c 'import torch_scatter' 2>/dev/null || path="$here/stand_ins:$path"
+fi
+export FRNET_ROOT="${FRNET_ROOT:-}"
+PYTHONPATH="$path" exec "$venv/bin/python" "$here/try_mmdet3d.py" "$@"
