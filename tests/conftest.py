@@ -1,6 +1,7 @@
 """Where tests find what is not in the repository, and the small scans they share."""
 
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,9 @@ import pytest
 
 from lidar_synth.scan import Scan
 from lidar_synth.sensor import Sensor, presets
+
+# A shell leaves SIGINT ignored in what it starts in the background, and so in every process that tests start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _folder(variable: str) -> Path:

@@ -66,11 +66,11 @@ def rewrite(path: Path, **changes: Any) -> None:
 
 def replace_weights(path: Path, change: Any) -> None:
     """Save other weights under a header that knows nothing of it but their sum, as a careless tool would."""
-    from lidar_synth.checkpoint import _sum
+    from lidar_synth.checkpoint import weights_hash
 
     tensors = load_file(path)
     change(tensors)
-    save_file(tensors, path, {"lidar_synth": json.dumps({**HEADER.to_dict(), "weights": _sum(tensors)})})
+    save_file(tensors, path, {"lidar_synth": json.dumps({**HEADER.to_dict(), "weights": weights_hash(tensors)})})
 
 
 def test_everything_comes_back(saved: Path) -> None:

@@ -17,7 +17,7 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, re.S)
 
 
-@pytest.mark.parametrize(("code", "seen"), zip(blocks("python"), ("torch.Size", "dict_keys"), strict=True))
+@pytest.mark.parametrize(("code", "seen"), list(zip(blocks("python"), ("torch.Size", "dict_keys"), strict=True)))
 def test_the_ten_lines_run(code: str, seen: str, tmp_path: Path) -> None:
     pytest.importorskip("embreex")
     export_town(Town(0, scans=3), tmp_path / "demo_out" / "town", "semantic_kitti", camera=False, progress=False)
