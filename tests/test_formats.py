@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import random_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -21,9 +22,10 @@ from lidar_synth.formats.range_images import RangeImages
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.projection import locate, project
 from lidar_synth.scan import Boxes, Scan, Source
+from lidar_synth.sensor import presets
 
 POINT_LAYOUTS = [name for name in WRITERS if name not in ("range", "png")]
-KEEP_FIELDS = ["kitti", "semantic_kitti", "pcd", "ply", "npz"]
+KEEP_FIELDS = ["kitti", "semantic_kitti", "pcd", "ply", "npz", "webdataset"]
 """Formats that keep every label and instance bit for bit."""
 
 
@@ -65,7 +67,7 @@ def test_labels_come_back_bit_for_bit(tmp_path: Path, to: str) -> None:
         assert getattr(read, name).dtype == getattr(scan, name).dtype
 
 
-@pytest.mark.parametrize("to", formats(["pcd", "ply", "npz"]))
+@pytest.mark.parametrize("to", formats(["pcd", "ply", "npz", "webdataset"]))
 def test_every_field_of_a_point_comes_back(tmp_path: Path, to: str) -> None:
     scan = some_scan()
     scan.ring = np.arange(len(scan), dtype=np.int16) % 64
@@ -527,6 +529,15 @@ def test_names_are_kept_where_a_layout_can_keep_them(tmp_path: Path) -> None:
         "ply": f"{frame}.ply",
         "npz": f"{frame}.npz",
         "png": f"range/{frame.replace('/', '_')}.png",
+        "webdataset": f".lidar_synth/000000007/{frame}.tar",
     }
     assert WRITERS["kitti360"](tmp_path).path(7, "03/000042") == WRITERS["kitti360"](tmp_path).path(7, frame)
     assert WRITERS["semantic_kitti"](tmp_path, sequence="21").path(7, "my_scan").stem == "000007"  # type: ignore[call-arg]
+
+
+def test_a_folder_of_npz_files_has_the_sensor_that_they_tell(tmp_path: Path) -> None:
+    sensor = presets()["os1_128"]
+    WRITERS["npz"](tmp_path).write(random_scan(sensor, 500, seed=0), 0)
+    assert open_scans(tmp_path).sensor == sensor
+    (tmp_path / "000000.npz").write_bytes(b"")
+    assert open_scans(tmp_path).sensor.name == "hdl64e_kitti"  # what is wrong is said when it is read

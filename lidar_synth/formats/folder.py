@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lidar_synth.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.npz import decode_scan, read_arrays, write_scan
+from lidar_synth.formats.npz import decode_scan, read_arrays, told_sensor, write_scan
 from lidar_synth.formats.pcd import read_cloud, write_cloud
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import check_scan, read_points, write_points
@@ -56,8 +56,9 @@ class Folder(ScanFiles):
         root = Path(root)
         self._base, paths = scan_paths(root, SUFFIXES)
         ids = [path.relative_to(self._base).with_suffix("").as_posix() for path in paths]
-        super().__init__(root, ids, "hdl64e_kitti" if sensor is None else sensor, on_bad)
         self._suffix = paths[0].suffix
+        told = told_sensor(paths[0]) if sensor is None and self._suffix == ".npz" else None
+        super().__init__(root, ids, sensor or told or "hdl64e_kitti", on_bad)
         self._given = None if sensor is None else load_sensor(sensor)
         self._fields, self._reflectance_max = fields, reflectance_max
 
