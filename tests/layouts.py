@@ -45,6 +45,7 @@ WRITTEN_AS = {
     "ply": "folder",
     "npz": "folder",
     "png": "png",
+    "webdataset": "webdataset",
 }
 """Which reader reads what each writer writes."""
 
@@ -100,6 +101,12 @@ def write_all(to: str, root: Path, scans: list[Scan], **options: object) -> list
         writer.write(scan, index)
     writer.finish()
     return [writer.path(index) for index in range(len(scans))]
+
+
+def write_tars(root: Path) -> list[Path]:
+    """Three scans as WebDataset's files, one in each; the files."""
+    write_all("webdataset", root, [some_scan(i) for i in range(3)], shard_size=1)
+    return sorted(root.glob("*.tar"))
 
 
 def nuscenes_arrays(count: int = 320, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -162,6 +169,7 @@ MAKERS: dict[str, Callable[[Path], list[Path]]] = {
     "folder": lambda root: write_all("kitti", root, [some_scan(i) for i in range(3)]),
     "range": lambda root: write_all("range", root, [some_scan(i) for i in range(3)]),
     "png": lambda root: write_all("png", root, [some_scan(i) for i in range(3)]),
+    "webdataset": write_tars,
     "nuscenes": write_nuscenes,
     "kitti_raw": write_kitti_raw,
 }

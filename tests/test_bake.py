@@ -365,6 +365,8 @@ def test_models_that_cannot_serve(tmp_path: Path) -> None:
         plan_in(tmp_path / "bank", plain, condition="here")
     with pytest.raises(ConfigError, match="condition None for model .*takes semantic conditions; expected a dataset"):
         plan_in(tmp_path / "bank", write_conditioned(tmp_path / "conditioned.safetensors"))
+    with pytest.raises(FileError, match="nowhere does not exist"):
+        plan_in(tmp_path / "bank", tmp_path / "conditioned.safetensors", condition=str(tmp_path / "nowhere"))
     (tmp_path / "broken.safetensors").write_bytes(b"no")
     with pytest.raises(DataError, match="broken"):
         plan_in(tmp_path / "bank", tmp_path / "broken.safetensors")

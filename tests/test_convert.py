@@ -1,5 +1,6 @@
 """Conversion: everything arrives, reruns do what is missing, bad scans are named."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -8,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from banks import some_image, write_bank
 from layouts import MAKERS, WRITTEN_AS, formats, some_scan, write_all
 from typer.testing import CliRunner
 
+from lidar_synth.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.cli.convert import convert as command
 from lidar_synth.convert import SETTINGS, Report, convert, reproject
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import READERS, WRITERS, open_scans
+from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.projection import project
 from lidar_synth.scan import Scan
 from lidar_synth.sensor import load_sensor, presets
@@ -34,6 +38,11 @@ def files(root: Path) -> dict[str, bytes]:
 def test_every_layout_becomes_every_format(tmp_path: Path, layout: str, to: str) -> None:
     MAKERS[layout](tmp_path / "in")
     source = open_scans(tmp_path / "in", layout=layout)
+    if to == "kitti_object" and source[0].boxes is None:
+        with pytest.raises(DataError, match=r"has no boxes; expected .*label_2.*semantic_kitti"):
+            convert(source, WRITERS[to](tmp_path / "out"), progress=False)
+        assert set(files(tmp_path / "out")) == set()
+        return
     report = convert(source, WRITERS[to](tmp_path / "out"), progress=False)
     assert report == Report(written=3)
     result = open_scans(tmp_path / "out")
@@ -94,6 +103,35 @@ def test_processes_write_the_same_files(tmp_path: Path) -> None:
     convert(source, WRITERS["kitti360"](tmp_path / "one"), progress=False)
     assert convert(source, WRITERS["kitti360"](tmp_path / "two"), jobs=2, progress=False) == Report(written=12)
     assert files(tmp_path / "one") == files(tmp_path / "two") and len(files(tmp_path / "one")) > 24
+
+
+@pytest.mark.parametrize("fields", [(), ("reflectance", "label")])
+def test_a_bank_becomes_semantic_kitti_with_a_label_file_for_every_scan(
+    tmp_path: Path, fields: tuple[str, ...]
+) -> None:
+    """A trainer reads a missing ``.label`` as some class; a bank without labels gets 0, unlabelled, everywhere."""
+    write_bank(tmp_path / "bank", [some_image(i) for i in range(3)], fields=fields)
+    bank = open_scans(tmp_path / "bank")
+    convert(bank, WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
+    for index, scan in enumerate(bank):
+        raw = np.fromfile(tmp_path / "out" / "sequences" / "00" / "labels" / f"{index:06d}.label", "<u4")
+        assert len(raw) == len(scan) and (scan.label is None) == ("label" not in fields)
+        known = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
+        assert np.array_equal(raw, SEMANTIC_KITTI.encode(known)) and (raw[known == IGNORE] == 0).all()
+        assert raw.any() == ("label" in fields)
+
+
+def test_a_bank_has_no_boxes_for_kitti_objects(tmp_path: Path) -> None:
+    write_bank(tmp_path / "bank", [some_image(i) for i in range(3)])
+    call = [str(tmp_path / "bank"), str(tmp_path / "out"), "--to", "kitti_object"]
+    result = CliRunner().invoke(app, call)
+    assert isinstance(result.exception, DataError)
+    assert re.search(r"scan 'small/5/0' has no boxes; .*Write it as semantic_kitti", str(result.exception))
+    result = CliRunner().invoke(app, [*call, "--on-bad", "skip"])
+    assert "0 scans written, 0 were there already, 3 skipped" in result.output
+    assert not list(tmp_path.rglob("*.bin"))
+    writer = KITTIObjectWriter(tmp_path / "testing", part="testing")  # which has no label_2
+    assert convert(open_scans(tmp_path / "bank"), writer, progress=False) == Report(written=3)
 
 
 @pytest.mark.parametrize(("jobs", "policy"), [(1, "error"), (1, "skip"), (2, "skip")])

@@ -6,8 +6,8 @@ from pathlib import Path
 import lidar_synth
 
 ORDER = """errors files classes sensor scan projection normalize noise nets codec conditions flow solvers timesteps
-distill checkpoint importers generator labels augment bank formats mixing service convert bake town metrics train config
-viz doctor cli""".split()
+distill checkpoint importers generator labels augment bank formats mixing service convert bake town metrics curate train
+config viz doctor cli""".split()
 """A module may import only from those before it."""
 
 PACKAGE = Path(lidar_synth.__file__).parent

@@ -1,8 +1,13 @@
-"""Banks from banks: ``merge``, ``split`` and ``head``. Whole shards are linked, or copied where that cannot be."""
+"""Banks from banks: ``merge``, ``split``, ``head`` and ``drop``. Whole shards are linked, or copied where that cannot
+be.
+
+A curated bank is an index that leaves scans of its shards out; its shards carry that in their names, because they say
+less than the truth without their index. Whatever is made of a curated bank is curated too.
+"""
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -75,41 +80,83 @@ def head(bank: Bank, scans: int, out: Path, progress: bool = True) -> Index:
     return _write(out, [(bank, 0, scans)], progress)
 
 
+def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool = True) -> Index:
+    """A curated bank: all scans but some. No shard is written anew; one of which nothing is kept is not there.
+
+    Args:
+        bank: what to choose from.
+        numbers: of the scans to leave out, 0 <= number < len.
+        why: what they are left out by, in words; it stands in the index.
+        out: the new bank's folder.
+        progress: show a bar.
+
+    Raises:
+        ConfigError: where no scan is left, on a number that is none, or a folder that is not empty.
+        FileError: where it cannot be written.
+    """
+    left_out = set(numbers)
+    if not left_out <= set(range(len(bank))):
+        raise ConfigError(f"scans {sorted(left_out - set(range(len(bank))))[:8]} to leave out", f"0 to {len(bank) - 1}")
+    if len(left_out) == len(bank):
+        raise ConfigError(f"all {len(bank)} scans of {bank.root} left out ({why})", "a rule that leaves some")
+    _check_empty(out)
+    entries: list[Entry] = []
+    shards = tqdm(bank.index.shards, desc="shards", unit="shard", disable=not progress)
+    for entry, end in zip(shards, bank.index.ends, strict=True):
+        start = end - entry.kept
+        more = (entry.position(number - start) for number in range(start, end) if number in left_out)
+        dropped = tuple(sorted({*entry.dropped, *more}))
+        if len(dropped) < entry.scans:
+            entries.append(replace(entry, file=_name(len(entries), True), dropped=dropped))
+            _link(Path(bank.root) / entry.file, out / entries[-1].file)
+    index = replace(bank.index, shards=tuple(entries), curation=(*bank.index.curation, why))
+    write_bank_files(out, index)
+    return index
+
+
+def _name(number: int, curated: bool) -> str:
+    return f"shard-{number:05d}{'.curated' if curated else ''}.h5"
+
+
 def _write(out: Path, parts: Sequence[tuple[Bank, int, int]], progress: bool) -> Index:
     """A bank of ranges of scans: (bank, first, one past the last)."""
     _check_empty(out)
+    curation = tuple(dict.fromkeys(why for bank, _, _ in parts for why in bank.index.curation))
     sources: list[Facts] = []
     entries: list[Entry] = []
     with tqdm(total=sum(b - a for _, a, b in parts), unit="scan", disable=not progress) as bar:
         for bank, start, stop in parts:
             for number, (entry, end) in enumerate(zip(bank.index.shards, bank.index.ends, strict=True)):
-                base = end - entry.scans
-                first, last = max(start - base, 0), min(stop - base, entry.scans)
+                base = end - entry.kept
+                first, last = max(start - base, 0), min(stop - base, entry.kept)
                 if first >= last:
                     continue
                 facts = bank.index.sources[entry.source]
                 if facts not in sources:
                     sources.append(facts)
-                new = replace(entry, file=f"shard-{len(entries):05d}.h5", source=sources.index(facts))
+                new = replace(entry, file=_name(len(entries), bool(curation)), source=sources.index(facts))
                 entries.append(_take(bank, number, new, first, last, out))
                 bar.update(last - first)
-    index = Index(tuple(sources), tuple(entries))
+    index = Index(tuple(sources), tuple(entries), curation=curation)
     write_bank_files(out, index)
     return index
 
 
 def _take(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path) -> Entry:
-    """Scans ``first`` to ``last`` - 1 of a shard as the shard ``entry.file`` of another bank."""
+    """Of the scans of a shard that are kept, ``first`` to ``last`` - 1 as the shard ``entry.file`` of another bank."""
     path = out / entry.file
-    if (first, last) == (0, entry.scans):
+    if (first, last) == (0, entry.kept):
         _link(Path(bank.root) / bank.index.shards[number].file, path)
         return entry
-    entry = replace(entry, first=entry.first + first, scans=last - first)
+    # A file holds consecutive scans: those between that are dropped go along, and stay dropped.
+    start, stop = entry.position(first), entry.position(last - 1) + 1
+    dropped = tuple(position - start for position in entry.dropped if start <= position < stop)
+    entry = replace(entry, first=entry.first + start, scans=stop - start, dropped=dropped)
     shard = bank.shard(number)
-    names = [name for p in range(first, last) if (name := shard.condition(p)) is not None]
+    names = [name for p in range(start, stop) if (name := shard.condition(p)) is not None]
     part = path.with_name(f".{path.name}.part")
     with ShardWriter(part, shard.facts, entry, conditions=names) as writer:
-        for position in range(first, last):
+        for position in range(start, stop):
             writer.append_chunks(*shard.chunks(position))
     entry = replace(entry, bytes=part.stat().st_size, sha256=sha256(part))
     part.replace(path)

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from lidar_synth.bake.job import Plan
@@ -73,7 +73,7 @@ def publish(plan: Plan, number: int, part: Path) -> Entry:
     path = plan.out / plan.shards[number].file
     try:
         entry = replace(plan.shards[number], bytes=part.stat().st_size, sha256=sha256(part))
-        write_file(_note(plan, number), json.dumps(asdict(entry)).encode(), durable=True)
+        write_file(_note(plan, number), json.dumps(entry.to_dict()).encode(), durable=True)
         part.replace(path)
     except OSError as error:
         if isinstance(error, FileError):

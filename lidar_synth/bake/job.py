@@ -17,6 +17,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 import lidar_synth
+from lidar_synth.bake.conditions import check_condition, open_conditions
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
 from lidar_synth.errors import ConfigError
@@ -119,19 +120,15 @@ def make_plan(out: str | Path, job: Job) -> Plan:
     Raises:
         ConfigError: on a model, solver, precision or device that is not there, a field that the model does not give,
             or a conditional model without conditions.
-        FileError, DataError: where the checkpoint cannot be read.
+        FileError, DataError: where the checkpoint or the dataset of the conditions cannot be read.
     """
     choose("solver", job.solver, SOLVERS)
     choose("dtype", job.dtype, DTYPES)
     if job.first + job.count >= 2**63:
         raise ConfigError(f"scans up to index {job.first + job.count}", "less than 2^63")
     generator = load_generator(job.model)
-    if (generator.condition is None) != (job.condition is None):
-        needs = f"{generator.condition} conditions" if generator.condition else "no condition"
-        raise ConfigError(
-            f"condition {job.condition} for model {job.model!r}, which takes {needs}",
-            "a dataset whose scans have them" if generator.condition else "none",
-        )
+    check_condition(generator, job.condition)
+    open_conditions(job.condition, job.condition_layout, job.condition_split)
     fields = _fields(job, generator.fields)
     software = {"lidar_synth": lidar_synth.__version__, "torch": torch.__version__, "numpy": np.__version__,
                 "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "machine": platform.machine()}  # fmt: skip

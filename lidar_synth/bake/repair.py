@@ -42,7 +42,8 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
         index = _index_from_shards(root, error)
         done[INDEX] = "written again from the shards"
     shards, repairs = list(index.shards), list(index.repairs)
-    with tqdm(total=index.scans, desc="repair", unit="scan", disable=not progress) as bar:
+    total = sum(entry.scans for entry in shards)
+    with tqdm(total=total, desc="repair", unit="scan", disable=not progress) as bar:
         for number, entry in enumerate(shards):
             facts = index.sources[entry.source]
             if entry.sha256 and next(check_shard(root, facts, entry), None) is None:
@@ -54,7 +55,7 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
             if not same:
                 repairs.append(f"{entry.file} was made again with torch {torch.__version__}, with other bytes")
     if done:
-        write_bank_files(root, Index(index.sources, tuple(shards), tuple(repairs)))
+        write_bank_files(root, replace(index, shards=tuple(shards), repairs=tuple(repairs)))
     return done
 
 

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import torch
 
-from lidar_synth.bake.conditions import condition_names, conditions
+from lidar_synth.bake.conditions import condition_names, conditions, open_conditions
 from lidar_synth.bake.folder import check_folder, finished, publish
 from lidar_synth.bake.job import DTYPES, Job, Plan
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.formats import ScanFiles
 from lidar_synth.generator import BATCH, Generator, load_generator
 from lidar_synth.scan import RangeImage
 
@@ -63,7 +64,7 @@ def write_shard(generator: Generator, path: Path, job: Job, facts: Facts, entry:
     Raises:
         FileError: where the file cannot be written or the disk is full.
     """
-    names = condition_names(job, range(entry.first, entry.first + entry.scans))
+    names = condition_names(_source(job), range(entry.first, entry.first + entry.scans))
     # One thread packs 250 scans a second, more than a CPU makes; how many there are changes no byte.
     packers = job.threads if job.device == "cpu" else min(16, os.cpu_count() or 1)
     writer = ShardWriter(path, facts, entry, conditions=names, threads=packers)
@@ -88,9 +89,12 @@ def generate(generator: Generator, job: Job, indices: Sequence[int]) -> list[Ran
     Raises:
         FileError, DataError: where a condition cannot be read.
     """
-    return generator.range_images(
-        job.seed, indices, conditions(job, indices), steps=job.steps, solver=job.solver, guidance=job.guidance
-    )
+    given = conditions(_source(job), indices)
+    return generator.range_images(job.seed, indices, given, steps=job.steps, solver=job.solver, guidance=job.guidance)
+
+
+def _source(job: Job) -> ScanFiles | None:
+    return open_conditions(job.condition, job.condition_layout, job.condition_split)
 
 
 @contextmanager

@@ -52,7 +52,8 @@ def verify(root: Path, progress: bool = True) -> list[Problem]:
     """
     index = read_index(root)
     problems = []
-    with tqdm(total=index.scans, desc="verify", unit="scan", disable=not progress) as bar:
+    total = sum(entry.scans for entry in index.shards)
+    with tqdm(total=total, desc="verify", unit="scan", disable=not progress) as bar:
         for entry in index.shards:
             problems += [Problem(entry.file, what) for what in check_shard(root, index.sources[entry.source], entry)]
             bar.update(entry.scans)

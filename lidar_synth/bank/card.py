@@ -50,6 +50,7 @@ def summary(index: Index) -> dict[str, Any]:
             ", ".join(f"{k} {v}" for k, v in sorted(source.software.items())) for source in index.sources
         ),
         "repairs": "; ".join(index.repairs) or "none",
+        "curation": "; ".join(index.curation) or "none",
         "identity": index.checksum,
     }
 

@@ -5,8 +5,10 @@
     format     "lidar-synth-bank/1"; a reader refuses every other
     scans      how many
     sources    the facts of each bake whose scans are here; more than one after a merge
-    shards     in order: file, seed, first index, scans, source (a position in ``sources``), bytes, sha256
+    shards     in order: file, seed, first index, scans, source (a position in ``sources``), bytes, sha256; in a
+               curated bank also ``dropped``, positions in the file of the scans that are left out
     repairs    what was made again with other bytes, in words
+    curation   in a curated bank: by what scans were left out, in words
     checksum   sha256 of the rest, as JSON without spaces and with sorted keys
 
 The facts stand in the root attributes of each shard too, text and numbers as they are, everything else as JSON, and
@@ -26,10 +28,11 @@ have to agree::
 import hashlib
 import json
 import re
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any
 
 import h5py
@@ -124,6 +127,7 @@ class Entry:
         source: position of its facts among the bank's.
         bytes: the file's size.
         sha256: of the file.
+        dropped: positions of the scans that are in the file and not in the bank, ascending.
     """
 
     file: str
@@ -133,6 +137,25 @@ class Entry:
     source: int = 0
     bytes: int = 0
     sha256: str = ""
+    dropped: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dropped", tuple(self.dropped))  # a list, where it comes from JSON
+
+    @property
+    def kept(self) -> int:
+        """How many of its scans are in the bank."""
+        return self.scans - len(self.dropped)
+
+    def position(self, rank: int) -> int:
+        """Where in the file scan ``rank`` of those that are kept stands."""
+        # Before dropped scan i stand ``dropped[i] - i`` that are kept, and it is passed by all ranks from there on.
+        return rank + bisect_right(range(len(self.dropped)), rank, key=lambda i: self.dropped[i] - i)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; ``Entry(**values)`` is the inverse."""
+        values = asdict(self)
+        return values if self.dropped else {name: value for name, value in values.items() if name != "dropped"}
 
     @property
     def span(self) -> str:
@@ -148,6 +171,7 @@ class Index:
         sources: the facts of each bake.
         shards: at least one.
         repairs: what was made again with other bytes.
+        curation: by what scans were left out; () for a bank that is not curated.
 
     Raises:
         DataError: where they do not fit together.
@@ -156,6 +180,7 @@ class Index:
     sources: tuple[Facts, ...]
     shards: tuple[Entry, ...]
     repairs: tuple[str, ...] = ()
+    curation: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for entry in self.shards:
@@ -163,6 +188,9 @@ class Index:
                 raise DataError(f"a bank's shard {entry.file!r}", "the name of an .h5 file in the bank's folder")
             if not (0 <= entry.source < len(self.sources) and entry.scans >= 1 and entry.first >= 0):
                 raise DataError(f"a bank with {entry}", "at least one scan, of one of its sources")
+            steps = pairwise((-1, *entry.dropped, entry.scans))
+            if not (entry.kept >= 1 and all(a < b for a, b in steps) and (self.curation or not entry.dropped)):
+                raise DataError(f"a bank with {entry}", "ascending positions that leave a scan, and what dropped them")
         if not self.shards or len({e.file for e in self.shards}) < len(self.shards):
             raise DataError(f"a bank with the shards {[e.file for e in self.shards]}", "at least one, each once")
         if any((f.sensor, f.fields) != (self.sources[0].sensor, self.sources[0].fields) for f in self.sources):
@@ -176,7 +204,7 @@ class Index:
     @cached_property
     def ends(self) -> list[int]:
         """Scans up to and with each shard."""
-        return list(accumulate(entry.scans for entry in self.shards))
+        return list(accumulate(entry.kept for entry in self.shards))
 
     @property
     def size(self) -> int:
@@ -209,6 +237,7 @@ class Index:
                 tuple(Facts.from_dict(facts, where) for facts in values["sources"]),
                 tuple(Entry(**entry) for entry in values["shards"]),
                 tuple(values["repairs"]),
+                tuple(values.get("curation", ())),
             )
         except DataError:
             raise
@@ -216,13 +245,14 @@ class Index:
             raise DataError(f"{where} is damaged ({error})", f"the index of a bank, {FORMAT}", REPAIR) from error
 
     def _values(self) -> dict[str, Any]:
-        return {
+        values: dict[str, Any] = {
             "format": FORMAT,
             "scans": self.scans,
             "sources": [facts.to_dict() for facts in self.sources],
-            "shards": [asdict(entry) for entry in self.shards],
+            "shards": [entry.to_dict() for entry in self.shards],
             "repairs": list(self.repairs),
         }
+        return values | ({"curation": list(self.curation)} if self.curation else {})
 
 
 def _sum(values: Any) -> str:

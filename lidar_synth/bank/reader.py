@@ -170,7 +170,8 @@ class _Names(Sequence[str]):
 def _place(index: Index, number: int) -> tuple[int, int]:
     """Shard and position there."""
     shard = bisect_right(index.ends, number)
-    return shard, number - (index.ends[shard] - index.shards[shard].scans)
+    entry = index.shards[shard]
+    return shard, entry.position(number - (index.ends[shard] - entry.kept))
 
 
 def _file(root: str | Path, name: str) -> Path | BinaryIO:

@@ -13,6 +13,7 @@ from lidar_synth import __version__
 from lidar_synth.cli.bake import bake
 from lidar_synth.cli.bank import bank, info, repair, verify
 from lidar_synth.cli.convert import convert
+from lidar_synth.cli.curate import curate
 from lidar_synth.cli.doctor import doctor
 from lidar_synth.cli.evaluate import evaluate
 from lidar_synth.cli.import_ import import_
@@ -31,6 +32,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "verify": verify,
     "repair": repair,
     "info": info,
+    "curate": curate,
     "train": train,
     "distill": distill,
     "evaluate": evaluate,

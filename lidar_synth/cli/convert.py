@@ -11,7 +11,10 @@ def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="A file, a folder of scans or a dataset's root.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
     to: Annotated[
-        str, typer.Option(help="kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | png")
+        str,
+        typer.Option(
+            help="kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | png | webdataset"
+        ),
     ],
     sensor: Annotated[str | None, typer.Option(help="Sensor of the input: a preset or a YAML file.")] = None,
     layout: Annotated[str | None, typer.Option(help="Layout of the input, if it is not to be recognised.")] = None,
@@ -29,6 +32,8 @@ def convert(
       lidar-synth convert scans out --to pcd --on-bad skip
 
       lidar-synth convert SemanticKITTI out --to range --as-sensor os1_128
+
+      lidar-synth convert bank out --to webdataset --jobs 4
     """
     from lidar_synth.convert import convert as run
     from lidar_synth.formats import WRITERS, open_scans

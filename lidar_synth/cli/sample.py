@@ -16,6 +16,12 @@ def sample(
     seed: Annotated[int, typer.Option(min=0, help="scan i is a function of the model, the seed and i")] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="of a uniform time grid; default: the model's own")] = None,
     solver: Annotated[str, typer.Option(help="euler | heun")] = "euler",
+    condition: Annotated[
+        str | None, typer.Option(help="dataset that a conditional model takes its labels or images from")
+    ] = None,
+    condition_layout: Annotated[str | None, typer.Option(help="of that dataset, if not to be recognised")] = None,
+    condition_split: Annotated[str | None, typer.Option(help="of that dataset, r2flow/train for instance")] = None,
+    guidance: Annotated[float, typer.Option(min=0, max=100, help="of a conditional model; 1 = none")] = 1.0,
     to: Annotated[str, typer.Option(help="npz (keeps all) | kitti | semantic_kitti | range | pcd | ...")] = "npz",
     device: Annotated[str, typer.Option(help="cpu | cuda")] = "cpu",
     dtype: Annotated[str, typer.Option(help="float32 | bfloat16: what the network computes in")] = "float32",
@@ -23,15 +29,19 @@ def sample(
 ) -> None:
     """Generates scans and writes them in any format. Run it again to go on where it stopped.
 
+    Scan i of a conditional model is made of scan i of the dataset of conditions, and round again.
+
     \b
     Examples:
       lidar-synth sample out
       lidar-synth sample out --count 100 --seed 7 --to semantic_kitti
       lidar-synth sample out --model runs/town_teacher/town_teacher.safetensors --steps 50
+      lidar-synth sample out --model semantic.safetensors --condition SemanticKITTI --condition-split val
     """
     import torch
     from tqdm import tqdm
 
+    from lidar_synth.bake.conditions import check_condition, conditions, open_conditions
     from lidar_synth.formats import WRITERS
     from lidar_synth.formats.source import choose
     from lidar_synth.formats.writer import claim
@@ -40,13 +50,22 @@ def sample(
     writer = choose("format", to, WRITERS)(out)
     precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
     generator = load_generator(model, device=device, dtype=precision, batch=batch)
-    settings = {"checkpoint": generator.hash, "seed": seed, "steps": steps, "solver": solver, "dtype": dtype, "to": to}
+    check_condition(generator, condition)
+    given = open_conditions(condition, condition_layout, condition_split)
+    settings = {
+        "checkpoint": generator.hash, "seed": seed, "steps": steps, "solver": solver, "dtype": dtype, "to": to,
+        "condition": condition, "condition_layout": condition_layout, "condition_split": condition_split,
+        "guidance": guidance,
+    }  # fmt: skip
     claim(writer.root / NOTE, settings | {"trained_on": generator.header.provenance["data"]})
     missing = [i for i in range(count) if not writer.complete(i)]
     with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
         for first in range(0, len(missing), generator.batch):
             indices = missing[first : first + generator.batch]
-            for index, scan in zip(indices, generator.scans(seed, indices, steps=steps, solver=solver), strict=True):
+            scans = generator.scans(
+                seed, indices, conditions(given, indices), steps=steps, solver=solver, guidance=guidance
+            )
+            for index, scan in zip(indices, scans, strict=True):
                 writer.write(scan, index)
             bar.update(len(indices))
     writer.finish()

@@ -22,6 +22,8 @@ from lidar_synth.formats.png import PNGWriter, RangePNG
 from lidar_synth.formats.range_images import RangeImages, RangeWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.webdataset import SUFFIX as TAR
+from lidar_synth.formats.webdataset import WebDataset, WebDatasetWriter
 from lidar_synth.formats.writer import Writer
 from lidar_synth.sensor import Sensor
 
@@ -40,6 +42,7 @@ __all__ = [
     "RangePNG",
     "ScanFiles",
     "SemanticKITTI",
+    "WebDataset",
     "Writer",
     "layout_of",
     "open_scans",
@@ -52,6 +55,7 @@ READERS: dict[str, type[ScanFiles]] = {
     "kitti_raw": KITTIRaw,
     "nuscenes": NuScenes,
     "bank": BankScans,
+    "webdataset": WebDataset,
     "range": RangeImages,
     "png": RangePNG,
     "folder": Folder,
@@ -68,6 +72,7 @@ WRITERS: dict[str, type[Writer]] = {
     "ply": PLYWriter,
     "npz": NPZWriter,
     "png": PNGWriter,
+    "webdataset": WebDatasetWriter,
 }
 """Writer by format."""
 
@@ -80,6 +85,7 @@ SIGNS: dict[str, Callable[[Path], bool]] = {
     ),
     "kitti_raw": lambda root: any(any(root.glob(p)) for p in ("velodyne_points/data", DRIVES, f"*/{DRIVES}")),
     "bank": is_bank,
+    "webdataset": lambda root: root.suffix == TAR or any(root.glob(f"*{TAR}")),
     "png": lambda root: root.suffix == ".png" or any(root.glob("range/*.png")),
     "range": lambda root: _holds_range_images(root),
     "folder": lambda root: root.suffix in SUFFIXES or any(p.suffix in SUFFIXES for p in root.rglob("*")),

@@ -31,7 +31,7 @@ from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
 from lidar_synth.formats.points import read_points, write_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import Picture, Writer, write_image
-from lidar_synth.scan import Boxes, Scan
+from lidar_synth.scan import Scan
 from lidar_synth.sensor import Sensor
 
 Part = Literal["training", "testing"]
@@ -121,7 +121,8 @@ class KITTIObjectWriter(Writer):
 
     ``label_2`` lists what the camera sees, as KITTI's does: boxes whose ``image_box`` is known, and others whose
     corners fall into the image (``image_box`` and truncation are worked out then); boxes elsewhere around the sensor
-    are left out. Trainers take the image's size from ``image_2``, so a scan without an image gets a black one.
+    are left out. A scan whose boxes are not known is refused for ``training``. Trainers take the image's size from
+    ``image_2``, so a scan without an image gets a black one.
 
     An id ``training/FFFFFF`` or ``testing/FFFFFF`` is kept; other scans go into ``part``, numbered by index.
 
@@ -142,15 +143,20 @@ class KITTIObjectWriter(Writer):
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         folder, frame = path.parents[1], path.stem
+        if folder.name == "training" and scan.boxes is None:
+            raise DataError(
+                f"scan {scan.id!r} has no boxes",
+                "a scan whose boxes are known: an empty label_2 would say that there is no object",
+                "Write it as semantic_kitti, or without label_2: KITTIObjectWriter(root, part='testing').",
+            )
         camera = camera or OBJECT_CAMERA
         if picture is None:
             width, height = camera.image_size or (1242, 375)
             picture = np.zeros((height, width, 3), np.uint8)
         write_image(folder / "image_2" / f"{frame}.png", picture)
         write_calibration(folder / "calib" / f"{frame}.txt", camera)
-        if folder.name == "training":
-            boxes = Boxes(np.zeros((0, 7), np.float32), ()) if scan.boxes is None else scan.boxes
-            write_label_2(folder / "label_2" / f"{frame}.txt", boxes, camera)
+        if folder.name == "training" and scan.boxes is not None:
+            write_label_2(folder / "label_2" / f"{frame}.txt", scan.boxes, camera)
         write_points(path, scan)
 
     def finish(self) -> None:

@@ -14,7 +14,7 @@ from lidar_synth.viz.colour import Scale, scales
 from lidar_synth.viz.images import picture
 from lidar_synth.viz.page import html_page
 from lidar_synth.viz.render import Camera, Orbit, bird, render
-from lidar_synth.viz.sheet import contact_sheet, sheet
+from lidar_synth.viz.sheet import contact_sheet, histograms, sheet
 from lidar_synth.viz.window import show
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "Scale",
     "bird",
     "contact_sheet",
+    "histograms",
     "html_page",
     "picture",
     "render",

@@ -1,9 +1,10 @@
-"""Sheets: every view of one scan, or many scans side by side, composed by matplotlib.
+"""Sheets: every view of one scan, many scans side by side, or the figures of very many, composed by matplotlib.
 
 Figures are made without pyplot, so nothing global changes and no screen is needed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.classes import NAMES
@@ -93,6 +95,41 @@ def contact_sheet(
         above.set_title(caption(view.scan, short=True), color=_DIM, fontsize=9, loc="left", pad=3)
     if by == "label":
         _legend(figure, all_views, colours[by].table)
+    return figure
+
+
+def histograms(
+    values: Mapping[str, NDArray[np.floating]], meanings: Mapping[str, str], marked: NDArray[np.bool_], title: str = ""
+) -> Figure:
+    """How some figures of many scans are distributed, with some of the scans marked.
+
+    Args:
+        values: {name: (N,)}, at least one.
+        meanings: of each figure, in words.
+        marked: (N,) scans to show in another colour, on top.
+        title: a line above.
+    """
+    columns = min(len(values), 4)
+    rows = -(-len(values) // columns)
+    height = 3.1 * rows + 0.6
+    figure = _figure(4.6 * columns, height)
+    grid = figure.add_gridspec(
+        rows,
+        columns,
+        hspace=0.55,
+        wspace=0.14,
+        left=0.2 / columns,
+        right=0.99,
+        bottom=0.7 / height,
+        top=1 - 0.9 / height,
+    )
+    figure.text(0.01, 1 - 0.3 / height, title, color=_INK, fontsize=14, va="center")
+    for place, (name, numbers) in enumerate(values.items()):
+        axes = figure.add_subplot(grid[place], facecolor=_BACK)
+        colours = [tuple((np.array(colour) / 255).tolist()) for colour in DOMAINS.values()]
+        axes.hist([numbers[~marked], numbers[marked]], bins=60, stacked=True, color=colours)
+        axes.set_yscale("symlog", linthresh=1)  # one scan among thousands is seen
+        _dress(axes, name, "\n".join(wrap(meanings[name], 52)), "" if place % columns else "scans")
     return figure
 
 

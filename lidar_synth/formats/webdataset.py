@@ -1,0 +1,215 @@
+"""WebDataset: scans in tar files that are read from front to back (https://github.com/webdataset/webdataset).
+
+The members of a scan stand behind one another and begin with its key, which is its id (a dot or % in it as %2E, %25)::
+
+    scans-000000.tar          the first 1000 scans, and so on
+      KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml); where they are known
+                              also pose (4 x 4, sensor to world) and names of the boxes
+      KEY.points.npy          (N, 4) float32: x, y, z in metres, reflectance in [0, 1]
+      KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always there, so that samples have the same keys
+      KEY.confidence.npy      and what else is known per point: raw_label, instance, ring
+      KEY.boxes.npy           (M, 7) float32, if there are boxes: x, y, z, l, w, h, yaw
+
+WebDataset's own ``decode()`` makes arrays and a dictionary of them. The same scans give the same bytes.
+"""
+
+import json
+import tarfile
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files import SKIP_HINT, list_files, unreadable, write_file
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.npz import decode_scan
+from lidar_synth.formats.points import check_scan
+from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.formats.writer import NOTES, Picture, Writer, clear_notes
+from lidar_synth.scan import Boxes, Scan
+from lidar_synth.sensor import Sensor, load_sensor
+
+SUFFIX = ".tar"
+
+Members = dict[str, tuple[int, int]]
+"""Where the members of a scan stand in their tar: {what follows the key: (offset, bytes)}."""
+
+
+class WebDataset(ScanFiles):
+    """A folder of WebDataset's .tar files as the package writes them, or one such file.
+
+    Args:
+        root: the folder or the file.
+        sensor: whose scans are expected; the files tell it.
+        on_bad: see ``ScanFiles``; a tar file whose headers are damaged is an error in any case.
+
+    Raises:
+        FileError: where there is no such path.
+        DataError: where there is no scan, or a file is no tar.
+    """
+
+    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
+        root = Path(root)
+        paths = [root] if root.is_file() else list_files(root, SUFFIX)
+        self._places = [(path, *place) for path in paths for place in _scans(path)]
+        self._given = None if sensor is None else load_sensor(sensor)
+        first = self._given or (_decode(*self._places[0], None).sensor if self._places else "hdl64e_kitti")
+        super().__init__(root, [unquote(key) for _, key, _ in self._places], first, on_bad)
+
+    def read(self, index: int) -> Scan:
+        return _decode(*self._places[index], self._given)
+
+
+class WebDatasetWriter(Writer):
+    """Writes WebDataset's .tar files. Each scan is written by itself; ``finish`` puts them together, in order.
+
+    Scans that come later, because they could not be read before, go behind the others of their file.
+
+    Args:
+        root: output folder.
+        shard_size: scans in a file.
+        calibration: see ``Writer``; it has no place here, nor have images.
+
+    Raises:
+        ConfigError: on fewer than one scan in a file.
+    """
+
+    def __init__(self, root: str | Path, *, shard_size: int = 1000, calibration: Calibration | None = None) -> None:
+        super().__init__(root, calibration=calibration)
+        if shard_size < 1:
+            raise ConfigError(f"{shard_size} scans in a tar file", "at least 1")
+        self.shard_size = shard_size
+        self._there: set[str] | None = None
+
+    def path(self, index: int, name: str | None = None) -> Path:
+        return self.root / NOTES / f"{index:09d}" / f"{_key(index, name)}{SUFFIX}"
+
+    def complete(self, index: int, name: str | None = None) -> bool:
+        if self._there is None:
+            self._there = {key for path in self.root.glob(f"*{SUFFIX}") for key, _ in _scans(path)}
+        return _key(index, name) in self._there or super().complete(index, name)
+
+    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        key = Path(*path.relative_to(self.root / NOTES).parts[1:]).with_suffix("").as_posix()
+        write_file(path, lambda file: _write_tar(file, _encode(key, scan)))
+
+    def finish(self) -> None:
+        parts: dict[int, list[Path]] = defaultdict(list)
+        for path in sorted((self.root / NOTES).rglob(f"*{SUFFIX}")):
+            parts[int(path.relative_to(self.root / NOTES).parts[0]) // self.shard_size].append(path)
+        for number, paths in parts.items():
+            whole = self.root / f"scans-{number:06d}{SUFFIX}"
+            sources = [whole, *paths] if whole.is_file() else paths
+            write_file(whole, lambda file, sources=sources: _write_tar(file, _members(sources)))  # type: ignore[misc]
+        clear_notes(self.root)
+        self._there = None
+
+
+def _key(index: int, name: str | None) -> str:
+    """Without a dot: to WebDataset, what follows the first one is the kind of the member."""
+    return f"{index:06d}" if name is None else name.replace("%", "%25").replace(".", "%2E")
+
+
+def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of the members; ``_decode`` is the inverse."""
+    facts: dict[str, Any] = {"id": scan.id, "domain": scan.domain, "sensor": scan.sensor.to_dict()}
+    facts |= {} if scan.pose is None else {"pose": scan.pose.tolist()}
+    facts |= {} if scan.boxes is None else {"names": list(scan.boxes.names)}
+    fields = {"label": np.full(len(scan), IGNORE, np.uint8)} | scan.fields()
+    arrays = {"points": np.column_stack([scan.points, fields.pop("reflectance")]), **fields}
+    arrays |= {} if scan.boxes is None else {"boxes": scan.boxes.values}
+    yield f"{key}.json", json.dumps(facts).encode()
+    for name, values in arrays.items():
+        content = BytesIO()
+        np.save(content, values, allow_pickle=False)
+        yield f"{key}.{name}.npy", content.getvalue()
+
+
+def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Scan:
+    where = f"scan {key!r} of {path}"
+    try:
+        with path.open("rb") as file:
+            contents = {name: _content(file, *place) for name, place in members.items()}
+        facts = json.loads(contents.pop("json"))
+        arrays: dict[str, NDArray[Any]] = {
+            name.removesuffix(".npy"): np.load(BytesIO(content), allow_pickle=False)
+            for name, content in contents.items()
+            if name.endswith(".npy")
+        }
+        boxes = Boxes(arrays.pop("boxes"), facts["names"]) if "boxes" in arrays else None
+        points = arrays.pop("points")
+        arrays |= {
+            "points": points[:, :3],
+            "reflectance": points[:, 3],
+            "sensor": np.array(json.dumps(facts["sensor"])),
+        }
+        arrays |= {name: np.array(facts[name]) for name in ("id", "domain", "pose") if name in facts}
+    except OSError as error:
+        raise unreadable(path, error) from error
+    except (ValueError, KeyError, IndexError, EOFError) as error:
+        raise DataError(f"{where}: {error!r}", "the members that this package writes", SKIP_HINT) from error
+    scan = decode_scan(arrays, where, sensor)
+    scan.boxes, scan.id = boxes, unquote(key)
+    check_scan(scan, where)
+    return scan
+
+
+def _content(file: BinaryIO, offset: int, size: int) -> bytes:
+    file.seek(offset)
+    return file.read(size)
+
+
+def _scans(path: Path) -> Iterator[tuple[str, Members]]:
+    """Key and members of each scan in a tar file, by its headers.
+
+    Raises:
+        FileError, DataError: where it cannot be read, or is no tar.
+    """
+    found: dict[str, Members] = {}
+    with _open(path) as tar:
+        for member in tar:
+            folder, slash, name = member.name.rpartition("/")
+            stem, _, kind = name.partition(".")
+            found.setdefault(f"{folder}{slash}{stem}", {})[kind] = (member.offset_data, member.size)
+    yield from found.items()
+
+
+def _members(paths: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
+    """What some tar files hold, each name once: a run that was stopped may have left a scan in two of them."""
+    done = set()
+    for path in paths:
+        with _open(path) as tar:
+            for member in tar:
+                content = tar.extractfile(member)
+                if member.name not in done and content is not None:
+                    done.add(member.name)
+                    yield member.name, content.read()
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[tarfile.TarFile]:
+    """A tar file to read, and its errors in words that help."""
+    try:
+        with tarfile.open(path, "r:") as tar:
+            yield tar
+    except tarfile.TarError as error:
+        raise DataError(f"{path} is cut, damaged or no tar file ({error})", "a file of a WebDataset") from error
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def _write_tar(file: BinaryIO, members: Iterable[tuple[str, bytes]]) -> None:
+    """Nothing in it depends on who writes it, or when."""
+    with tarfile.open(fileobj=file, mode="w") as tar:
+        for name, content in members:
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, BytesIO(content))
