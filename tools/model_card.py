@@ -65,9 +65,10 @@ def picture(path: Path, scans: Sequence[Scan], title: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_view(path, list(scans), title=title)
     image = Image.open(path).convert("RGB")
-    width = 1600
+    width = 1500
     image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
-    image.quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
+    # Few cells are cars or poles: a palette by number of pixels would lose their colours.
+    image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def main() -> None:
