@@ -19,6 +19,7 @@ def train(config: ConfigFile, overrides: Overrides = None, resume: Resume = Fals
 
     \b
     Examples:
+      lidar-synth train configs/town_codec.yaml
       lidar-synth train configs/town_teacher.yaml
       lidar-synth train configs/town_teacher.yaml --resume recipe.iterations=20000
       lidar-synth train mine.yaml init=runs/town_teacher/town_teacher.safetensors data.path=scans
