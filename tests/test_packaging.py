@@ -62,3 +62,18 @@ def test_every_shipped_yaml_loads_safely() -> None:
     assert files
     for path in files:
         assert isinstance(yaml.safe_load(path.read_text()), dict), path
+
+
+@pytest.mark.parametrize("script", sorted(ROOT.glob("tools/**/[a-z]*.py")), ids=lambda path: path.stem)
+def test_what_a_script_imports_from_the_package_is_there(script: Path) -> None:
+    """Scripts are run by hand and by nobody else: what they lean on moves."""
+    import ast
+    import importlib
+
+    for node in ast.walk(ast.parse(script.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "lidar_synth":
+            if "integrations" in (node.module or ""):
+                continue
+            module = importlib.import_module(str(node.module))
+            for name in node.names:
+                assert hasattr(module, name.name), f"{script.name}: {node.module} has no {name.name}"
