@@ -3,6 +3,7 @@
 A file is written beside its place and renamed, so that a reader never meets half of one.
 """
 
+import hashlib
 import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -61,6 +62,16 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise unreadable(path, error) from error
+
+
+def sha256(path: Path) -> str:
+    """Of a file's bytes, in hexadecimal.
+
+    Raises:
+        OSError: where it cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def unreadable(path: Path, error: OSError) -> FileError:

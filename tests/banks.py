@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.bake.folder import sha256, write_bank_files
+from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.classes import IGNORE
+from lidar_synth.files import sha256
 from lidar_synth.projection import project
 from lidar_synth.scan import RangeImage
 from lidar_synth.sensor import Sensor, load_sensor

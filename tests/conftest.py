@@ -2,10 +2,12 @@
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from lidar_synth.scan import Scan
 from lidar_synth.sensor import Sensor, presets
@@ -22,6 +24,15 @@ def _folder(variable: str) -> Path:
     if not path.is_dir() or not any(path.iterdir()):
         pytest.fail(f"{variable}={value} leads to no folder with files")
     return path
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """torch on one thread: sums in one order, and no waiting for each other on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

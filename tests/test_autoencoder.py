@@ -1,6 +1,5 @@
 """The small autoencoder: what it says of every cell, its loss, and latents that are made once."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,12 +24,7 @@ TENSORS = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow
 SCANS = [random_scan(SENSOR, 300, i) for i in range(4)]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def network(**arguments: Any) -> Autoencoder:

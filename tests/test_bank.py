@@ -20,13 +20,14 @@ from hypothesis import given, settings
 from torch.utils.data import DataLoader
 
 import lidar_synth.bank.reader as reader
-from lidar_synth.bake.folder import sha256, write_bank_files
+from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import FORMAT, INDEX, Bank, Encoding, Entry, Index, ShardReader, ShardWriter
 from lidar_synth.bank.chunks import checksum, fletcher32
 from lidar_synth.bank.encoding import LEVELS, TYPES
 from lidar_synth.classes import IGNORE
 from lidar_synth.convert import convert
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
+from lidar_synth.files import sha256
 from lidar_synth.formats import WRITERS, BankScans, open_scans
 from lidar_synth.projection import project, unproject
 from lidar_synth.scan import SYNTHETIC, RangeImage, Source

@@ -1,6 +1,5 @@
 """The codec between range images and states, and how an autoencoder is trained and judged."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -37,12 +36,7 @@ TENSORS = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow
 SCANS = [random_scan(SENSOR, 400, seed) for seed in range(4)]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def network(**arguments: Any) -> VQVAE:

@@ -32,12 +32,7 @@ CAMERA_SHAPE = (3, 32, 64)
 OPTIONS: dict[str, Any] = {"image": [40, 80]}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def picture(path: Path, size: tuple[int, int] = (40, 80), seed: int = 0) -> Path:

@@ -1,6 +1,5 @@
 """The U-Net: what it takes, what wraps, what the table of places adds, and a diffusion network as a velocity."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import hypothesis.strategies as st
@@ -23,12 +22,7 @@ SMALL: dict[str, Any] = {
 }  # fmt: skip
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def network(kind: str = "unet", **arguments: Any) -> nn.Module:

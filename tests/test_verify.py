@@ -17,12 +17,13 @@ from typer.testing import CliRunner
 import lidar_synth.bake.repair as repair_module
 from lidar_synth.bake import Job, bake, make_plan
 from lidar_synth.bake.edit import head, merge, split
-from lidar_synth.bake.folder import sha256, write_bank_files
+from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import AGREE, regenerate, verify
 from lidar_synth.bank import INDEX, Bank, Index
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files import sha256
 from lidar_synth.scan import RangeImage
 
 

@@ -6,7 +6,6 @@ finished when its file has the noted hash, so that a run which is killed at any 
 and nothing else.
 """
 
-import hashlib
 import json
 import os
 import shutil
@@ -18,7 +17,7 @@ from lidar_synth.bake.job import Plan
 from lidar_synth.bank import INDEX, Entry, Index
 from lidar_synth.bank.card import write_card
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files import read_file, write_file
+from lidar_synth.files import read_file, sha256, write_file
 from lidar_synth.formats.writer import NOTES, claim
 
 SETTINGS = ".bake.json"
@@ -115,16 +114,6 @@ def write_bank_files(root: Path, index: Index) -> None:
     write_card(root, index)
     write_file(root / INDEX, index.to_json(), durable=True)
     sync_folder(root)
-
-
-def sha256(path: Path) -> str:
-    """Of a file, in hexadecimal.
-
-    Raises:
-        OSError: where it cannot be read.
-    """
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sync_folder(path: Path) -> None:

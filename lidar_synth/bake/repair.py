@@ -8,12 +8,13 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import sha256, sync_folder, write_bank_files
+from lidar_synth.bake.folder import sync_folder, write_bank_files
 from lidar_synth.bake.job import Plan
 from lidar_synth.bake.shard import load_checked, write_shard
 from lidar_synth.bake.verify import check_scans, check_shard, job_of, read_index
 from lidar_synth.bank import INDEX, Entry, Facts, Index, ShardReader
 from lidar_synth.errors import DataError, FileError
+from lidar_synth.files import sha256
 
 
 def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[str, str]:

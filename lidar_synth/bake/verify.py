@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import sha256
 from lidar_synth.bake.job import Job
 from lidar_synth.bake.shard import generate, load_checked, one_computer
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.errors import DataError, FileError
-from lidar_synth.files import read_file
+from lidar_synth.files import read_file, sha256
 from lidar_synth.noise import keyed_rng
 from lidar_synth.scan import RangeImage
 

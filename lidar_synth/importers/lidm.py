@@ -24,9 +24,9 @@ from torch import Tensor, nn
 from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Header, Part
 from lidar_synth.classes import NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.files import read_text
+from lidar_synth.files import read_text, sha256
 from lidar_synth.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
-from lidar_synth.importers.pickled import load_pickle, sha256_of, state_of
+from lidar_synth.importers.pickled import load_pickle, state_of
 from lidar_synth.nets import assemble
 from lidar_synth.nets.diffusion import schedule_times
 from lidar_synth.normalize import Normalisation
@@ -176,7 +176,7 @@ def _provenance(config: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "licence": "as LiDM's repository: MIT",
         "source": "https://github.com/hancyran/LiDAR-Diffusion",
         "file": path.name,
-        "file_sha256": sha256_of(path),
+        "file_sha256": sha256(path),
         "recipe": config["model"],
     }
 

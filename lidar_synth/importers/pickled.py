@@ -1,6 +1,5 @@
 """Reading the pickles in which peers ship their weights: tensors and plain values come out, code never runs."""
 
-import hashlib
 import re
 from pathlib import Path
 from typing import Any
@@ -50,9 +49,3 @@ def state_of(content: Any, key: str, path: Path) -> dict[str, Tensor]:
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
         raise DataError(f"{path}: its weights are no tensors by name", "the state dictionary of a network")
     return weights
-
-
-def sha256_of(path: Path) -> str:
-    """sha256 of a file's bytes, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -21,7 +21,8 @@ from torch import Tensor, nn
 
 from lidar_synth.checkpoint import VELOCITY, Header, Part
 from lidar_synth.errors import DataError
-from lidar_synth.importers.pickled import load_pickle, sha256_of, state_of
+from lidar_synth.files import sha256
+from lidar_synth.importers.pickled import load_pickle, state_of
 from lidar_synth.nets import assemble
 from lidar_synth.nets.positions import BASES, LEARNED
 from lidar_synth.normalize import Normalisation
@@ -143,7 +144,7 @@ def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "licence": "as R2Flow's repository: MIT",
         "source": "https://github.com/kazuto1011/r2flow",
         "file": path.name,
-        "file_sha256": sha256_of(path),
+        "file_sha256": sha256(path),
         "images": content.get("num_images"),
         "recipe": {group: cfg.get(group) for group in ("data", "flow", "training", "finetuning")},
     }

@@ -20,9 +20,10 @@ from projection import random_points
 from timing import machine, print_table, time_in_turns
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import sha256, write_bank_files
+from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Encoding, Entry, Facts, Index, ShardWriter
 from lidar_synth.bank.chunks import deflate, fletcher32
+from lidar_synth.files import sha256
 from lidar_synth.formats.points import read_points
 from lidar_synth.projection import project
 from lidar_synth.scan import RangeImage, Scan

@@ -19,8 +19,9 @@ from typing import Any
 import torch
 from timing import machine, time_in_turns
 
-from lidar_synth.bake.folder import sha256, write_bank_files
+from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
+from lidar_synth.files import sha256
 from lidar_synth.formats import WRITERS, SemanticKITTI
 from lidar_synth.mixing import MixedScans, to_item
 from lidar_synth.noise import keyed_rng
