@@ -15,14 +15,16 @@ from hypothesis import given
 from torch import Tensor, nn
 
 from lidar_synth.distill import STRATEGIES
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.flow import METRICS, Example
+from lidar_synth.nets import build_network
 from lidar_synth.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.projection import project
 from lidar_synth.scan import Scan
 from lidar_synth.sensor import Sensor
 from lidar_synth.solvers import uniform_grid
 from lidar_synth.train import (
+    OPTIMIZERS,
     SCHEDULES,
     Batch,
     Batches,
@@ -237,22 +239,67 @@ def test_accumulation_changes_rounding_only(batches: Batches, accelerator: Accel
     assert one == pytest.approx(two, rel=1e-4)
 
 
+def transformer() -> nn.Module:
+    """A velocity network that every optimiser can train."""
+    torch.manual_seed(0)
+    arguments = {"width": 16, "time_width": 16, "depths": [1], "heads": [2], "patch": [2, 4]}
+    angles = torch.from_numpy(SENSOR.ray_angles())
+    return build_network("hdit", {"resolution": SENSOR.shape, "channels": TENSORS.size, "angles": angles} | arguments)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
 def test_a_saved_run_goes_on_with_the_very_same_losses(
-    batches: Batches, accelerator: Accelerator, tmp_path: Path
+    optimizer: str, batches: Batches, accelerator: Accelerator, tmp_path: Path
 ) -> None:
-    whole = new_training(ema_every=1)
+    recipe = Recipe(iterations=6, batch=4, warmup=2, rate=1e-2, ema_every=1, optimizer=optimizer)
+    whole = Training(transformer(), recipe)
     losses = [r.loss for r in steps(whole, teacher_task(), batches, accelerator)]
-    first = new_training(ema_every=1)
+    first = Training(transformer(), recipe)
     for record in steps(first, teacher_task(), batches, accelerator):
         if record.step == 3:
             break
     first.save(tmp_path / "run" / "state.safetensors")
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["state.safetensors"]
-    second = Training(Convolution(), whole.recipe)
+    second = Training(transformer(), recipe)
     second.load(tmp_path / "run" / "state.safetensors")
     assert [r.loss for r in steps(second, teacher_task(), batches, accelerator)] == losses[3:]
     for a, b in zip(whole.average.parameters(), second.average.parameters(), strict=True):
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_every_weight_is_moved_once_at_the_rate_of_the_schedule(
+    optimizer: str, batches: Batches, accelerator: Accelerator
+) -> None:
+    recipe = Recipe(iterations=2, batch=4, warmup=4, rate=1e-2, optimizer=optimizer)
+    training = Training(transformer(), recipe)
+    moved = [p for o in training.optimizers for group in o.param_groups for p in group["params"]]
+    assert sorted(map(id, moved)) == sorted(map(id, training.network.parameters()))
+    record = next(steps(training, teacher_task(), batches, accelerator))
+    assert {group["lr"] for o in training.optimizers for group in o.param_groups} == {record.rate} == {2.5e-3}
+
+
+def test_a_step_of_muon_turns_all_directions_alike() -> None:
+    """The update of a matrix has singular values that are about equal, whatever its gradient's are."""
+    network = transformer()
+    muon = OPTIMIZERS["muon"](network, 0.1, (0.9, 0.99), 0.0)[0]
+    weight = muon.param_groups[0]["params"][0]
+    before = weight.detach().clone()
+    u, _, v = torch.linalg.svd(torch.randn(weight.shape), full_matrices=False)
+    weight.grad = u * torch.logspace(0, -1, u.shape[1]) @ v
+    muon.step()
+    values = torch.linalg.svdvals(before - weight.detach())
+    assert values.max() < 2 * values.min()
+    rms = (before - weight.detach()).square().mean().sqrt()
+    assert 0.1 < rms / 0.1 < 0.4, "as long as a step of AdamW commonly is"
+
+
+def test_muon_refuses_a_network_without_matrices_to_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match="optimizer 'muon' for Convolution; expected a transformer"):
+        new_training(optimizer="muon")
+    monkeypatch.delattr(torch.optim, "Muon")
+    with pytest.raises(LibraryError, match=r"expected torch >= 2\.9\. Or optimizer: adamw"):
+        OPTIMIZERS["muon"](transformer(), 0.1, (0.9, 0.99), 0.0)
 
 
 def test_the_average_follows_the_weights(batches: Batches, accelerator: Accelerator) -> None:
@@ -310,6 +357,15 @@ def test_a_state_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     other = Training(nn.Linear(2, 2), training.recipe)
     with pytest.raises(DataError, match="state of another network"):
         other.load(path)
+    recipe = Recipe(iterations=1, optimizer="muon")
+    two = Training(transformer(), recipe)
+    for optimizer in two.optimizers:
+        for weight in (w for group in optimizer.param_groups for w in group["params"]):
+            weight.grad = torch.ones_like(weight)
+        optimizer.step()
+    two.save(path)
+    with pytest.raises(DataError, match="state of another network"):
+        Training(transformer(), Recipe(iterations=1)).load(path)
 
 
 def test_a_recipe_with_an_unknown_name_is_refused() -> None:

@@ -11,10 +11,12 @@ from lidar_synth.train.autoencoder import (
 from lidar_synth.train.cache import ImageCache, Other, cache_latents, cache_scans
 from lidar_synth.train.data import Batch, Batches, Conditioning, micro_batches
 from lidar_synth.train.loop import Loss, Record, Task, steps, student_task, teacher_task
+from lidar_synth.train.optimizers import OPTIMIZERS
 from lidar_synth.train.schedules import SCHEDULES
 from lidar_synth.train.state import Recipe, Training
 
 __all__ = [
+    "OPTIMIZERS",
     "SCHEDULES",
     "Autoencoding",
     "Batch",

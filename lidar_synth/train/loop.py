@@ -99,11 +99,11 @@ def steps(
     recipe = training.recipe
     metric = weighted(METRICS[recipe.metric], recipe.weights, batches.tensors)
     schedule = SCHEDULES[recipe.schedule]
-    network, optimizer = accelerator.prepare(training.network, training.optimizer)
+    network, *optimizers = accelerator.prepare(training.network, *training.optimizers)
     training.network.train()
     while training.step < recipe.iterations:
         rate = recipe.rate * schedule(training.step, recipe.warmup, recipe.iterations)
-        for group in training.optimizer.param_groups:
+        for group in (group for optimizer in optimizers for group in optimizer.param_groups):
             group["lr"] = rate
         parts = list(micro_batches(
             training.step, recipe.batch, recipe.accumulate, accelerator.process_index, accelerator.num_processes
@@ -119,14 +119,15 @@ def steps(
             evaluations += example.teacher_evaluations * accelerator.num_processes
         gradient = float(accelerator.clip_grad_norm_(network.parameters(), recipe.clip))
         if not (math.isfinite(total) and math.isfinite(gradient)):
-            optimizer.zero_grad()
+            network.zero_grad()
             raise DataError(
                 f"step {training.step + 1}: the loss is {total}, the norm of its gradient {gradient}",
                 "finite values",
                 "The last saved state and checkpoint are kept. Lower the rate, or train without bf16.",
             )
-        optimizer.step()
-        optimizer.zero_grad()
+        for optimizer in optimizers:
+            optimizer.step()
+            optimizer.zero_grad()
         training.step += 1
         if training.step % recipe.ema_every == 0:
             training.update_average()

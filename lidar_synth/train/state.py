@@ -19,6 +19,7 @@ from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
 from lidar_synth.flow import METRICS
 from lidar_synth.normalize import CHANNELS
+from lidar_synth.train.optimizers import OPTIMIZERS
 from lidar_synth.train.schedules import SCHEDULES
 
 
@@ -33,8 +34,9 @@ class Recipe:
         metric: a name of ``METRICS``.
         weights: {channel: weight} of squared errors, 1 where none is given: labels are five channels of seven, but
             no more than a seventh of what matters.
-        rate: the learning rate (AdamW) at the top of the schedule.
-        betas, weight_decay: AdamW's.
+        optimizer: a name of ``OPTIMIZERS``.
+        rate: the learning rate at the top of the schedule.
+        betas, weight_decay: AdamW's; the decay is Muon's too.
         schedule: a name of ``SCHEDULES``.
         warmup: steps until the rate is reached.
         clip: largest norm of the gradient.
@@ -52,6 +54,7 @@ class Recipe:
     accumulate: int = 1
     metric: str = "squared_l2"
     weights: Mapping[str, float] = field(default_factory=dict)
+    optimizer: str = "adamw"
     rate: float = 1e-4
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 0.01
@@ -62,7 +65,7 @@ class Recipe:
     ema_every: int = 10
 
     def __post_init__(self) -> None:
-        for key, table in (("metric", METRICS), ("schedule", SCHEDULES)):
+        for key, table in (("metric", METRICS), ("optimizer", OPTIMIZERS), ("schedule", SCHEDULES)):
             if getattr(self, key) not in table:
                 raise ConfigError(f"{key} {getattr(self, key)!r}", f"one of {', '.join(table)}")
         if set(self.weights) - set(CHANNELS) or not all(weight > 0 for weight in self.weights.values()):
@@ -72,7 +75,7 @@ class Recipe:
 
 
 class Training:
-    """What a run consists of between two steps: the network, its averaged twin, the optimiser, the step.
+    """What a run consists of between two steps: the network, its averaged twin, the optimisers, the step.
 
     Args:
         network: the velocity network, on its device.
@@ -83,9 +86,8 @@ class Training:
         self.network = network
         self.recipe = recipe
         self.average = copy.deepcopy(network).eval().requires_grad_(False)
-        self.optimizer = torch.optim.AdamW(
-            network.parameters(), recipe.rate, recipe.betas, weight_decay=recipe.weight_decay
-        )
+        make = OPTIMIZERS[recipe.optimizer]
+        self.optimizers = make(network, recipe.rate, recipe.betas, recipe.weight_decay)
         self.step = 0
 
     def update_average(self) -> None:
@@ -106,8 +108,9 @@ class Training:
         """
         tensors = {f"network.{n}": p for n, p in self.network.state_dict().items()}
         tensors |= {f"average.{n}": p for n, p in self.average.state_dict().items()}
-        for i, moments in self.optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{i}.{n}": value for n, value in moments.items()}
+        for k, optimizer in enumerate(self.optimizers):
+            for i, moments in optimizer.state_dict()["state"].items():
+                tensors |= {f"optimizer.{k}.{i}.{n}": value for n, value in moments.items()}
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
         write_file(path, save(tensors, {"step": str(self.step)}))
 
@@ -130,15 +133,15 @@ class Training:
         for name, tensor in tensors.items():
             part, key = name.split(".", 1)
             parts[part][key] = tensor
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in parts["optimizer"].items():
-            number, key = name.split(".")
-            moments.setdefault(int(number), {})[key] = tensor
         try:
             self.network.load_state_dict(parts["network"])
             self.average.load_state_dict(parts["average"])
-            groups = self.optimizer.state_dict()["param_groups"]
-            self.optimizer.load_state_dict({"state": moments, "param_groups": groups})
-        except (RuntimeError, ValueError) as error:
+            moments: list[dict[int, dict[str, Tensor]]] = [{} for _ in self.optimizers]
+            for name, tensor in parts["optimizer"].items():
+                which, number, key = name.split(".")
+                moments[int(which)].setdefault(int(number), {})[key] = tensor
+            for optimizer, state in zip(self.optimizers, moments, strict=True):
+                optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+        except (RuntimeError, ValueError, IndexError) as error:
             raise DataError(f"{path} is the state of another network ({error})", "the same configuration") from error
         self.step = step
