@@ -22,7 +22,7 @@ from torch.utils.data import DataLoader
 import lidar_synth.bank.reader as reader
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import FORMAT, INDEX, Bank, Encoding, Entry, Index, ShardReader, ShardWriter
-from lidar_synth.bank.chunks import checksum, fletcher32
+from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
 from lidar_synth.bank.encoding import LEVELS, TYPES
 from lidar_synth.classes import IGNORE
 from lidar_synth.convert import convert
@@ -156,6 +156,52 @@ def test_fletcher32_is_that_of_hdf5(size: int, fill: int | None) -> None:
         file.flush()
         chunk = bytes(dataset.id.read_direct_chunk((0,))[1])
     assert fletcher32(chunk[:-4]) == int.from_bytes(chunk[-4:], "little")
+
+
+@given(
+    values=st.integers(0, 2**32 - 1).map(np.random.default_rng),
+    shape=st.tuples(st.integers(1, 9), st.integers(1, 700)),
+    dtype=st.sampled_from([np.uint8, np.uint16, np.uint32]),
+    most=st.sampled_from([1, 3, 256, 2**32 - 1]),
+)
+@settings(max_examples=60, deadline=None)
+def test_inflate_is_the_inverse_of_deflate(
+    values: np.random.Generator, shape: tuple[int, int], dtype: type[np.unsignedinteger[Any]], most: int
+) -> None:
+    array = values.integers(0, min(most, np.iinfo(dtype).max), shape).astype(dtype)
+    again = inflate(deflate(array), shape, np.dtype(dtype))
+    assert again.dtype == dtype and np.array_equal(again, array)
+
+
+def test_a_chunk_that_is_none_is_refused() -> None:
+    array = np.random.default_rng(0).integers(0, 9, (8, 32)).astype(np.uint16)
+    chunk, dtype = deflate(array), array.dtype
+    for bit in range(8 * len(chunk)):
+        damaged = bytearray(chunk)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(ValueError, match="Fletcher-32"):
+            inflate(bytes(damaged), array.shape, dtype)
+    for length in range(len(chunk)):
+        with pytest.raises(ValueError):
+            inflate(chunk[:length], array.shape, dtype)
+
+    def sealed(packed: bytes) -> bytes:
+        return packed + fletcher32(packed).to_bytes(4, "little")
+
+    with pytest.raises(ValueError, match="it holds 512 bytes and not 256"):
+        inflate(chunk, array.shape, np.dtype(np.uint8))
+    for packed in (b"no zlib at all", chunk[:-9], zlib.compress(array.tobytes())[:40]):
+        with pytest.raises(ValueError):
+            inflate(sealed(packed), array.shape, dtype)
+
+
+def test_a_chunk_that_passed_by_a_filter_is_refused(root: Path) -> None:
+    path = root / "shard-00000.h5"
+    with h5py.File(path, "r+") as file:
+        chunk = bytes(file["range"].id.read_direct_chunk((1, 0, 0))[1])
+        file["range"].id.write_direct_chunk((1, 0, 0), chunk + b"0", filter_mask=1)
+    with pytest.raises(DataError, match=r"scan 1 cannot be read \(filters 1 were left out\)"):
+        ShardReader(path, str(path)).read(1)
 
 
 def test_plain_hdf5_reads_a_shard(tmp_path: Path) -> None:

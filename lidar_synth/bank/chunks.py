@@ -1,13 +1,16 @@
-"""Scans as the chunks of an HDF5 dataset, made in the same way as HDF5's own filters make them.
+"""Scans as the chunks of an HDF5 dataset, made and read in the same way as HDF5's own filters do it.
 
-They are made here and not by HDF5, because HDF5 does one thing at a time and zlib leaves the other threads alone.
+They are made and read here and not by HDF5, because HDF5 does one thing at a time and by zlib; ISA-L writes and reads
+the same format of data in a fraction of the time (docs/benchmarks.md) and leaves the other threads alone.
 """
 
-import zlib
+import math
 from collections.abc import Mapping
 from typing import Any
 
+import numba
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from lidar_synth.errors import LibraryError
@@ -17,31 +20,71 @@ _GZIP_LEVEL = 1
 
 def checksum(seed: int, index: int, arrays: Mapping[str, NDArray[Any]], condition: bytes = b"") -> int:
     """CRC-32 of what a scan is: seed and index (8 bytes each, lowest first), the condition's name, then the arrays."""
-    crc = zlib.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
+    crc = isal_zlib.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
     for values in arrays.values():
-        crc = zlib.crc32(values.data, crc)
+        crc = isal_zlib.crc32(values.data, crc)
     return crc
 
 
 def deflate(values: NDArray[Any]) -> bytes:
     """A chunk as HDF5's filters shuffle, deflate and fletcher32 make it."""
-    shuffled = values.view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
-    packed = zlib.compress(shuffled, _GZIP_LEVEL)
+    size = values.itemsize
+    planes = np.empty((size, values.size), np.uint8)
+    for k, plane in enumerate(planes):
+        np.right_shift(values.reshape(-1), 8 * k, out=plane, casting="unsafe")
+    packed = isal_zlib.compress(planes.data, _GZIP_LEVEL)
     return packed + fletcher32(packed).to_bytes(4, "little")
 
 
-def fletcher32(data: bytes) -> int:
+def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The inverse of ``deflate``.
+
+    Raises:
+        ValueError: where the chunk is damaged, or holds something else.
+    """
+    packed = memoryview(chunk)[:-4]
+    if fletcher32(packed) != int.from_bytes(chunk[-4:], "little"):
+        raise ValueError("its Fletcher-32 does not match")
+    size = math.prod(shape) * dtype.itemsize
+    try:
+        plain = isal_zlib.decompress(packed, bufsize=size)
+    except isal_zlib.error as error:  # type: ignore[misc]  # its stubs take the class for an instance
+        raise ValueError(str(error)) from error
+    if len(plain) != size:
+        raise ValueError(f"it holds {len(plain)} bytes and not {size}")
+    first, *others = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
+    values = first.astype(dtype, copy=False)
+    for k, plane in enumerate(others, 1):
+        values |= np.left_shift(plane, 8 * k, dtype=dtype)
+    return values.reshape(shape)
+
+
+def fletcher32(data: bytes | memoryview) -> int:
     """The checksum of HDF5's filter of that name: over big-endian 16-bit words, an odd last byte as the higher one."""
-    words = np.frombuffer(data + b"\0" * (len(data) % 2), ">u2").astype(np.int64)
-    first, second = int(words.sum()), int(words @ np.arange(len(words), 0, -1))
+    first, second = _fletcher_sums(np.frombuffer(data, np.uint8))
+    if len(data) % 2:
+        first += data[-1] << 8
+        second += first
     # Sums are folded with end-around carry, so that a multiple of 65535 becomes 65535 and not 0.
     low, high = ((total - 1) % 0xFFFF + 1 if total else 0 for total in (first, second))
     return high << 16 | low
 
 
+@numba.njit(nogil=True, cache=True)
+def _fletcher_sums(data):  # type: ignore[no-untyped-def]  # (N,) uint8, compiled
+    """The sum of the whole 16-bit words, and the sum of what it was after each of them."""
+    count = len(data) // 2
+    first = second = np.int64(0)
+    for i in range(count):
+        word = np.int64(data[2 * i]) << 8 | np.int64(data[2 * i + 1])
+        first += word
+        second += word * (count - i)
+    return first, second
+
+
 def filters(compression: str) -> Mapping[str, Any]:
-    """What ``h5py.create_dataset`` takes for gzip, which every HDF5 reads, or for Blosc2 (zstd 3, bits shuffled), which
-    reads twice as fast where hdf5plugin is installed; importing that is also what makes HDF5 know Blosc2.
+    """What ``h5py.create_dataset`` takes for gzip, which every HDF5 reads, or for Blosc2 (zstd 3, bits shuffled), where
+    hdf5plugin is installed; importing that is also what makes HDF5 know Blosc2.
 
     Raises:
         LibraryError: on Blosc2 without hdf5plugin.

@@ -17,6 +17,7 @@ projection would drop it.
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -85,59 +86,90 @@ class Encoding:
             raise DataError(f"a range image of {image.sensor.shape}", f"{self.sensor.shape} of {self.sensor.name!r}")
         if missing := [name for name in self.names[1:] if name not in image.channels]:
             raise DataError(f"a range image without {missing}", f"channels {list(self.names[1:])}")
-        codes = {
-            name: self._code(name, image.range if name == "range" else image.channels[name]) for name in self.names
-        }
+        codes = {n: self._code(n, image.range if n == "range" else image.channels[n]) for n in self.names}
         if out is None:
-            return {name: code.astype(TYPES[name]) for name, code in codes.items()}
+            return codes
         for name, code in codes.items():
-            np.copyto(out[name], code, casting="unsafe")
+            np.copyto(out[name], code)
         return {name: out[name] for name in self.names}
 
     def decode(self, arrays: Mapping[str, NDArray[Any]]) -> RangeImage:
         """The range image of ``encode``'s arrays; its own memory, float32 but for the labels."""
-        shares = {n: np.divide(arrays[n], np.float32(LEVELS[n]), dtype=np.float32) for n in self.names if n in LEVELS}
-        labels = {n: arrays[n].copy() for n in self.names if n == "label"}
-        return RangeImage(self.metres(arrays["range"]), self.sensor, shares | labels)
+        channels: dict[str, NDArray[Any]] = {}
+        for name in self.names[1:]:
+            if name in LEVELS:
+                channels[name] = np.empty(self.sensor.shape, np.float32)
+                _decode_shares(arrays[name].ravel(), np.float32(LEVELS[name]), channels[name].reshape(-1))
+            else:
+                channels[name] = arrays[name].copy()
+        return RangeImage(self.metres(arrays["range"]), self.sensor, channels)
 
     def metres(self, codes: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Ranges (any shape) of their codes, 0 = no return."""
         near, far = self.sensor.range_min * (1 + _INSIDE), self.sensor.range_max * (1 - _INSIDE)
-        metres = np.multiply(codes, np.float32(self.scale), dtype=np.float32)
-        np.clip(metres, np.float32(near), np.float32(far), out=metres)
-        metres[codes == 0] = 0
+        metres = np.empty(codes.shape, np.float32)
+        _decode_range(codes.ravel(), np.float32(self.scale), np.float32(near), np.float32(far), metres.reshape(-1))
         return metres
 
     def _code(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
-        """What ``encode`` stores, in any type that holds it."""
+        """What ``encode`` stores of one channel."""
+        if name == "label":
+            return _train_ids(values)
+        codes = np.empty(values.shape, TYPES[name])
         if name == "range":
-            return self._range(values)
-        return _share(values, name) if name in LEVELS else _train_ids(values)
-
-    def _range(self, metres: NDArray[np.float32]) -> NDArray[Any]:
-        near, far = self.sensor.range_min - self.scale / 2, self.sensor.range_max + self.scale / 2
-        seen = metres != 0
-        if not ((metres >= np.float32(max(near, 0))) & (metres <= np.float32(far)) | ~seen).all():
-            raise DataError(
-                f"a range image with ranges from {metres[seen].min():g} to {metres[seen].max():g} m",
-                f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of {self.sensor.name!r}, "
-                "or 0 = no return",
-            )
-        codes: NDArray[np.float32] = np.rint(np.multiply(metres, np.float32(1 / self.scale), dtype=np.float32))
-        np.clip(codes, seen, RANGE_STEPS, out=codes)
+            near, far = self.sensor.range_min - self.scale / 2, self.sensor.range_max + self.scale / 2
+            limits = np.float32(max(near, 0)), np.float32(far)
+            if not _encode_range(values.ravel(), np.float32(1 / self.scale), *limits, codes.reshape(-1)):
+                seen = values[values != 0]
+                raise DataError(
+                    f"a range image with ranges from {seen.min():g} to {seen.max():g} m",
+                    f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of {self.sensor.name!r}, "
+                    "or 0 = no return",
+                )
+        elif not _encode_shares(values.ravel(), np.float32(LEVELS[name]), codes.reshape(-1)):
+            raise DataError(f"{name} from {values.min():g} to {values.max():g}", "values in [0, 1]")
         return codes
 
 
-def _share(values: NDArray[Any], name: str) -> NDArray[Any]:
-    """Codes of values in [0, 1]."""
-    if not ((values >= 0) & (values <= 1)).all():
-        raise DataError(f"{name} from {values.min():g} to {values.max():g}", "values in [0, 1]")
-    codes: NDArray[np.float32] = np.rint(np.multiply(values, np.float32(LEVELS[name]), dtype=np.float32))
-    return codes
+def _train_ids(label: NDArray[Any]) -> NDArray[np.uint8]:
+    wrong = (label >= len(NAMES)) & (label != IGNORE)
+    if wrong.any():
+        raise DataError(
+            f"train ids {np.unique(label[wrong]).tolist()[:8]}", f"0..{len(NAMES) - 1}, or {IGNORE} = ignore"
+        )
+    return label.astype(np.uint8)
 
 
-def _train_ids(label: NDArray[Any]) -> NDArray[Any]:
-    if ((label >= len(NAMES)) & (label != IGNORE)).any():
-        wrong = np.unique(label[(label >= len(NAMES)) & (label != IGNORE)]).tolist()
-        raise DataError(f"train ids {wrong[:8]}", f"0..{len(NAMES) - 1}, or {IGNORE} = ignore")
-    return label
+@numba.njit(nogil=True, cache=True)
+def _encode_range(metres, inverse, near, far, out):  # type: ignore[no-untyped-def]  # (N,) float32, compiled
+    """Steps of 1 / inverse metres; False where a range is outside near to far and not 0."""
+    sound = True
+    for i in range(len(metres)):
+        seen = metres[i] != 0
+        sound &= ((metres[i] >= near) & (metres[i] <= far)) | (not seen)
+        out[i] = np.uint16(min(max(np.rint(metres[i] * inverse), np.float32(seen)), np.float32(RANGE_STEPS)))
+    return sound
+
+
+@numba.njit(nogil=True, cache=True)
+def _decode_range(codes, scale, near, far, out):  # type: ignore[no-untyped-def]
+    """The inverse, kept between near and far."""
+    for i in range(len(codes)):
+        out[i] = min(max(np.float32(codes[i]) * scale, near), far) if codes[i] > 0 else np.float32(0)
+
+
+@numba.njit(nogil=True, cache=True)
+def _encode_shares(values, levels, out):  # type: ignore[no-untyped-def]
+    """Steps of 1 / levels; False where a value is outside 0 to 1."""
+    sound = True
+    for i in range(len(values)):
+        sound &= (values[i] >= 0) & (values[i] <= 1)
+        out[i] = np.uint8(np.rint(np.float32(values[i]) * levels))
+    return sound
+
+
+@numba.njit(nogil=True, cache=True)
+def _decode_shares(codes, levels, out):  # type: ignore[no-untyped-def]
+    """The inverse."""
+    for i in range(len(codes)):
+        out[i] = np.float32(codes[i]) / levels

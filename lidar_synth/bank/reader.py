@@ -85,8 +85,9 @@ class Bank:
         """
         if not -len(self) <= number < len(self):
             raise IndexError(f"scan {number} of {len(self)}")
-        number %= len(self)
-        return replace(unproject(self.image(number)), id=self.ids[number], domain=SYNTHETIC)
+        shard, position = _place(self.index, number % len(self))
+        image = self.facts.encoding.decode(self.shard(shard).read(position))
+        return replace(unproject(image), id=_name(self.index, shard, position), domain=SYNTHETIC)
 
     def image(self, number: int) -> RangeImage:
         """The range image of a scan, 0 <= number < len; raises as ``__getitem__``."""
@@ -162,9 +163,7 @@ class _Names(Sequence[str]):
     def __getitem__(self, number: int | slice) -> str | Sequence[str]:
         if isinstance(number, slice):
             return [self[i] for i in range(len(self))[number]]
-        shard, position = _place(self._index, range(len(self))[number])
-        entry = self._index.shards[shard]
-        return f"{self._index.sources[entry.source].model}/{entry.seed}/{entry.first + position}"
+        return _name(self._index, *_place(self._index, range(len(self))[number]))
 
 
 def _place(index: Index, number: int) -> tuple[int, int]:
@@ -172,6 +171,12 @@ def _place(index: Index, number: int) -> tuple[int, int]:
     shard = bisect_right(index.ends, number)
     entry = index.shards[shard]
     return shard, entry.position(number - (index.ends[shard] - entry.kept))
+
+
+def _name(index: Index, shard: int, position: int) -> str:
+    """A scan's name."""
+    entry = index.shards[shard]
+    return f"{index.sources[entry.source].model}/{entry.seed}/{entry.first + position}"
 
 
 def _file(root: str | Path, name: str) -> Path | BinaryIO:

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 import h5py
 from numpy.typing import NDArray
 
-from lidar_synth.bank.chunks import checksum, filters
+from lidar_synth.bank.chunks import checksum, filters, inflate
 from lidar_synth.bank.index import FORMAT, REPAIR, Entry, Facts
 from lidar_synth.errors import DataError, FileError
 
@@ -68,7 +68,7 @@ class ShardReader:
             DataError: where it is damaged.
         """
         with self._reading(f"scan {position}"):
-            arrays = {name: dataset[position] for name, dataset in self._datasets.items()}
+            arrays = {name: self._array(name, position) for name in self._datasets}
             seed, index, crc = (int(self._numbers[n][position]) for n in ("seed", "index", "crc"))
             if checksum(seed, index, arrays, self._condition(position)) != crc:
                 raise OSError("its CRC does not match")
@@ -84,7 +84,7 @@ class ShardReader:
         """The chunks of one scan as they are in the file, and its CRC; checked by ``read`` before."""
         self.read(position)
         with self._reading(f"scan {position}"):
-            found = {n: bytes(d.id.read_direct_chunk((position, 0, 0))[1]) for n, d in self._datasets.items()}
+            found = {name: self._chunk(name, position) for name in self._datasets}
         return found, int(self._numbers["crc"][position])
 
     def close(self) -> None:
@@ -116,15 +116,29 @@ class ShardReader:
 
     def _read_datasets(self) -> None:
         filters(self.facts.compression)
-        count, names = self.entry.scans, self.encoding.names
+        count, self._layout = self.entry.scans, self.encoding.arrays()
         with self._reading("its datasets"):
             self._numbers = {n: self._file[n][:] for n in ("seed", "index", "crc")}
             self._conditions = self._file["condition"][:] if "condition" in self._file else None
-            self._datasets = {n: self._file[n] for n in names}
+            self._datasets = {n: self._file[n] for n in self._layout}
             shapes = {n: (d.shape, d.dtype) for n, d in self._datasets.items()}
-            expected = {n: ((count, *shape), dtype) for n, (shape, dtype) in self.encoding.arrays().items()}
+            expected = {n: ((count, *shape), dtype) for n, (shape, dtype) in self._layout.items()}
             if shapes != expected or any(v.shape != (count,) for v in self._numbers.values()):
                 raise OSError(f"they are {shapes}, not {expected}")
+
+    def _array(self, name: str, position: int) -> NDArray[Any]:
+        """One array of a scan."""
+        if self.facts.compression != "gzip":
+            values: NDArray[Any] = self._datasets[name][position]
+            return values
+        return inflate(self._chunk(name, position), *self._layout[name])
+
+    def _chunk(self, name: str, position: int) -> bytes:
+        """The chunk that holds one array of a scan, as it is in the file."""
+        skipped, chunk = self._datasets[name].id.read_direct_chunk((position, 0, 0))
+        if skipped:
+            raise OSError(f"filters {skipped:b} were left out")
+        return bytes(chunk)
 
     def _condition(self, position: int) -> bytes:
         return b"" if self._conditions is None else bytes(self._conditions[position])

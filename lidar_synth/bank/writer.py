@@ -137,8 +137,8 @@ class ShardWriter:
             numbers["condition"] = np.array(self._conditions, "S")
         for name, values in numbers.items():
             self._file.create_dataset(name, data=values, track_times=False)
-        for name, (shape, dtype) in self.encoding.arrays().items():
-            self._file.create_dataset(
+        self._datasets = {
+            name: self._file.create_dataset(
                 name,
                 (count, *shape),
                 dtype.newbyteorder("<"),
@@ -147,6 +147,8 @@ class ShardWriter:
                 track_times=False,
                 **filters(self._compression),
             )
+            for name, (shape, dtype) in self.encoding.arrays().items()
+        }
 
     def _pack(self, position: int, image: RangeImage) -> tuple[int, dict[str, bytes]]:
         """CRC and chunks of a scan; in a thread."""
@@ -171,10 +173,10 @@ class ShardWriter:
         with _on_disk(self.path):
             for name, chunk in chunks.items():
                 if ready:
-                    self._file[name].id.write_direct_chunk((position, 0, 0), chunk)
+                    self._datasets[name].id.write_direct_chunk((position, 0, 0), chunk)
                 else:
                     shape, dtype = self.encoding.sensor.shape, self._types()[name]
-                    self._file[name][position] = np.frombuffer(chunk, dtype).reshape(shape)
+                    self._datasets[name][position] = np.frombuffer(chunk, dtype).reshape(shape)
 
 
 def _create(path: Path, layout: str) -> h5py.File:

@@ -191,11 +191,35 @@ def gather(values, index, empty, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(error_model="numpy", cache=True)
-def along_rays(image, directions, points):  # type: ignore[no-untyped-def]
-    """Points (N, 3) of the returns in image (H*W,) along directions (H*W, 3)."""
+def returns_in(image):  # type: ignore[no-untyped-def]
+    """How many cells of image (H*W,) have a return; -1 where a range is negative or not finite."""
+    n, sound = 0, True
+    for c in range(len(image)):
+        n += image[c] > 0
+        sound &= (image[c] >= 0) & (image[c] < _INF)
+    return n if sound else -1
+
+
+# The two loops below write every cell to the next free place and only then ask whether it stays: a branch that nobody
+# can foresee costs more. So ``out`` has room for one more than there are returns.
+
+
+@numba.njit(error_model="numpy", cache=True)
+def along_rays(image, directions, out):  # type: ignore[no-untyped-def]
+    """Points (N + 1, 3), the last of them spare, of the returns in image (H*W,) along directions (H*W, 3)."""
     n = 0
     for c in range(len(image)):
-        if image[c] > 0:
-            for k in range(3):
-                points[n, k] = image[c] * directions[c, k]
-            n += 1
+        r = image[c]
+        # All loads before the stores: the compiler has to take ``out`` for a part of the others.
+        x, y, z = r * directions[c, 0], r * directions[c, 1], r * directions[c, 2]
+        out[n, 0], out[n, 1], out[n, 2] = x, y, z
+        n += r > 0
+
+
+@numba.njit(cache=True)
+def pick_returns(image, values, out):  # type: ignore[no-untyped-def]
+    """What values (H*W,) say of the returns in image (H*W,): (N + 1,), the last of them spare."""
+    n = 0
+    for c in range(len(image)):
+        out[n] = values[c]
+        n += image[c] > 0

@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.projection.kernels import along_rays, gather, grid_of, locate_points, nearest_in_cells, nearest_points
+from lidar_synth.projection.kernels import (
+    along_rays,
+    gather,
+    grid_of,
+    locate_points,
+    nearest_in_cells,
+    nearest_points,
+    pick_returns,
+    returns_in,
+)
 from lidar_synth.scan import POINT_FIELDS, RangeImage, Scan
 from lidar_synth.sensor import Rays, Sensor
 
@@ -120,15 +129,21 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
     Raises:
         DataError: on a range that is negative or not finite.
     """
-    if not (np.isfinite(image.range).all() and (image.range >= 0).all()):
+    directions = image.sensor.ray_directions(rays).reshape(-1, 3)
+    flat = np.ascontiguousarray(image.range, np.float32).reshape(len(directions))
+    count = returns_in(flat)
+    if count < 0:
         raise DataError(f"range image of sensor {image.sensor.name!r} with negative or non-finite range", "metres")
-    flat = np.ascontiguousarray(image.range, np.float32).reshape(-1)
-    seen = flat > 0
-    points = np.empty((np.count_nonzero(seen), 3), np.float32)
-    along_rays(flat, image.sensor.ray_directions(rays).reshape(-1, 3), points)
-    fields: dict[str, Any] = {name: v.reshape(-1)[seen] for name, v in image.channels.items() if name in POINT_FIELDS}
-    fields.setdefault("reflectance", np.zeros(len(points), np.float32))
-    return Scan(points, sensor=image.sensor, **fields)
+    points = np.empty((count + 1, 3), np.float32)
+    along_rays(flat, directions, points)
+    fields: dict[str, Any] = {}
+    for name in [n for n in image.channels if n in POINT_FIELDS]:
+        values = np.ascontiguousarray(image.channels[name]).reshape(len(directions))
+        picked = np.empty(count + 1, values.dtype)
+        pick_returns(flat, values, picked)
+        fields[name] = picked[:count]
+    fields.setdefault("reflectance", np.zeros(count, np.float32))
+    return Scan(points[:count], sensor=image.sensor, **fields)
 
 
 def _checked(points: NDArray[Any]) -> NDArray[np.float32]:

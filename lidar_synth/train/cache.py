@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from lidar_synth.bank.encoding import LEVELS, TYPES, Encoding
 from lidar_synth.codec import Codec
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
@@ -20,9 +22,8 @@ from lidar_synth.projection import project
 from lidar_synth.scan import RangeImage, Scan, Source
 from lidar_synth.sensor import Sensor
 
-DTYPES: dict[str, type[np.generic]] = {"range": np.uint16, "reflectance": np.uint8, "label": np.uint8}
-"""How a cache holds each channel: the range in 65535 steps of the sensor's farthest (1.2 mm for 80 m), reflectance
-in 255, labels as they are."""
+DTYPES: dict[str, type[np.generic]] = {name: TYPES[name] for name in ("range", "reflectance", "label")}
+"""How a cache holds each channel: as a bank does."""
 
 Layout = dict[str, tuple[tuple[int, ...], type[np.generic]]]
 """{field of a cache: its shape and type}."""
@@ -43,6 +44,11 @@ class ImageCache:
     fields: Mapping[str, NDArray[Any]]
     sensor: Sensor
 
+    @cached_property
+    def encoding(self) -> Encoding:
+        """Of the channels."""
+        return Encoding(self.sensor, DTYPES.keys() & self.fields.keys())
+
     def __len__(self) -> int:
         return len(self.fields["range"])
 
@@ -50,18 +56,18 @@ class ImageCache:
         """(B, H, W) of each channel: range float32 metres, reflectance float32 in [0, 1], label uint8; (B, ...) uint8
         of all else."""
         values = {name: torch.from_numpy(v[np.asarray(indices, np.int64)]) for name, v in self.fields.items()}
-        values["range"] = values["range"].float() * (self.sensor.range_max / 65535)
+        values["range"] = values["range"].float() * self.encoding.scale
         if "reflectance" in values:
-            values["reflectance"] = values["reflectance"].float() / 255
+            values["reflectance"] = values["reflectance"].float() / LEVELS["reflectance"]
         return values
 
     def write(self, index: int, image: RangeImage, others: Mapping[str, NDArray[np.uint8]] | None = None) -> None:
-        """Put a range image, and what else is kept of its scan, into its place."""
-        self.fields["range"][index] = np.rint(image.range * (65535 / self.sensor.range_max)).clip(max=65535)
-        if "reflectance" in self.fields:
-            self.fields["reflectance"][index] = np.rint(image.channels["reflectance"].clip(0, 1) * 255)
-        if "label" in self.fields:
-            self.fields["label"][index] = image.channels["label"]
+        """Put a range image, and what else is kept of its scan, into its place.
+
+        Raises:
+            DataError: on a value that has no code, see ``Encoding.encode``.
+        """
+        self.encoding.encode(image, {name: self.fields[name][index] for name in self.encoding.names})
         for name, values in (others or {}).items():
             self.fields[name][index] = values
 

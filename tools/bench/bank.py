@@ -1,10 +1,11 @@
 """How large a bank of town scans is, and how fast it is written and read, on one core.
 
-    python tools/bench/bank.py [SCAN.bin] [--scans N]
+    python tools/bench/bank.py [SCAN.bin] [--scans N] [--model NAME|FILE] [--generated N]
 
 SCAN.bin is a KITTI-360 scan to compare reading with; without one, a random scan of 120,000 points. Processor time is
-counted, not the clock's, so that a machine that is busy otherwise gives the same figures. The town's scans have no
-confidence; one that is mostly high and falls where labels change stands in for it.
+counted, not the clock's, so that a machine that is busy otherwise gives nearly the same figures. The town's scans have
+no confidence; one that is mostly high and falls where labels change stands in for it. What a model's own takes is
+measured on its scans.
 """
 
 import argparse
@@ -13,24 +14,30 @@ import time
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import h5py
 import numpy as np
+import torch
+from isal import isal_zlib
 from projection import random_points
 from timing import machine, print_table, time_in_turns
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Encoding, Entry, Facts, Index, ShardWriter
-from lidar_synth.bank.chunks import deflate, fletcher32
+from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
 from lidar_synth.files import sha256
 from lidar_synth.formats.points import read_points
-from lidar_synth.projection import project
+from lidar_synth.generator import load_generator
+from lidar_synth.projection import project, unproject
 from lidar_synth.scan import RangeImage, Scan
 from lidar_synth.sensor import load_sensor
 from lidar_synth.town import Town
 
 SHARD = 64
+FIELDS = ("reflectance", "label", "confidence")
 
 
 def town_images(count: int) -> list[RangeImage]:
@@ -62,6 +69,18 @@ def write(root: Path, images: list[RangeImage], fields: tuple[str, ...]) -> Bank
     return Bank(root)
 
 
+def sizes(root: Path, images: list[RangeImage]) -> None:
+    """Prints what each array of the images takes in a bank."""
+    bank = write(root, images, FIELDS)
+    total = bank.index.size / len(images)
+    with h5py.File(root / bank.index.shards[0].file) as file:
+        parts = {name: file[name].id.get_storage_size() / len(file[name]) for name in bank.facts.encoding.names}
+    print(f"| all of it | {total / 1e3:.1f} kB a scan |")
+    print(f"| without confidence | {(total - parts['confidence']) / 1e3:.1f} kB a scan |")
+    for name, size in parts.items():
+        print(f"| {name} | {size / 1e3:.1f} kB a scan |")
+
+
 def seconds(call: Callable[[], object]) -> float:
     """Processor time of one call, of all threads."""
     start = time.process_time()
@@ -69,58 +88,98 @@ def seconds(call: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
+def size_and_rate(root: Path, images: list[RangeImage]) -> Bank:
+    """Prints the first table; returns a bank without confidence."""
+    count = len(images)
+    plain = write(root / "plain", images, FIELDS[:2])
+    rates = {}
+    for turn, fields in enumerate((FIELDS[:2], FIELDS) * 3):
+        name = ", ".join(("range", *fields))
+        took = seconds(partial(write, root / f"turn-{turn}", images, fields))
+        rates[name] = max(rates.get(name, 0.0), count / took)
+    error = max(float(np.abs(plain.image(i).range - image.range).max()) for i, image in enumerate(images))
+    read = min(seconds(lambda: [plain.image(i) for i in range(count)]) for _ in range(3))
+    print(f"\n### Size and rate, 64 x 1024, {count} scans of the town\n\n{machine()}\n\n| what | |\n|---|---:|")
+    sizes(root / "full", images)
+    print(f"| step of the range | {plain.facts.encoding.scale * 1e3:.2f} mm |")
+    print(f"| largest difference of a range | {error * 1e3:.2f} mm |")
+    print(f"| read one after the other, as images | {count / read:.0f} scans/s |")
+    for name, rate in rates.items():
+        print(f"| written by one core: {name} | {rate:.0f} scans/s |")
+    return plain
+
+
+def reading(path: Path, bank: Bank) -> None:
+    """Prints what a scan of a bank costs beside a point file."""
+    turn = iter(np.random.default_rng(0).integers(0, len(bank), 10**6).tolist())
+    sensor, shard = bank.sensor, bank.shard(0)
+
+    def read_and_project() -> RangeImage:
+        points = read_points(path)
+        return project(Scan(points[:, :3], points[:, 3], sensor))
+
+    def by_hdf5() -> list[object]:
+        position = next(turn) % shard.entry.scans
+        return [dataset[position] for dataset in shard._datasets.values()]
+
+    ours = "random scan of a bank, as image"
+    calls: dict[str, Callable[[], object]] = {
+        ours: lambda: bank.image(next(turn)),
+        "the same, as points": lambda: bank[next(turn)],
+        "its arrays": lambda: shard.read(next(turn) % shard.entry.scans),
+        "its arrays by HDF5's own filters (zlib), CRC not looked at": by_hdf5,
+        f"{path.name}, {path.stat().st_size // 16} points, read and projected": read_and_project,
+    }
+    print_table("Reading", time_in_turns(calls, 200, time.process_time), ours)
+
+
+def stages(image: RangeImage) -> None:
+    """Prints what a scan with confidence goes through."""
+    encoding = Encoding(image.sensor, FIELDS)
+    arrays, kinds = encoding.encode(image), encoding.arrays()
+    packed = {name: deflate(values) for name, values in arrays.items()}
+    decoded = encoding.decode(arrays)
+    planes = [values.view(np.uint8).reshape(-1, values.itemsize).T.tobytes() for values in arrays.values()]
+    pack = "shuffle, deflate, Fletcher-32"
+    calls: dict[str, Callable[[], object]] = {
+        "encode": lambda: encoding.encode(image),
+        "CRC-32": lambda: checksum(0, 0, arrays),
+        pack: lambda: [deflate(values) for values in arrays.values()],
+        "of which deflate": lambda: [isal_zlib.compress(plane, 1) for plane in planes],
+        "deflate by zlib": lambda: [zlib.compress(plane, 1) for plane in planes],
+        "Fletcher-32, inflate, unshuffle": lambda: [inflate(c, *kinds[name]) for name, c in packed.items()],
+        "of which inflate": lambda: [isal_zlib.decompress(c[:-4], bufsize=1 << 17) for c in packed.values()],
+        "inflate by zlib": lambda: [zlib.decompress(c[:-4], bufsize=1 << 17) for c in packed.values()],
+        "of which Fletcher-32": lambda: [fletcher32(chunk) for chunk in packed.values()],
+        "decode": lambda: encoding.decode(arrays),
+        "unproject": lambda: unproject(decoded),
+    }
+    print_table("Stages of a scan with confidence", time_in_turns(calls, 200, time.process_time), pack)
+
+
 def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scan", nargs="?", type=Path, help="a .bin file")
-    parser.add_argument("--scans", type=int, default=192)
-    path, count = parser.parse_args().scan, parser.parse_args().scans
-    images, sensor = town_images(count), load_sensor("hdl64e_kitti360")
-    fields = ("reflectance", "label", "confidence")
+    parser.add_argument("--scans", type=int, default=192, help="of the town")
+    parser.add_argument("--model", default="town", help="a shipped model or a checkpoint")
+    parser.add_argument("--generated", type=int, default=40, help="scans of the model; 0 leaves that table out")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    images = town_images(options.scans)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        plain = write(root / "plain", images, fields[:2])
-        took = seconds(lambda: write(root / "full", images, fields))
-        full = Bank(root / "full")
-        error = max(float(np.abs(full.image(i).range - image.range).max()) for i, image in enumerate(images))
-        print(f"\n### Size and rate, 64 x 1024, {count} scans\n\n{machine()}\n\n| what | |\n|---|---:|")
-        print(f"| range, reflectance, labels | {plain.index.size / count / 1e3:.1f} kB a scan |")
-        print(f"| confidence beside them | {(full.index.size - plain.index.size) / count / 1e3:.1f} kB a scan |")
-        print(f"| step of the range | {full.facts.encoding.scale * 1e3:.2f} mm |")
-        print(f"| largest difference of a range | {error * 1e3:.2f} mm |")
-        read = seconds(lambda: [plain.image(i) for i in range(count)])
-        print(f"| read one after the other, as images | {count / read:.0f} scans/s |")
-        print(f"| written by one core, with confidence | {count / took:.0f} scans/s |")
-
-        if path is None:
-            path = root / "random.bin"
-            random_points(sensor).tofile(path)
-        turn = iter(np.random.default_rng(0).integers(0, count, 10**6).tolist())
-
-        def read_and_project() -> RangeImage:
-            points = read_points(path)
-            return project(Scan(points[:, :3], points[:, 3], sensor))
-
-        ours = "random scan of a bank, as image"
-        calls: dict[str, Callable[[], object]] = {
-            ours: lambda: plain.image(next(turn)),
-            "the same, as points": lambda: plain[next(turn)],
-            f"{path.name}, {path.stat().st_size // 16} points, read and projected": read_and_project,
-        }
-        print_table("Reading", time_in_turns(calls, clock=time.process_time), ours)
-
-    encoding, image = Encoding(sensor, fields), images[0]
-    arrays = encoding.encode(image)
-    packed = [deflate(values) for values in arrays.values()]
-    encode, pack = "encode", "shuffle, deflate, Fletcher-32"
-    stages: dict[str, Callable[[], object]] = {
-        encode: lambda: encoding.encode(image),
-        "CRC-32": lambda: [zlib.crc32(values.data) for values in arrays.values()],
-        pack: lambda: [deflate(values) for values in arrays.values()],
-        "of which Fletcher-32": lambda: [fletcher32(chunk) for chunk in packed],
-        "decode": lambda: encoding.decode(arrays),
-    }
-    print_table("Stages of a scan with confidence", time_in_turns(stages, clock=time.process_time), pack)
+        plain = size_and_rate(root, images)
+        path = options.scan or root / "random.bin"
+        if options.scan is None:
+            random_points(plain.sensor).tofile(path)
+        reading(path, plain)
+        stages(images[0])
+        if options.generated:
+            generator = load_generator(options.model)
+            print(f"\n### Size of {options.generated} scans of {generator.name}\n\n| what | |\n|---|---:|")
+            rounds = tqdm(range(options.generated), "generated", leave=False)
+            sizes(root / "generated", [generator.range_images(0, [i])[0] for i in rounds])
 
 
 if __name__ == "__main__":

@@ -112,6 +112,9 @@ def main() -> None:
         }
         seconds = time_in_turns(calls, arguments.rounds, time.process_time)
         print_rates("Overhead at ratio 0", len(real), seconds, next(iter(calls)))
+        numbers = MixedScans.wrap(range(1000), None, 0, to_sample=to_item)
+        bare = time_in_turns({"": lambda: [numbers[i] for i in range(1000)]}, arguments.rounds, time.process_time)
+        print(f"\nWrapping alone, around a dataset of numbers: {1e3 * bare['']:.1f} µs a sample")
         for form, title in (("offsets", "points"), ("range", "range images")):
             only = MixedScans(real, None, 0, collate=form)  # type: ignore[arg-type]
             half = MixedScans(real, bank, 0.5, epoch_size="replace", balanced=True, collate=form)  # type: ignore[arg-type]
