@@ -1,15 +1,9 @@
-"""Baking: the same bytes by every engine and after every interruption; what cannot be made is refused at once."""
+"""Baking: the same bytes by every engine; what cannot be made is refused at once."""
 
-import multiprocessing
-import os
-import resource
+import itertools
 import shutil
-import signal
 import subprocess
 import sys
-import time
-from collections import namedtuple
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from bakes import COUNT, SIZE, files, plan_in
 from layouts import some_scan, write_all
 from test_generator import SENSOR, write
 from typer.testing import CliRunner
 
-import lidar_synth.bake.run as run_module
 import lidar_synth.bake.shard as shard_module
-from lidar_synth.bake import ENGINES, Job, Plan, Resources, Share, bake, bake_shard, make_plan
+from lidar_synth.bake import ENGINES, Job, Plan, Resources, Share, bake
 from lidar_synth.bake.folder import SETTINGS, finish, prepare
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import regenerate
@@ -38,7 +32,6 @@ from lidar_synth.nets import build_network
 from lidar_synth.normalize import NORMALISATIONS
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-COUNT, SIZE = 10, 3
 
 
 @pytest.fixture(scope="module")
@@ -51,21 +44,12 @@ def plan(model: Path, tmp_path: Path) -> Plan:
     return plan_in(tmp_path / "bank", model)
 
 
-def plan_in(out: Path, model: Path, **settings: Any) -> Plan:
-    return make_plan(out, Job(**{"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 4} | settings))
-
-
 @pytest.fixture(scope="module")
 def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The files of the bank, baked in one go in this process."""
     plan = plan_in(tmp_path_factory.mktemp("expected") / "bank", model)
     bake(plan, progress=False)
     return files(plan.out)
-
-
-def files(root: Path) -> dict[str, bytes]:
-    assert not list(root.rglob("*.part")) and not (root / ".lidar_synth").exists()
-    return {path.name: path.read_bytes() for path in root.iterdir()}
 
 
 def test_a_bank_holds_the_models_scans(plan: Plan, model: Path, expected: dict[str, bytes]) -> None:
@@ -128,31 +112,43 @@ def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
 # The same bytes
 
 
-def test_two_processes(plan: Plan, expected: dict[str, bytes]) -> None:
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_processes(plan: Plan, expected: dict[str, bytes], workers: int) -> None:
     prepare(plan)
     told: list[int] = []
-    ENGINES["processes"](plan, range(4), Resources(2), told.append)
+    ENGINES["processes"](plan, range(4), Resources(workers), told.append)
     assert sum(told) == COUNT  # the bar counts every scan once
     finish(plan)
     assert files(plan.out) == expected
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+@pytest.mark.parametrize("order", list(itertools.permutations(range(4)))[::5])
 def test_shares_in_any_order(plan: Plan, expected: dict[str, bytes], order: tuple[int, ...]) -> None:
-    found = [bake(plan, share=Share(k, 3), progress=False) for k in order]
-    assert found[:2] == [None, None] and found[2] is not None
+    found = [bake(plan, share=Share(k, 4), progress=False) for k in order]
+    assert found[:3] == [None, None, None] and found[3] is not None
     assert files(plan.out) == expected
 
 
-def test_torchrun(plan: Plan, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("ranks", [(0,), (1, 0), (1, 2, 0)])
+def test_ranks_of_torchrun_in_turn(
+    plan: Plan, expected: dict[str, bytes], ranks: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(ConfigError, match="engine 'torchrun' without 'RANK'.*torchrun --nproc-per-node"):
         bake(plan, "torchrun", progress=False)
-    monkeypatch.setenv("WORLD_SIZE", "3")
-    for rank in ("1", "0", "2"):
-        monkeypatch.setenv("RANK", rank)
-        monkeypatch.setenv("LOCAL_RANK", rank)
+    monkeypatch.setenv("WORLD_SIZE", str(len(ranks)))
+    for rank in ranks:
+        monkeypatch.setenv("RANK", str(rank))
+        monkeypatch.setenv("LOCAL_RANK", str(rank))
         index = bake(plan, "torchrun", progress=False)
     assert index is not None and files(plan.out) == expected
+
+
+def test_torchrun(plan: Plan, model: Path, expected: dict[str, bytes]) -> None:
+    """Two processes at once, as its own command starts them."""
+    options = ["--model", model, "--count", COUNT, "--shard-size", SIZE, "--seed", 4, "--engine", "torchrun"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2]
+    subprocess.run([str(a) for a in (*command, "-m", "lidar_synth", "bake", plan.out, *options)], check=True)
+    assert files(plan.out) == expected
 
 
 @pytest.mark.parametrize("engine", ["ray", "slurm"])
@@ -165,122 +161,6 @@ def test_engines_whose_library_is_missing(plan: Plan, engine: str, monkeypatch: 
 def test_every_engine_is_named_in_the_help() -> None:
     text = CliRunner().invoke(app, ["bake", "--help"]).output
     assert all(engine in text for engine in ENGINES)
-
-
-def stop_after(plan: Plan, scans: int, stop: Callable[[], object]) -> None:
-    """Bake in this process; call ``stop`` when so many scans are made."""
-    made = 0
-
-    def progress(number: int) -> None:
-        nonlocal made
-        made += number
-        if made == scans:
-            stop()
-
-    def engine(plan: Plan, numbers: Any, resources: Resources, _: Any) -> None:
-        for number in numbers:
-            bake_shard(plan, number, progress)
-
-    engines = run_module.ENGINES
-    run_module.ENGINES = {"local": engine}
-    try:
-        bake(plan, progress=False)
-    finally:
-        run_module.ENGINES = engines
-
-
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("scans", [1, 5, 10])
-def test_a_signal_keeps_finished_shards(
-    plan: Plan, expected: dict[str, bytes], stop: signal.Signals, scans: int
-) -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt):
-        stop_after(plan, scans, lambda: os.kill(os.getpid(), stop))
-    assert signal.getsignal(signal.SIGTERM) == before
-    whole = sorted(path.name for path in plan.out.glob("*.h5"))
-    assert len(whole) == (scans - 1) // SIZE and not list(plan.out.glob(".*.part")) and not (plan.out / INDEX).exists()
-    times = {name: (plan.out / name).stat().st_mtime_ns for name in whole}
-    bake(plan, progress=False)
-    assert files(plan.out) == expected
-    assert times == {name: (plan.out / name).stat().st_mtime_ns for name in whole}  # not made twice
-
-
-def start(out: Path, model: Path, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "lidar_synth", "bake", str(out), "--model", str(model), "--count", "60"]
-    command += ["--shard-size", "5", "--seed", "4", *options]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-
-
-def wait_for_shards(process: subprocess.Popen[str], out: Path, count: int) -> None:
-    while len(list(out.glob("*.h5"))) < count:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.01)
-
-
-def test_killed_and_terminated_runs_go_on(model: Path, tmp_path: Path) -> None:
-    whole = plan_in(tmp_path / "whole" / "bank", model, count=60, shard_size=5)
-    bake(whole, progress=False)
-    out = tmp_path / "bank"
-    process = start(out, model)
-    wait_for_shards(process, out, 2)
-    process.kill()
-    process.wait()
-    assert not (out / INDEX).exists()
-    process = start(out, model, "--engine", "processes", "--workers", "2")
-    wait_for_shards(process, out, 5)
-    process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate()
-    assert process.returncode == 1
-    assert f"stopped; finished shards are kept in {out}, and the same command goes on" in errors
-    assert "Traceback" not in errors
-    bake(plan_in(out, model, count=60, shard_size=5), progress=False)
-    assert files(out) == files(whole.out)
-
-
-def test_a_killed_worker_is_told_of(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
-    plan = plan_in(tmp_path / "bank", model, count=300, shard_size=100)
-
-    def kill(scans: int) -> None:
-        for worker in multiprocessing.active_children():
-            if worker.pid is not None and worker.name.startswith("SpawnProcess"):
-                os.kill(worker.pid, signal.SIGKILL)
-
-    prepare(plan)
-    with pytest.raises(FileError, match=r"a worker was killed \(exit status -9\).*finished shards are kept"):
-        ENGINES["processes"](plan, range(3), Resources(1), kill)
-    assert multiprocessing.active_children() == []
-
-
-def test_what_a_worker_raises_arrives(plan: Plan, model: Path) -> None:
-    prepare(plan)
-    (plan.out / SETTINGS).unlink()
-    with pytest.raises(FileError, match="has vanished or lost its .bake.json"):
-        ENGINES["processes"](plan, range(4), Resources(1), lambda scans: None)
-
-
-def test_a_finished_shard_that_rots_is_made_again(plan: Plan, expected: dict[str, bytes]) -> None:
-    bake(plan, progress=False)
-    path = plan.out / "shard-00001.h5"
-    path.write_bytes(path.read_bytes()[:-1] + b"\x00")
-    (plan.out / "shard-00003.h5").unlink()
-    bake(plan, progress=False)
-    assert files(plan.out) == expected
-
-
-def test_halves_of_killed_processes_are_removed(plan: Plan, expected: dict[str, bytes]) -> None:
-    prepare(plan)
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    host = shard_module.socket.gethostname()
-    mine, other = (plan.out / f".shard-00000.h5.{h}-{ended.pid}.part" for h in (host, "another"))
-    running = plan.out / f".shard-00000.h5.{host}-{os.getppid()}.part"
-    for path in (mine, other, running):
-        path.touch()
-    bake_shard(plan, 0)
-    assert not mine.exists() and other.exists() and running.exists()
-    bake(plan, progress=False)
-    assert files(plan.out) == expected
 
 
 # Settings
@@ -400,81 +280,6 @@ def test_a_dry_run_makes_nothing(model: Path, tmp_path: Path) -> None:
     whole = CliRunner().invoke(app, [*call[:-1]]).output  # what was estimated is near what comes
     estimated, made = (float(text.split(" MB")[0].split()[-1]) for text in (output, whole))
     assert estimated == pytest.approx(made, rel=0.4)
-
-
-# The disk
-
-
-def test_a_full_disk_by_limit(plan: Plan, expected: dict[str, bytes]) -> None:
-    """A file may not grow beyond what HDF5 needs for one and a half scans."""
-    bake(plan, share=Share(0, 4), progress=False)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (6000, limits[1]))
-    try:
-        with pytest.raises(FileError, match=r"cannot be written \(File too large\).*finished shards are kept"):
-            bake(plan, progress=False)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert [path.name for path in plan.out.glob("*.h5")] == ["shard-00000.h5"]
-    assert not list(plan.out.glob(".*.part"))
-    bake(plan, progress=False)
-    assert files(plan.out) == expected
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 44 kB, where one may be mounted."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = shutil.which("mount") and subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=44k", "tmpfs", folder], capture_output=True, check=False
-    )
-    if not mounted or mounted.returncode:
-        pytest.skip("no file system may be mounted here")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
-
-
-def test_a_full_disk(
-    small_disk: Path, model: Path, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shard_module, "_PACKED", 0)  # the look at free space before a shard
-    plan = plan_in(small_disk / "bank", model)
-    with pytest.raises(FileError, match=r"No space left on device.*finished shards are kept"):
-        bake(plan, progress=False)
-    kept = {path.name for path in plan.out.glob("*.h5")}
-    assert 1 <= len(kept) < 4 and not list(plan.out.glob(".*.part"))
-    assert all((plan.out / name).read_bytes() == expected[name] for name in kept)
-    subprocess.run(["mount", "-o", "remount,size=400k", small_disk], check=True)
-    bake(plan, progress=False)
-    assert files(plan.out) == expected
-
-
-def test_space_is_looked_at_before_a_shard(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = namedtuple("usage", "total used free")
-    need = 3 * 8 * 32 * 5 * 0.6
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need - 1))
-    with pytest.raises(FileError, match=r"bank has 0 MB free; expected about 0 MB for the next shard. Free some space"):
-        bake(plan, progress=False)
-    assert not list(plan.out.glob("*.h5"))
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need + 1))
-    assert bake(plan, progress=False) is not None
-
-
-def test_a_folder_that_cannot_be_written(model: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for out in (tmp_path / "file", tmp_path / "file" / "bank", Path("/proc/bank")):
-        with pytest.raises(FileError, match=r"cannot be written \(.*Choose another output folder"):
-            bake(plan_in(out, model), progress=False)
-
-
-def test_a_folder_that_vanishes(plan: Plan, expected: dict[str, bytes]) -> None:
-    for scans in (3, 4):  # at the end of a shard, and within one
-        with pytest.raises(FileError, match=r"bank.*(has vanished or lost its .bake.json|No such file)"):
-            stop_after(plan, scans, lambda: shutil.rmtree(plan.out))
-        assert not plan.out.exists()
-    bake(plan, progress=False)
-    assert files(plan.out) == expected
 
 
 def test_an_index_waits_for_every_shard(plan: Plan) -> None:

@@ -1,10 +1,11 @@
 """Kill a bake at random moments, over and over, and see that what is there in the end has the same bytes.
 
-    python tools/kill_bake.py --model town --kills 100 [--engine processes]
+    python tools/kill_bake.py --kills 100 [--engine processes] [--model town]
 
 A bank is baked in one go first. Then the same bake runs in a process group of its own, which is killed (SIGKILL) after
 a random part of the time that a whole run takes, and is started again; whenever it comes to its end, its files are
-compared and the next bank begins.
+compared and the next bank begins. The model is a quick one that has learnt nothing, unless another is named: what is
+tried is the writing.
 """
 
 import argparse
@@ -17,6 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from bench.untrained import write_untrained
 from tqdm import tqdm
 
 from lidar_synth.bake import Job, Plan, Resources, bake, make_plan
@@ -28,8 +30,9 @@ def start(plan: Plan, engine: str, workers: int) -> int:
     """Bake in a child process with a group of its own; its id."""
     child = os.fork()
     if child:
+        os.setpgid(child, child)  # here too: it may be killed before it has come to that itself
         return child
-    os.setsid()
+    os.setpgid(0, 0)
     try:
         bake(plan, engine, Resources(workers), progress=False)
     except BaseException as error:
@@ -60,7 +63,7 @@ def files(root: Path) -> dict[str, bytes]:
 def main() -> None:
     """Kills until the number is reached; exits with 1 where bytes differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", default="town")
+    parser.add_argument("--model", help="a shipped model or a checkpoint")
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--count", type=int, default=40)
     parser.add_argument("--shard-size", type=int, default=4)
@@ -69,8 +72,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     given = parser.parse_args()
     chance = random.Random(given.seed)
-    job = Job(model=given.model, count=given.count, shard_size=given.shard_size)
     with tempfile.TemporaryDirectory() as folder:
+        model = given.model or str(write_untrained(Path(folder) / "untrained.safetensors"))
+        job = Job(model=model, count=given.count, shard_size=given.shard_size)
         whole, plan = (make_plan(Path(folder) / name / "bank", job) for name in ("whole", "killed"))
         assert not killed(start(whole, "local", 1), 1e6)
         begin = time.monotonic()

@@ -43,10 +43,10 @@ def recorded(plan: Plan, number: int) -> Entry | None:
         entry = Entry(**json.loads(read_file(_note(plan, number))))
         if replace(entry, bytes=0, sha256="") == wanted:
             return entry
-    with suppress(FileError, DataError):
-        for entry in Index.from_json(read_file(plan.out / INDEX), str(plan.out / INDEX)).shards:
-            if replace(entry, bytes=0, sha256="") == wanted:
-                return entry
+    index = _index(plan)
+    for entry in index.shards if index else ():
+        if replace(entry, bytes=0, sha256="") == wanted:
+            return entry
     return None
 
 
@@ -94,11 +94,15 @@ def finish(plan: Plan) -> Index | None:
         if entry is None or not (plan.out / entry.file).is_file():
             return None
         entries.append(entry)
-    index = Index((plan.facts,), tuple(entries))
-    with suppress(FileError, DataError):
-        there = Index.from_json(read_file(plan.out / INDEX), INDEX)
-        index = there if there.shards == index.shards else index  # it may know of repairs
-    write_bank_files(plan.out, index)
+    index, there = Index((plan.facts,), tuple(entries)), _index(plan)
+    if there is not None and there.shards == index.shards:
+        index = there  # it may know of repairs
+    try:
+        write_bank_files(plan.out, index)
+    except FileError:
+        # A process that ends at the same time clears this one's halves away, when it has written the same.
+        if _index(plan) != index:
+            raise
     for part in plan.out.glob(".*.part"):
         part.unlink(missing_ok=True)
     shutil.rmtree(plan.out / NOTES, ignore_errors=True)
@@ -132,12 +136,22 @@ def check_folder(plan: Plan) -> None:
     Raises:
         FileError: where it has vanished.
     """
-    if not (plan.out / SETTINGS).is_file():
-        raise FileError(
-            f"{plan.out} has vanished or lost its {SETTINGS}",
-            "the folder in which the bake began",
-            "Bring it back, or run the same command to begin again.",
-        )
+    with suppress(OSError):  # a network's folder that is gone, or closed to us
+        if (plan.out / SETTINGS).is_file():
+            return
+    raise FileError(
+        f"{plan.out} has vanished or lost its {SETTINGS}",
+        "the folder in which the bake began",
+        "Bring it back, or run the same command to begin again.",
+    )
+
+
+def _index(plan: Plan) -> Index | None:
+    """The index that is there, if one can be read."""
+    try:
+        return Index.from_json(read_file(plan.out / INDEX), str(plan.out / INDEX))
+    except (FileError, DataError):
+        return None
 
 
 def _note(plan: Plan, number: int) -> Path:

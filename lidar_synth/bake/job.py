@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import h5py
+import isal
 import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
@@ -131,7 +132,8 @@ def make_plan(out: str | Path, job: Job) -> Plan:
     open_conditions(job.condition, job.condition_layout, job.condition_split)
     fields = _fields(job, generator.fields)
     software = {"lidar_synth": lidar_synth.__version__, "torch": torch.__version__, "numpy": np.__version__,
-                "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "machine": platform.machine()}  # fmt: skip
+                "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "isal": isal.__version__,
+                "machine": platform.machine()}  # fmt: skip
     model = Path(job.model)
     settled = job.model_copy(
         update={

@@ -5,8 +5,11 @@ making is made by the next one.
 """
 
 import signal
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
+from operator import attrgetter
 from typing import Any
 
 from lidar_synth.bake.job import Plan
@@ -25,20 +28,23 @@ def bake_in_processes(plan: Plan, numbers: Sequence[int], resources: Resources, 
         FileError: where a worker was killed.
     """
     context = get_context("spawn")  # a fork would share torch's threads
-    taken, scans = context.Value("q", 0), context.Value("q", 0)
-    stop, errors = context.Event(), context.SimpleQueue()
+    count = min(resources.workers, len(numbers))
+    taken, errors = context.Value("q", 0), context.SimpleQueue()
+    # What this process looks at has no lock: a worker that is killed while it holds one would stop it for good.
+    scans, stop = context.RawArray("q", count), context.RawValue("b", 0)
     workers = [
         context.Process(target=_work, args=(plan, numbers, taken, scans, stop, errors, rank), daemon=True)
-        for rank in range(min(resources.workers, len(numbers)))
+        for rank in range(count)
     ]
-    for worker in workers:
-        worker.start()
     told = 0
     try:
+        with _signals_wait():
+            for worker in workers:
+                worker.start()
         while any(worker.is_alive() for worker in workers):
             for worker in workers:
                 worker.join(_LOOK / len(workers))
-            told += _tell(progress, scans.value - told)
+            told += _tell(progress, sum(scans) - told)
             if not errors.empty():
                 raise errors.get()
             if killed := [worker for worker in workers if worker.exitcode not in (None, 0)]:
@@ -49,13 +55,34 @@ def bake_in_processes(plan: Plan, numbers: Sequence[int], resources: Resources, 
                 )
         if not errors.empty():
             raise errors.get()
-        _tell(progress, scans.value - told)
+        _tell(progress, sum(scans) - told)
     finally:
-        stop.set()
-        for worker in workers:
+        stop.value = 1
+        for worker in filter(attrgetter("pid"), workers):  # those that were started
             worker.join(_PATIENCE)
             worker.kill()  # one that a killed worker left waiting for a lock
             worker.join()
+
+
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Signals are heard when all processes that start within are started; these never hear control-C, which a terminal
+    sends to all: this one says when to stop."""
+    heard: list[int] = []
+    in_charge = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if in_charge else ()
+    before = {number: signal.signal(number, lambda found, frame: heard.append(found)) for number in numbers}
+    masks = hasattr(signal, "pthread_sigmask")  # not on Windows
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
+    try:
+        yield
+    finally:
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for late in heard:
+        signal.raise_signal(late)
 
 
 def _tell(progress: Progress, scans: int) -> int:
@@ -66,7 +93,7 @@ def _tell(progress: Progress, scans: int) -> int:
 
 def _work(plan: Plan, numbers: Sequence[int], taken: Any, scans: Any, stop: Any, errors: Any, rank: int) -> None:
     """One worker: until there is no shard left, or the run is stopped."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process says when to stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows, where none can be deaf from the start
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if plan.job.device == "cuda":
         import torch
@@ -75,13 +102,12 @@ def _work(plan: Plan, numbers: Sequence[int], taken: Any, scans: Any, stop: Any,
     parent = parent_process()
 
     def progress(made: int) -> None:
-        if stop.is_set() or parent is None or not parent.is_alive():
+        if stop.value or parent is None or not parent.is_alive():
             raise KeyboardInterrupt
-        with scans.get_lock():
-            scans.value += made
+        scans[rank] += made
 
     try:
-        while not stop.is_set():
+        while not stop.value:
             with taken.get_lock():
                 position = taken.value
                 taken.value += 1

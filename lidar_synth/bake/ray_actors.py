@@ -35,7 +35,7 @@ def bake_on_ray(plan: Plan, numbers: Sequence[int], resources: Resources, progre
     """Make the shards by ``resources.workers`` actors.
 
     Raises:
-        LibraryError: where Ray is not installed.
+        LibraryError: where Ray is not installed, here or on a node, or the package is not.
         ConfigError: where there is no cluster at the address.
         FileError, DataError: as ``bake_shard``.
     """
@@ -73,6 +73,10 @@ def _work_off(ray: Any, start: Any, waiting: deque[int], workers: int, progress:
         try:
             made = ray.get(done)
         except ray.exceptions.RayActorError as error:
+            if error.actor_init_failed:
+                raise LibraryError(
+                    f"a Ray actor cannot start ({error})", "the same lidar_synth and versions on every node"
+                ) from error
             losses += 1
             if losses > _LOSSES * workers:
                 raise FileError(

@@ -1,7 +1,8 @@
 """Engine ``slurm``: an array of Slurm jobs by submitit, all writing to a folder that every node sees.
 
 Job k of n takes every n-th shard. submitit puts a job that was preempted or ran out of time back into the queue; it
-goes on where whole shards end.
+goes on where whole shards end. Options are submitit's (``slurm_partition``, ``timeout_min``), and ``cluster``: "local"
+runs the jobs as processes of this machine, to try things without Slurm.
 """
 
 from collections.abc import Sequence
@@ -10,10 +11,14 @@ from typing import Any
 from lidar_synth.bake.job import Plan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
-from lidar_synth.errors import FileError, LibraryError
+from lidar_synth.errors import ConfigError, FileError, LibraryError
 
 LOGS = ".slurm"
 """Folder of the jobs' logs, in the bank's folder."""
+
+_OPTIONS = {"cluster": "slurm", "timeout_min": 240}  # submitit's own limit is 5 minutes, less than a shard may take
+_TIMEOUTS = 1000  # how often a job may run out of time and go on
+_LOOK = 1  # seconds between two looks at the jobs
 
 
 class Part:
@@ -35,8 +40,44 @@ def bake_on_slurm(plan: Plan, numbers: Sequence[int], resources: Resources, prog
 
     Raises:
         LibraryError: where submitit is not installed.
-        FileError: where a job failed.
+        ConfigError: where there is no Slurm, or an option is none of submitit's.
+        FileError: where a job failed; the others are cancelled.
     """
+    submitit = _import_submitit()
+    workers = min(resources.workers, len(numbers))
+    executor = _executor(submitit, plan, resources.slurm)
+    jobs = executor.map_array(Part(), [plan] * workers, [numbers[k::workers] for k in range(workers)])
+    try:
+        for job in submitit.helpers.as_completed(jobs, poll_frequency=_LOOK):
+            progress(job.result())
+    except submitit.core.utils.UncompletedJobError as error:
+        raise FileError(
+            f"Slurm job {job.job_id} failed ({error})",
+            f"jobs that finish; their logs are in {plan.out / LOGS}",
+            "Run the same again: finished shards are kept.",
+        ) from error
+    finally:
+        for job in jobs:
+            if not job.done():
+                job.cancel()
+
+
+def _executor(submitit: Any, plan: Plan, options: dict[str, str | int]) -> Any:
+    """What takes the jobs, with the options of a job set."""
+    share = {"gpus_per_node": 1} if plan.job.device == "cuda" else {"cpus_per_task": plan.job.threads}
+    values = _OPTIONS | share | options
+    cluster = values.pop("cluster")
+    try:
+        executor = submitit.AutoExecutor(plan.out / LOGS, cluster, **{f"{cluster}_max_num_timeout": _TIMEOUTS})
+        executor.update_parameters(name="lidar-synth-bake", **values)
+    except (RuntimeError, ValueError, NameError, TypeError) as error:
+        raise ConfigError(
+            f"--slurm {options} ({error})", "a machine that submits to Slurm, and options of submitit"
+        ) from error
+    return executor
+
+
+def _import_submitit() -> Any:
     try:
         import submitit
     except ImportError as error:
@@ -45,17 +86,4 @@ def bake_on_slurm(plan: Plan, numbers: Sequence[int], resources: Resources, prog
             "the extra slurm",
             "pip install 'lidar_synth[slurm]'",
         ) from error
-    workers = min(resources.workers, len(numbers))
-    executor = submitit.AutoExecutor(folder=plan.out / LOGS)
-    accelerator = {"gpus_per_node": 1} if plan.job.device == "cuda" else {"cpus_per_task": plan.job.threads}
-    executor.update_parameters(name="lidar-synth-bake", **accelerator, **resources.slurm)
-    jobs = executor.map_array(Part(), [plan] * workers, [numbers[k::workers] for k in range(workers)])
-    for job in submitit.helpers.as_completed(jobs):
-        try:
-            progress(job.result())
-        except submitit.core.utils.UncompletedJobError as error:
-            raise FileError(
-                f"Slurm job {job.job_id} failed ({error})",
-                f"jobs that finish; their logs are in {plan.out / LOGS}",
-                "Run the same again: finished shards are kept.",
-            ) from error
+    return submitit

@@ -1,0 +1,309 @@
+"""Baking that is disturbed: signals, kills, full disks, lost folders. What is finished stays, a rerun ends it."""
+
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import namedtuple
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bakes import SIZE, files, plan_in
+from test_generator import write
+
+import lidar_synth.bake.folder as folder_module
+import lidar_synth.bake.run as run_module
+import lidar_synth.bake.shard as shard_module
+from lidar_synth.bake import ENGINES, Plan, Resources, Share, bake, bake_shard
+from lidar_synth.bake.folder import SETTINGS, prepare
+from lidar_synth.bank import INDEX, Index
+from lidar_synth.errors import FileError
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("model") / "small.safetensors")
+
+
+@pytest.fixture
+def plan(model: Path, tmp_path: Path) -> Plan:
+    return plan_in(tmp_path / "bank", model)
+
+
+@pytest.fixture(scope="module")
+def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of the bank, baked in one go in this process."""
+    plan = plan_in(tmp_path_factory.mktemp("expected") / "bank", model)
+    bake(plan, progress=False)
+    return files(plan.out)
+
+
+def stop_after(plan: Plan, scans: int, stop: Callable[[], object]) -> None:
+    """Bake in this process; call ``stop`` when so many scans are made."""
+    made = 0
+
+    def progress(number: int) -> None:
+        nonlocal made
+        made += number
+        if made == scans:
+            stop()
+
+    def engine(plan: Plan, numbers: Any, resources: Resources, _: Any) -> None:
+        for number in numbers:
+            bake_shard(plan, number, progress)
+
+    engines = run_module.ENGINES
+    run_module.ENGINES = {"local": engine}
+    try:
+        bake(plan, progress=False)
+    finally:
+        run_module.ENGINES = engines
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("scans", [1, 5, 10])
+def test_a_signal_keeps_finished_shards(
+    plan: Plan, expected: dict[str, bytes], stop: signal.Signals, scans: int
+) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt):
+        stop_after(plan, scans, lambda: os.kill(os.getpid(), stop))
+    assert signal.getsignal(signal.SIGTERM) == before
+    whole = sorted(path.name for path in plan.out.glob("*.h5"))
+    assert len(whole) == (scans - 1) // SIZE and not list(plan.out.glob(".*.part")) and not (plan.out / INDEX).exists()
+    times = {name: (plan.out / name).stat().st_mtime_ns for name in whole}
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+    assert times == {name: (plan.out / name).stat().st_mtime_ns for name in whole}  # not made twice
+
+
+def start(out: Path, model: Path, *options: str, **others: Any) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "lidar_synth", "bake", str(out), "--model", str(model), "--count", "60"]
+    command += ["--shard-size", "5", "--seed", "4", *options]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **others)
+
+
+def wait_for_shards(process: subprocess.Popen[str], out: Path, count: int) -> None:
+    while len(list(out.glob("*.h5"))) < count:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+
+
+def test_killed_and_terminated_runs_go_on(model: Path, tmp_path: Path) -> None:
+    whole = plan_in(tmp_path / "whole" / "bank", model, count=60, shard_size=5)
+    bake(whole, progress=False)
+    out = tmp_path / "bank"
+    process = start(out, model)
+    wait_for_shards(process, out, 2)
+    process.kill()
+    process.wait()
+    assert not (out / INDEX).exists()
+    process = start(out, model, "--engine", "processes", "--workers", "2")
+    wait_for_shards(process, out, 5)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate()
+    assert process.returncode == 1
+    assert f"stopped; finished shards are kept in {out}, and the same command goes on" in errors
+    assert "Traceback" not in errors
+    bake(plan_in(out, model, count=60, shard_size=5), progress=False)
+    assert files(out) == files(whole.out)
+
+
+def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
+    """A terminal sends it to every process of the group; one of them answers."""
+    process = start(tmp_path / "bank", model, "--engine", "processes", "--workers", "2", process_group=0)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    while len(children.read_text().split()) < 3:  # the workers, and Python's own for what they share
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate()
+    assert process.returncode == 1
+    assert "stopped; finished shards are kept" in errors and "Traceback" not in errors
+
+
+def test_a_killed_worker_is_told_of(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
+    plan = plan_in(tmp_path / "bank", model, count=300, shard_size=100)
+
+    def kill(scans: int) -> None:
+        for worker in multiprocessing.active_children():
+            if worker.pid is not None and worker.name.startswith("SpawnProcess"):
+                os.kill(worker.pid, signal.SIGKILL)
+
+    prepare(plan)
+    with pytest.raises(FileError, match=r"a worker was killed \(exit status -9\).*finished shards are kept"):
+        ENGINES["processes"](plan, range(3), Resources(1), kill)
+    assert multiprocessing.active_children() == []
+
+
+def test_what_a_worker_raises_arrives(plan: Plan, model: Path) -> None:
+    prepare(plan)
+    (plan.out / SETTINGS).unlink()
+    with pytest.raises(FileError, match="has vanished or lost its .bake.json"):
+        ENGINES["processes"](plan, range(4), Resources(1), lambda scans: None)
+
+
+def test_a_finished_shard_that_rots_is_made_again(plan: Plan, expected: dict[str, bytes]) -> None:
+    bake(plan, progress=False)
+    path = plan.out / "shard-00001.h5"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    (plan.out / "shard-00003.h5").unlink()
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+def test_halves_of_killed_processes_are_removed(plan: Plan, expected: dict[str, bytes]) -> None:
+    prepare(plan)
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    host = shard_module.socket.gethostname()
+    mine, other = (plan.out / f".shard-00000.h5.{h}-{ended.pid}.part" for h in (host, "another"))
+    running = plan.out / f".shard-00000.h5.{host}-{os.getppid()}.part"
+    for path in (mine, other, running):
+        path.touch()
+    bake_shard(plan, 0)
+    assert not mine.exists() and other.exists() and running.exists()
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+def test_two_that_end_at_the_same_time(plan: Plan, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of them clears away what the other one is just writing; it matters where the index is not there."""
+    written = folder_module.write_bank_files
+
+    def disturbed(root: Path, index: Index) -> None:
+        written(root, index)
+        raise FileError("cleared away", "")
+
+    monkeypatch.setattr(folder_module, "write_bank_files", disturbed)
+    assert bake(plan, progress=False) is not None
+    assert files(plan.out) == expected
+    monkeypatch.setattr(folder_module, "write_bank_files", lambda root, index: disturbed(root / "elsewhere", index))
+    (plan.out / INDEX).unlink()
+    with pytest.raises(FileError, match="cleared away"):
+        bake(plan, progress=False)
+
+
+# The disk
+
+
+def test_a_full_disk_by_limit(plan: Plan, expected: dict[str, bytes]) -> None:
+    """A file may not grow beyond what HDF5 needs for one and a half scans."""
+    bake(plan, share=Share(0, 4), progress=False)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (6000, limits[1]))
+    try:
+        with pytest.raises(FileError, match=r"cannot be written \(File too large\).*finished shards are kept"):
+            bake(plan, progress=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.name for path in plan.out.glob("*.h5")] == ["shard-00000.h5"]
+    assert not list(plan.out.glob(".*.part"))
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 44 kB, where one may be mounted."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = shutil.which("mount") and subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=44k", "tmpfs", folder], capture_output=True, check=False
+    )
+    if not mounted or mounted.returncode:
+        pytest.skip("no file system may be mounted here")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk(
+    small_disk: Path, model: Path, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shard_module, "_PACKED", 0)  # the look at free space before a shard
+    plan = plan_in(small_disk / "bank", model)
+    with pytest.raises(FileError, match=r"No space left on device.*finished shards are kept"):
+        bake(plan, progress=False)
+    kept = {path.name for path in plan.out.glob("*.h5")}
+    assert 1 <= len(kept) < 4 and not list(plan.out.glob(".*.part"))
+    assert all((plan.out / name).read_bytes() == expected[name] for name in kept)
+    subprocess.run(["mount", "-o", "remount,size=400k", small_disk], check=True)
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+def test_space_is_looked_at_before_a_shard(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = namedtuple("usage", "total used free")
+    need = 3 * 8 * 32 * 5 * 0.6
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need - 1))
+    with pytest.raises(FileError, match=r"bank has 0 MB free; expected about 0 MB for the next shard. Free some space"):
+        bake(plan, progress=False)
+    assert not list(plan.out.glob("*.h5"))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need + 1))
+    assert bake(plan, progress=False) is not None
+
+
+def test_a_folder_that_cannot_be_written(model: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file", tmp_path / "file" / "bank", Path("/proc/bank")):
+        with pytest.raises(FileError, match=r"cannot be written \(.*Choose another output folder"):
+            bake(plan_in(out, model), progress=False)
+
+
+@contextmanager
+def no_privileges() -> Iterator[None]:
+    """Rights count for root, too, while it has another user's."""
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+
+
+def test_a_folder_that_may_not_be_written_any_more(model: Path, expected: dict[str, bytes]) -> None:
+    with tempfile.TemporaryDirectory() as folder:  # pytest's own are closed to other users
+        plan = plan_in(Path(folder) / "bank", model)
+        bake(plan, share=Share(0, 4), progress=False)
+        Path(folder).chmod(0o755)
+        plan.out.chmod(0o555)
+        with (
+            no_privileges(),
+            pytest.raises(FileError, match=r"cannot be written \(Permission denied\).*finished shards are kept"),
+        ):
+            bake(plan, progress=False)
+        assert [path.name for path in plan.out.glob("*.h5")] == ["shard-00000.h5"]
+        plan.out.chmod(0o755)
+        bake(plan, progress=False)
+        assert files(plan.out) == expected
+
+
+def test_a_folder_that_vanishes(plan: Plan, expected: dict[str, bytes]) -> None:
+    for scans in (3, 4):  # at the end of a shard, and within one
+        with pytest.raises(FileError, match=r"bank.*(has vanished or lost its .bake.json|No such file)"):
+            stop_after(plan, scans, lambda: shutil.rmtree(plan.out))
+        assert not plan.out.exists()
+    bake(plan, progress=False)
+    assert files(plan.out) == expected
+
+
+def test_a_disk_that_is_not_mounted_any_more(plan: Plan) -> None:
+    """An empty folder stands where the bank was; nothing is to be written into it."""
+    prepare(plan)
+    bake_shard(plan, 0)
+    shutil.rmtree(plan.out)
+    plan.out.mkdir()
+    with pytest.raises(FileError, match="has vanished or lost its .bake.json"):
+        bake_shard(plan, 1)
+    assert not list(plan.out.iterdir())

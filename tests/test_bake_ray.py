@@ -1,0 +1,151 @@
+"""Engine ``ray`` on real clusters on this machine: actors are killed, nodes come and go, the bytes stay the same."""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bakes import files, plan_in
+from test_generator import write
+
+import lidar_synth.bake.ray_actors as module
+from lidar_synth.bake import ENGINES, Plan, Resources, bake
+from lidar_synth.bake.folder import SETTINGS, finish, prepare
+from lidar_synth.errors import ConfigError, FileError
+
+ray = pytest.importorskip("ray", reason="ray is not installed: pip install 'lidar_synth[ray]'")
+
+NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("model") / "small.safetensors")
+
+
+@pytest.fixture
+def plan(model: Path, tmp_path: Path) -> Plan:
+    return plan_in(tmp_path / "bank", model)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def settings() -> Iterator[None]:
+    """Ray tells nobody, and its workers do not wait behind everything else that a machine does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_worker_niceness", "0")
+        yield
+
+
+@pytest.fixture(scope="module")
+def cluster(settings: None) -> Iterator[Any]:
+    """A node with one core, and this process connected to it."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args=NODE)
+    ray.init(address=cluster.address, log_to_driver=False)
+    yield cluster
+    ray.shutdown()
+    cluster.shutdown()
+
+
+def actors() -> set[int]:
+    """Processes of actors that are up on this machine."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            name = path.read_bytes()
+        except OSError:
+            continue  # it has ended
+        if name.startswith(b"ray::Baker"):
+            found.add(int(path.parent.name))
+    return found
+
+
+def comes(what: Callable[[], bool], seconds: float = 200) -> bool:
+    """Whether it is so within the time."""
+    end = time.monotonic() + seconds
+    while not (so := what()) and time.monotonic() < end:
+        time.sleep(0.05)
+    return so
+
+
+def writing(plan: Plan) -> set[int]:
+    """Processes that are in the middle of a shard, by the halves in the folder."""
+    return {int(part.name.removesuffix(".part").rpartition("-")[2]) for part in plan.out.glob(".*.part")}
+
+
+def test_a_cluster_of_its_own(plan: Plan, model: Path, tmp_path: Path) -> None:
+    """Without an address the engine starts Ray and ends it; where none is running, 'auto' is refused."""
+    with pytest.raises(ConfigError, match="Ray address 'auto' .*; expected a cluster that is up"):
+        bake(plan, "ray", Resources(1, "auto"), progress=False)
+    assert bake(plan, "ray", Resources(2), progress=False) is not None
+    assert not ray.is_initialized()
+    whole = plan_in(tmp_path / "whole" / "bank", model)
+    bake(whole, progress=False)
+    assert files(plan.out) == files(whole.out)
+
+
+@pytest.mark.timeout(900)
+def test_actors_and_nodes_that_come_and_go(cluster: Any, model: Path, tmp_path: Path) -> None:
+    """A second node joins, an actor of the first is killed within a shard, the second node is taken away within one."""
+    whole, plan = (plan_in(tmp_path / name / "bank", model, count=1200, shard_size=40) for name in ("whole", "upset"))
+    bake(whole, progress=False)
+    prepare(plan)
+    told: list[int] = []
+    first: set[int] = set()
+    second: set[int] = set()
+    nodes: list[Any] = []
+    upsets: list[str] = []
+
+    def progress(scans: int) -> None:
+        told.append(scans)
+        if not upsets:
+            first.update(actors())
+            nodes.append(cluster.add_node(**NODE))
+            assert comes(lambda: len(actors()) == 2)
+            second.update(actors() - first)
+            upsets.append("a node came")
+        elif upsets == ["a node came"] and (busy := writing(plan) & first):
+            os.kill(busy.pop(), signal.SIGKILL)
+            upsets.append("an actor was killed")
+        elif upsets[-1] == "an actor was killed" and comes(lambda: len(actors() - first) == 2, 10):
+            upsets.append("another came")  # not before this returns and the engine hears of the loss
+        elif upsets[-1] == "another came" and writing(plan) & second:
+            cluster.remove_node(nodes.pop(), allow_graceful=False)
+            assert comes(lambda: not actors() & second)
+            upsets.append("a node went")
+
+    ENGINES["ray"](plan, range(30), Resources(2), progress)
+    assert upsets == ["a node came", "an actor was killed", "another came", "a node went"]
+    assert len(first) == 1 and len(second) == 1 and sum(told) == 1200
+    assert finish(plan) is not None
+    assert files(plan.out) == files(whole.out)
+
+
+def test_what_an_actor_raises_arrives(cluster: Any, plan: Plan) -> None:
+    prepare(plan)
+    (plan.out / SETTINGS).unlink()
+    with pytest.raises(FileError, match="has vanished or lost its .bake.json"):
+        ENGINES["ray"](plan, range(4), Resources(1), lambda scans: None)
+
+
+class Dying(module.Baker):
+    """An actor on a node without memory."""
+
+    def bake(self, number: int) -> int:
+        os._exit(1)
+
+
+def test_actors_that_never_make_a_shard(cluster: Any, plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_LOSSES", 1)
+    monkeypatch.setattr(module, "Baker", Dying)
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    prepare(plan)
+    with pytest.raises(FileError, match=r"(?s)2 Ray actors were lost and no shard was made.*finished shards are kept"):
+        ENGINES["ray"](plan, range(4), Resources(1), lambda scans: None)
+    assert not list(plan.out.glob("*.h5"))

@@ -1,0 +1,84 @@
+"""Engine ``slurm`` by submitit's executor for one machine: real jobs, their logs, and what happens when they fail."""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from bakes import COUNT, files, plan_in
+from test_generator import write
+
+from lidar_synth.bake import ENGINES, Plan, Resources, bake
+from lidar_synth.bake.folder import SETTINGS, prepare
+from lidar_synth.bake.slurm import LOGS, Part
+from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.files import write_file
+
+submitit = pytest.importorskip("submitit", reason="submitit is not installed: pip install 'lidar_synth[slurm]'")
+cloudpickle = pytest.importorskip("cloudpickle")  # comes with it
+
+LOCAL = {"cluster": "local"}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("model") / "small.safetensors")
+
+
+@pytest.fixture
+def plan(model: Path, tmp_path: Path) -> Plan:
+    return plan_in(tmp_path / "bank", model)
+
+
+def test_jobs_write_the_same_bytes(plan: Plan, model: Path, tmp_path: Path) -> None:
+    whole = plan_in(tmp_path / "whole" / "bank", model)
+    bake(whole, progress=False)
+    assert bake(plan, "slurm", Resources(3, slurm=LOCAL), progress=False) is not None
+    assert files(plan.out) == files(whole.out)
+    assert len(list((plan.out / LOGS).glob("*.out"))) == 3
+
+
+class Slow(Part):
+    """A part that waits until it is told that its time is over, once, after its first shard."""
+
+    def __call__(self, plan: Plan, numbers: Sequence[int]) -> int:
+        if (plan.out / "waited").exists():
+            return super().__call__(plan, numbers)
+        super().__call__(plan, numbers[:1])
+        write_file(plan.out / "waited", str(os.getpid()).encode())
+        time.sleep(600)
+        raise AssertionError("no signal came")
+
+
+def test_a_job_that_runs_out_of_time_goes_on(plan: Plan) -> None:
+    """What Slurm does before it takes a node away: a signal; submitit puts the job back by its checkpoint."""
+    prepare(plan)
+    executor = submitit.AutoExecutor(plan.out / LOGS, "local")
+    executor.update_parameters(timeout_min=10)
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    job = executor.submit(Slow(), plan, range(4))
+    while not (plan.out / "waited").exists():
+        assert not job.done(), job.stderr()
+        time.sleep(0.1)
+    first = (plan.out / "shard-00000.h5").stat()
+    os.kill(int((plan.out / "waited").read_text()), signal.SIGUSR2)
+    assert job.result() == COUNT, job.stderr()
+    assert (plan.out / "shard-00000.h5").stat().st_mtime_ns == first.st_mtime_ns  # not made twice
+
+
+def test_a_job_that_fails_is_told_of(plan: Plan) -> None:
+    prepare(plan)
+    (plan.out / SETTINGS).unlink()
+    with pytest.raises(FileError, match=r"(?s)Slurm job \d+.* failed .*has vanished or lost its .bake.json"):
+        ENGINES["slurm"](plan, range(4), Resources(2, slurm=LOCAL), lambda scans: None)
+
+
+def test_what_cannot_be_submitted(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", os.devnull)
+    with pytest.raises(ConfigError, match=r'Could not detect "srun".*expected a machine that submits to Slurm'):
+        bake(plan, "slurm", progress=False)
+    with pytest.raises(ConfigError, match=r"(?s)'speed'.*options of submitit"):
+        bake(plan, "slurm", Resources(1, slurm=LOCAL | {"speed": 9}), progress=False)
