@@ -23,6 +23,7 @@ from lidar_synth.integrations.mixture import (
     points_of,
     read_settings,
     refuse_unlabelled,
+    require_ids,
 )
 
 from lidar_synth.errors import LibraryError
@@ -55,6 +56,7 @@ def register() -> Any:
             if imageset == "train":
                 settings = read_settings()
                 refuse_unlabelled(settings, "Cylinder3D")
+                require_ids(self.learning_map, _IDS)
                 self.mixed = mix(len(self.im_idx), settings, lambda scan, rng: scan)
 
         def set_epoch(self, epoch: int) -> None:

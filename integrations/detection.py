@@ -6,6 +6,7 @@ by a plane ``a x + b y + c z + d = 0`` in the rectified camera frame, whose norm
 
 import pickle
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -62,6 +63,20 @@ def _lowest(points: NDArray[np.float64]) -> NDArray[np.float64]:
     cell = np.floor(points[:, :2] / 2).astype(np.int64) @ (1, 1 << 20)
     order = np.lexsort((points[:, 2], cell))
     return points[order[np.r_[True, np.diff(cell[order]) != 0]]]
+
+
+def check_names(scan: Scan, classes: Collection[str]) -> None:
+    """Boxes of which a trainer knows none would be left out one by one, and nobody would notice.
+
+    Raises:
+        DataError: where there are boxes, and none is of these classes.
+    """
+    if scan.boxes is not None and len(scan.boxes) and not set(scan.boxes.names) & set(classes):
+        raise DataError(
+            f"boxes of {sorted(set(scan.boxes.names))} in synthetic scan {scan.id!r}",
+            f"some of {', '.join(classes)}",
+            "Name them as the trainer does.",
+        )
 
 
 def plane_in_camera(plane: NDArray[np.float64], camera: Calibration) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
 from lidar_synth.bank import Bank, is_bank
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.classes import IGNORE, NAMES, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files import read_text
 from lidar_synth.formats import open_scans
@@ -139,6 +139,26 @@ def id_table(first: int, ignore: int, dtype: Any) -> NDArray[Any]:
     table = np.full(256, ignore, dtype)
     table[: len(NAMES)] = np.arange(first, first + len(NAMES))
     return table
+
+
+def require_ids(learning_map: Mapping[int, int], table: NDArray[Any]) -> None:
+    """A trainer's own map of SemanticKITTI's classes has to give the ids that synthetic labels get.
+
+    Args:
+        learning_map: the trainer's id by the file's class.
+        table: (256,) a trainer's id by train id, see ``id_table``.
+
+    Raises:
+        ConfigError: where a class, or what is unlabelled, becomes another one.
+    """
+    classes = [*enumerate(SEMANTIC_KITTI.from_train or ()), (IGNORE, 0)]
+    wrong = [(raw, learning_map.get(raw), int(table[i])) for i, raw in classes if learning_map.get(raw) != table[i]]
+    if wrong:
+        raise ConfigError(
+            f"a map of classes with {', '.join(f'{raw}: {given}' for raw, given, _ in wrong)}",
+            ", ".join(f"{raw}: {wanted}" for raw, _, wanted in wrong),
+            "Synthetic labels are SemanticKITTI's 19 classes: use the trainer's stock map of them.",
+        )
 
 
 def points_of(scan: Scan) -> NDArray[np.float32]:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.detection import ground_plane
-from lidar_synth.integrations.mixture import inner
+from lidar_synth.integrations.detection import check_names, ground_plane
+from lidar_synth.integrations.mixture import id_table, inner, require_ids
 from lidar_synth.integrations.mmdet3d_infos import (
     MIXTURE,
     PREFIX,
@@ -24,7 +24,6 @@ from lidar_synth.integrations.mmdet3d_infos import (
     scan_of,
 )
 
-from lidar_synth.classes import NAMES, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.scan import Scan
 
@@ -94,8 +93,8 @@ class SynthKittiDataset(KittiDataset):  # type: ignore[misc]
         return info
 
     def _annotations(self, scan: Scan) -> dict[str, Any]:
-        given = require_boxes(scan)
-        known = self.METAINFO["classes"]
+        given, known = require_boxes(scan), self.METAINFO["classes"]
+        check_names(scan, known)
         ids = [self.label_mapping[known.index(n)] if n in known else -1 for n in given.names]
         labels = np.array(ids, np.int64).reshape(-1)
         boxes = LiDARInstance3DBoxes(given.values[labels >= 0], origin=(0.5, 0.5, 0.5))
@@ -117,7 +116,8 @@ class SynthEpochHook(Hook):  # type: ignore[misc]
             raise ConfigError("SynthEpochHook without a mixed list", "an ann_file that write_infos wrote")
         for dataset, _ in _mixed(runner.train_dataloader.dataset):
             if isinstance(dataset, Seg3DDataset):
-                _check_classes(dataset)
+                ids = id_table(0, dataset.ignore_index, np.int64)
+                require_ids(dict(enumerate(np.asarray(dataset.seg_label_mapping).tolist())), ids)
         self._tell(_epoch(runner))
 
     def before_train_epoch(self, runner: Any) -> None:
@@ -153,17 +153,3 @@ def _mixed(dataset: Any) -> list[tuple[Any, Folder]]:
     held = [each for each in inner(dataset) if isinstance(getattr(each, "ann_file", None), str)]
     folders = [(each, Path(each.ann_file).resolve().parent) for each in held]
     return [(each, open_folder(folder)) for each, folder in folders if (folder / MIXTURE).is_file()]
-
-
-def _check_classes(dataset: Any) -> None:
-    """The trainer's map from the file's classes has to give our train ids, and ignore what is unlabelled."""
-    table = np.asarray(dataset.seg_label_mapping)
-    raw = np.array([*(SEMANTIC_KITTI.from_train or ()), 0])
-    wanted = [*range(len(NAMES)), dataset.ignore_index]
-    if len(table) <= raw.max() or table[raw].tolist() != wanted:
-        found = table[raw[raw < len(table)]].tolist()
-        raise ConfigError(
-            f"a map of classes that gives {found} for SemanticKITTI's {raw.tolist()}",
-            f"{wanted}",
-            "Synthetic labels are SemanticKITTI's 19 classes: use its stock metainfo and ignore_index.",
-        )

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.detection import in_view
+from lidar_synth.integrations.detection import check_names, in_view
 from lidar_synth.integrations.mixture import class_ids, id_table, mix, open_synthetic, points_of, refuse_unlabelled
+from lidar_synth.integrations.mmdet3d_lists import CLASSES
 from numpy.typing import NDArray
 
 from lidar_synth.classes import SEMANTIC_KITTI
@@ -85,6 +86,7 @@ def write_infos(
     folder = Folder(out, facts)
     if detects and folder.slots:
         require_boxes(folder.scan(0))
+        check_names(folder.scan(0), CLASSES)
     for entry in entries:
         _make_absolute(entry, Path(data_root).resolve(), points)
     entries += [_slot(out, i, camera) for i in range(folder.slots)]

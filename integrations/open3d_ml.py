@@ -21,6 +21,7 @@ from lidar_synth.integrations.mixture import (
     points_of,
     read_settings,
     refuse_unlabelled,
+    require_ids,
 )
 
 from lidar_synth.errors import ConfigError, LibraryError
@@ -46,7 +47,40 @@ def dataset_class(package: str = "open3d.ml.datasets") -> Any:
             f"{package} cannot be imported ({error})", "Open3D with its ML part", "pip install open3d"
         ) from error
 
-    class MixedSplit(stock.SemanticKITTISplit):  # type: ignore[misc, name-defined]
+    mixed_split = _split_class(stock)
+
+    class MixedSemanticKITTI(stock.SemanticKITTI):  # type: ignore[misc, name-defined]
+        """Open3D-ML's ``SemanticKITTI`` with a mixed training split.
+
+        Args:
+            dataset_path: as there.
+            mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them.
+            options: as there.
+
+        Raises:
+            ConfigError: with ``use_cache``, or settings that cannot be served.
+        """
+
+        def __init__(self, dataset_path: str, mixture: Any = None, **options: Any) -> None:
+            if options.get("use_cache"):
+                raise ConfigError("use_cache=True for a mixture, whose scans change from epoch to epoch", "False")
+            super().__init__(dataset_path, **options)
+            self.mixture = read_settings(mixture)
+            refuse_unlabelled(self.mixture, "Open3D-ML")
+            require_ids(dict(enumerate(self.remap_lut_val.tolist())), _IDS)
+
+        def get_split(self, split: str) -> Any:
+            """A split; the training split is mixed."""
+            return mixed_split(self, split) if split in ("train", "training") else super().get_split(split)
+
+    stock.DATASET._register_module(MixedSemanticKITTI)
+    return MixedSemanticKITTI
+
+
+def _split_class(stock: Any) -> Any:
+    """The class of the training split, of the module with Open3D-ML's own."""
+
+    class MixedSplit(stock.SemanticKITTISplit):  # type: ignore[misc]
         """The training split: real scans as they are and synthetic ones among them."""
 
         def __init__(self, dataset: Any, split: str = "training") -> None:
@@ -79,31 +113,7 @@ def dataset_class(package: str = "open3d.ml.datasets") -> Any:
                 return attr | {"idx": idx}
             return {"idx": idx, "name": f"synthetic_{number}", "path": "", "split": self.split}
 
-    class MixedSemanticKITTI(stock.SemanticKITTI):  # type: ignore[misc, name-defined]
-        """Open3D-ML's ``SemanticKITTI`` with a mixed training split.
-
-        Args:
-            dataset_path: as there.
-            mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them.
-            options: as there.
-
-        Raises:
-            ConfigError: with ``use_cache``, or settings that cannot be served.
-        """
-
-        def __init__(self, dataset_path: str, mixture: Any = None, **options: Any) -> None:
-            if options.get("use_cache"):
-                raise ConfigError("use_cache=True for a mixture, whose scans change from epoch to epoch", "False")
-            super().__init__(dataset_path, **options)
-            self.mixture = read_settings(mixture)
-            refuse_unlabelled(self.mixture, "Open3D-ML")
-
-        def get_split(self, split: str) -> Any:
-            """A split; the training split is mixed."""
-            return MixedSplit(self, split) if split in ("train", "training") else super().get_split(split)
-
-    stock.DATASET._register_module(MixedSemanticKITTI)
-    return MixedSemanticKITTI
+    return MixedSplit
 
 
 def tell_epochs(pipeline: str = "open3d.ml.torch.pipelines") -> None:

@@ -11,157 +11,165 @@ OpenPCDet's tree is touched. KITTI's own samples pass through its own code.
 import runpy
 import sys
 from copy import deepcopy
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.detection import ground_plane, in_view, plane_in_camera
+from lidar_synth.integrations.detection import check_names, ground_plane, in_view, plane_in_camera
 from lidar_synth.integrations.mixture import mix, points_of, read_settings
+from lidar_synth.integrations.mmdet3d_lists import CLASSES
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats.calibration import Calibration, homogeneous
 from lidar_synth.scan import Scan
 
+try:
+    import pcdet.datasets
+    from pcdet.datasets.kitti.kitti_dataset import KittiDataset
+except ImportError as error:
+    raise LibraryError(
+        f"pcdet cannot be imported ({error})", "OpenPCDet 0.6, built in its checkout", "python setup.py develop"
+    ) from error
+
+if not pcdet.__version__.startswith("0.6."):
+    raise LibraryError(f"OpenPCDet {pcdet.__version__}", "0.6", "git checkout v0.6.0, python setup.py develop")
+
 NAME = "MixedKitti"
 
 
-@cache
-def dataset_class() -> Any:
-    """The class ``MixedKitti``, a subclass of OpenPCDet's ``KittiDataset``.
+class MixedKitti(KittiDataset):  # type: ignore[misc]
+    """KITTI with synthetic scans among its own, at the ratio of its settings; evaluation is on KITTI alone.
 
-    Raises:
-        LibraryError: where OpenPCDet cannot be imported.
+    OpenPCDet replaces a scan that has no box after augmentation by a random other one. Here a real one is replaced
+    by a real one, and a synthetic one is refused by an error, so that the ratio holds: give synthetic scans boxes
+    by ``labels: mix``.
     """
-    try:
-        from pcdet.datasets.kitti.kitti_dataset import KittiDataset
-    except ImportError as error:
-        raise LibraryError(
-            f"pcdet cannot be imported ({error})", "OpenPCDet 0.6, built in its checkout", "python setup.py develop"
-        ) from error
 
-    class MixedKitti(KittiDataset):  # type: ignore[misc]
-        """KITTI with synthetic scans among its own, at the ratio of its settings; evaluation is on KITTI alone.
+    def __init__(self, dataset_cfg: Any, class_names: Any, training: bool = True, **options: Any) -> None:
+        super().__init__(dataset_cfg=dataset_cfg, class_names=class_names, training=training, **options)
+        self._asked: int | None = None  # the position whose sample is being made
+        self.mixed = None
+        if training:
+            self.mixed = mix(
+                len(self.kitti_infos), read_settings(dataset_cfg.get("LIDAR_SYNTH", None)), lambda scan, rng: scan
+            )
+            self._check_files()
+            self._view = self._camera()
+            self._check_boxes()
 
-        OpenPCDet replaces a scan that has no box after augmentation by a random other one. Here a real one is replaced
-        by a real one, and a synthetic one is refused by an error, so that the ratio holds: give synthetic scans boxes
-        by ``labels: mix``.
+    def merge_all_iters_to_one_epoch(self, merge: bool = True, epochs: int | None = None) -> None:
+        """Not with a mixture: it changes from epoch to epoch.
+
+        Raises:
+            ConfigError: if asked to.
         """
+        if merge and self.mixed is not None:
+            raise ConfigError(f"merge_all_iters_to_one_epoch with {NAME}", "epochs one by one")
+        super().merge_all_iters_to_one_epoch(merge, epochs)
 
-        def __init__(self, dataset_cfg: Any, class_names: Any, training: bool = True, **options: Any) -> None:
-            super().__init__(dataset_cfg=dataset_cfg, class_names=class_names, training=training, **options)
-            self._asked: int | None = None  # the position whose sample is being made
-            self.mixed = None
-            if training:
-                self.mixed = mix(
-                    len(self.kitti_infos), read_settings(dataset_cfg.get("LIDAR_SYNTH", None)), lambda scan, rng: scan
-                )
-                self._view = self._camera()
-                self._check_planes()
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch; its workers are told."""
+        if self.mixed is not None:
+            self.mixed.set_epoch(epoch)
 
-        def merge_all_iters_to_one_epoch(self, merge: bool = True, epochs: int | None = None) -> None:
-            """Not with a mixture: it changes from epoch to epoch.
+    def domain(self, index: int) -> int:
+        """0 where a real sample stands in this epoch, 1 where a synthetic one does."""
+        return 0 if self.mixed is None else self.mixed.domain(index)
 
-            Raises:
-                ConfigError: if asked to.
-            """
-            if merge and self.mixed is not None:
-                raise ConfigError(f"merge_all_iters_to_one_epoch with {NAME}", "epochs one by one")
-            super().merge_all_iters_to_one_epoch(merge, epochs)
+    def __len__(self) -> int:
+        # While KITTI's own code works, it counts KITTI's scans.
+        return super().__len__() if self.mixed is None or self._asked is not None else len(self.mixed)
 
-        def set_epoch(self, epoch: int) -> None:
-            """Choose the epoch; its workers are told."""
-            if self.mixed is not None:
-                self.mixed.set_epoch(epoch)
+    def __getitem__(self, index: int) -> Any:
+        if self.mixed is None:
+            return super().__getitem__(index)
+        if self._asked is not None:
+            return self._instead(index)
+        self._asked = index
+        try:
+            sample = self.mixed[index]
+            return self._synthetic(sample) if isinstance(sample, Scan) else super().__getitem__(int(sample))
+        finally:
+            self._asked = None
 
-        def domain(self, index: int) -> int:
-            """0 where a real sample stands in this epoch, 1 where a synthetic one does."""
-            return 0 if self.mixed is None else self.mixed.domain(index)
+    def _instead(self, index: int) -> Any:
+        """What ``prepare_data`` asks for in the place of a scan without a box in the end."""
+        assert self.mixed is not None and self._asked is not None
+        if not self.mixed.domain(self._asked):
+            return super().__getitem__(index % len(self.kitti_infos))
+        scan = self.mixed[self._asked]
+        raise DataError(
+            f"synthetic scan {scan.id!r} has no box of {list(self.class_names)} in range after augmentation",
+            "at least one, or OpenPCDet would put another scan in its place",
+            "labels: mix with a bank of objects, and gt_sampling, give it some.",
+        )
 
-        def __len__(self) -> int:
-            # While KITTI's own code works, it counts KITTI's scans.
-            return super().__len__() if self.mixed is None or self._asked is not None else len(self.mixed)
+    def _synthetic(self, scan: Scan) -> Any:
+        """A synthetic scan through the trainer's own augmentation and processing."""
+        scan = in_view(scan, self._view[1]) if self.dataset_cfg.FOV_POINTS_ONLY else scan
+        values = np.zeros((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()
+        names = np.array([] if scan.boxes is None else scan.boxes.names, dtype=str)
+        plane = plane_in_camera(ground_plane(scan), self._view[1])
+        calib, image_shape = self._view[0], self._view[2]
+        sample = self.prepare_data(
+            {
+                "frame_id": f"synthetic/{scan.id}",
+                "calib": deepcopy(calib),
+                "points": points_of(scan),
+                "road_plane": plane,
+                "gt_boxes": values,
+                "gt_names": names,
+            }
+        )
+        sample["image_shape"] = image_shape.copy()
+        return sample
 
-        def __getitem__(self, index: int) -> Any:
-            if self.mixed is None:
-                return super().__getitem__(index)
-            if self._asked is not None:
-                return self._instead(index)
-            self._asked = index
-            try:
-                sample = self.mixed[index]
-                return self._synthetic(sample) if isinstance(sample, Scan) else super().__getitem__(int(sample))
-            finally:
-                self._asked = None
-
-        def _instead(self, index: int) -> Any:
-            """What ``prepare_data`` asks for in the place of a scan without a box in the end."""
-            assert self.mixed is not None and self._asked is not None
-            if not self.mixed.domain(self._asked):
-                return super().__getitem__(index % len(self.kitti_infos))
-            scan = self.mixed[self._asked]
-            raise DataError(
-                f"synthetic scan {scan.id!r} has no box of {list(self.class_names)} in range after augmentation",
-                "at least one, or OpenPCDet would put another scan in its place",
-                "labels: mix with a bank of objects, and gt_sampling, give it some.",
-            )
-
-        def _synthetic(self, scan: Scan) -> Any:
-            """A synthetic scan through the trainer's own augmentation and processing."""
-            scan = in_view(scan, self._view[1]) if self.dataset_cfg.FOV_POINTS_ONLY else scan
-            values = np.zeros((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()
-            names = np.array([] if scan.boxes is None else scan.boxes.names, dtype=str)
-            plane = plane_in_camera(ground_plane(scan), self._view[1])
-            calib, image_shape = self._view[0], self._view[2]
-            sample = self.prepare_data(
-                {
-                    "frame_id": f"synthetic/{scan.id}",
-                    "calib": deepcopy(calib),
-                    "points": points_of(scan),
-                    "road_plane": plane,
-                    "gt_boxes": values,
-                    "gt_names": names,
-                }
-            )
-            sample["image_shape"] = image_shape.copy()
-            return sample
-
-        def _check_planes(self) -> None:
-            """GT sampling on the ground needs a plane for every real scan; OpenPCDet fails on the first without."""
-            steps = self.dataset_cfg.DATA_AUGMENTOR
-            wanted = any(
-                step.NAME == "gt_sampling" and step.get("USE_ROAD_PLANE", False)
-                for step in steps.AUG_CONFIG_LIST
-                if step.NAME not in steps.get("DISABLE_AUG_LIST", [])
-            )
-            frames = [info["point_cloud"]["lidar_idx"] for info in self.kitti_infos]
-            folder = self.root_split_path / "planes"
-            missing = [f for f in frames if wanted and not (folder / f"{f}.txt").is_file()]
+    def _check_files(self) -> None:
+        """Every real scan needs a calibration, and a plane for GT sampling; OpenPCDet fails on the first without."""
+        frames = [info["point_cloud"]["lidar_idx"] for info in self.kitti_infos]
+        needed = {"calib": ("KITTI's calibration of every scan", "")}
+        if any(step.get("USE_ROAD_PLANE", False) for step in self._sampling()):
+            hint = "lidar_synth.integrations.folders.write_planes(root) fits them."
+            needed["planes"] = ("KITTI's planes, or USE_ROAD_PLANE: False", hint)
+        for kind, (expected, hint) in needed.items():
+            folder = self.root_split_path / kind
+            missing = [f for f in frames if not (folder / f"{f}.txt").is_file()]
             if missing:
-                raise ConfigError(
-                    f"USE_ROAD_PLANE, but {folder} has no plane for {len(missing)} scans ({missing[0]}, ...)",
-                    "KITTI's planes, or USE_ROAD_PLANE: False",
-                    "lidar_synth.integrations.folders.write_planes(root) fits them.",
+                raise ConfigError(f"{folder} without {len(missing)} scans ({missing[0]}, ...)", expected, hint)
+
+    def _check_boxes(self) -> None:
+        """The first synthetic scan tells whether there are boxes, and of classes that are known here."""
+        assert self.mixed is not None
+        for position in np.flatnonzero(self.mixed.plan().domain)[:1]:
+            scan = self.mixed[int(position)]
+            check_names(scan, [*self.class_names, *CLASSES])
+            if scan.boxes is None and not self._sampling():
+                raise DataError(
+                    f"synthetic scan {scan.id!r} has no boxes, and there is no gt_sampling",
+                    "boxes, for a detector",
+                    "labels: mix with a bank of objects, or gt_sampling, gives it some.",
                 )
 
-        def _camera(self) -> tuple[Any, Calibration, Any]:
-            """The camera of the first real scan, in which synthetic ones are seen, as OpenPCDet and as we hold it."""
-            asked = set(self.dataset_cfg.get("GET_ITEM_LIST", ["points"]))
-            if asked - {"points"}:
-                raise ConfigError(f"GET_ITEM_LIST {sorted(asked)} with {NAME}", "['points']: there is no picture")
-            info = self.kitti_infos[0]
-            calib, shape = self.get_calib(info["point_cloud"]["lidar_idx"]), info["image"]["image_shape"]
-            camera_from_sensor = homogeneous(calib.R0) @ homogeneous(calib.V2C)
-            return calib, Calibration(calib.P2, camera_from_sensor, (int(shape[1]), int(shape[0]))), shape
+    def _sampling(self) -> list[Any]:
+        """The steps of GT sampling that are in use."""
+        steps = self.dataset_cfg.DATA_AUGMENTOR
+        unused = steps.get("DISABLE_AUG_LIST", [])
+        return [s for s in steps.AUG_CONFIG_LIST if s.NAME == "gt_sampling" and s.NAME not in unused]
 
-    return MixedKitti
+    def _camera(self) -> tuple[Any, Calibration, Any]:
+        """The camera of the first real scan, in which synthetic ones are seen, as OpenPCDet and as we hold it."""
+        asked = set(self.dataset_cfg.get("GET_ITEM_LIST", ["points"]))
+        if asked - {"points"}:
+            raise ConfigError(f"GET_ITEM_LIST {sorted(asked)} with {NAME}", "['points']: there is no picture")
+        info = self.kitti_infos[0]
+        calib, shape = self.get_calib(info["point_cloud"]["lidar_idx"]), info["image"]["image_shape"]
+        camera_from_sensor = homogeneous(calib.R0) @ homogeneous(calib.V2C)
+        return calib, Calibration(calib.P2, camera_from_sensor, (int(shape[1]), int(shape[0]))), shape
 
 
 def register() -> None:
     """Make ``DATASET: MixedKitti`` known to OpenPCDet."""
-    import pcdet.datasets
-
-    pcdet.datasets.__all__[NAME] = dataset_class()
+    pcdet.datasets.__all__[NAME] = MixedKitti
 
 
 def tell_epochs() -> None:

@@ -18,6 +18,7 @@ from lidar_synth.integrations.mixture import (
     points_of,
     read_settings,
     refuse_unlabelled,
+    require_ids,
 )
 
 from lidar_synth.errors import ConfigError, LibraryError
@@ -53,6 +54,7 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
         settings = read_settings(mixture)
         refuse_unlabelled(settings, "Pointcept")
         self._ids = id_table(0, self.ignore_index, np.int32)
+        require_ids(self.learning_map, self._ids)
         self.mixed = mix(len(self.data_list), settings, lambda scan, rng: scan)
 
     def set_epoch(self, epoch: int) -> None:

@@ -15,6 +15,7 @@ import pytest
 import torch
 import yaml
 from lidar_synth.integrations.detection import (
+    check_names,
     difficulty,
     ground_plane,
     in_view,
@@ -32,6 +33,7 @@ from lidar_synth.integrations.mixture import (
     points_of,
     read_settings,
     refuse_unlabelled,
+    require_ids,
 )
 from lidar_synth.integrations.mmdet3d_infos import read_url
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, read_plane, semantic_kitti_list
@@ -41,8 +43,8 @@ from mixtures import Endless, Scans
 from streets import CAMERA, held, kitti, semantic_kitti, street, synthetic
 from torch.utils.data import DataLoader, Dataset
 
-from lidar_synth.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError, LibraryError
+from lidar_synth.classes import IGNORE, SEMANTIC_KITTI
+from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.formats import KITTIObject, open_scans
 from lidar_synth.labels import ObjectBank
 from lidar_synth.mixing import MixedScans
@@ -121,6 +123,28 @@ def test_class_ids(first: int, ignore: int) -> None:
     assert table[:19].tolist() == list(range(first, first + 19)) and (table[19:] == ignore).all()
 
 
+def test_a_map_of_classes_that_does_not_fit_is_refused() -> None:
+    table = id_table(1, 0, np.uint8)
+    stock = {raw: i + 1 for i, raw in enumerate(SEMANTIC_KITTI.from_train or ())} | {0: 0, 252: 1}
+    require_ids(stock, table)
+    require_ids({raw: i - 1 if i else -1 for raw, i in stock.items()}, id_table(0, -1, np.int64))
+    for wrong, said in (({10: 4}, "with 10: 4.* 10: 1"), ({0: 1}, "with 0: 1.* 0: 0")):
+        with pytest.raises(ConfigError, match=said):
+            require_ids(stock | wrong, table)
+    with pytest.raises(ConfigError, match="with 40: None"):
+        require_ids({raw: i for raw, i in stock.items() if raw != 40}, table)
+
+
+def test_boxes_that_a_trainer_does_not_know_are_refused() -> None:
+    scan = street(0)
+    assert scan.boxes is not None
+    check_names(scan, ["Car", "Van"])
+    check_names(replace(scan, boxes=None), ["Van"])
+    check_names(street(0, boxes=False), ["Van"])
+    with pytest.raises(DataError, match="boxes of .'Car'. in synthetic scan .* some of Van, Truck"):
+        check_names(scan, ["Van", "Truck"])
+
+
 def test_points_are_memory_of_their_own() -> None:
     """Trap: trainers turn points in place."""
     scan = Scans("s", 1)[0]
@@ -160,12 +184,13 @@ def test_the_loader_tells_the_epoch(persistent: bool) -> None:
 
 def test_trainers_generators_do_not_decide_on_scans() -> None:
     """Trap: some seed their workers the same in every epoch."""
-    mixed = mix(6, {"synthetic": Endless(), "ratio": 0.4}, as_is)
+    settings = {"synthetic": Endless(), "ratio": 0.4}
+    mixed = mix(6, settings, lambda scan, rng: (scan.id, int(rng.integers(1 << 60))))
     given = []
     for seed in (0, 1):
         np.random.seed(seed)
         torch.manual_seed(seed)
-        given.append([s.id if isinstance(s, Scan) else s for s in (mixed[i] for i in range(len(mixed)))])
+        given.append([mixed[i] for i in range(len(mixed))])
     assert given[0] == given[1]
 
 
@@ -306,6 +331,12 @@ def test_lists_for_mmdetection3d(tmp_path: Path) -> None:
         assert np.allclose(dims, scan.boxes.values[0, [3, 5, 4]], atol=1e-5)
         reduced = np.fromfile(root / "training" / "velodyne_reduced" / entry["lidar_points"]["lidar_path"], "<f4")
         assert np.array_equal(reduced.reshape(-1, 4)[:, :3], in_view(scan, CAMERA).points)
+    (root / "training" / "calib" / "000001.txt").unlink()
+    (root / "training" / "planes" / "000001.txt").unlink()
+    with pytest.raises(FileError, match="calib/000001.txt cannot be read"):
+        kitti_list(root, tmp_path / "k.json")
+    with pytest.raises(DataError, match="has no calibration.*calib/000001.txt"):
+        write_planes(root)
     listed = semantic_kitti_list(semantic_kitti(tmp_path / "sk", 2), tmp_path / "s.json")
     for entry in json.loads(listed.read_text())["data_list"]:
         assert (tmp_path / "sk" / entry["lidar_points"]["lidar_path"]).is_file()
@@ -332,20 +363,23 @@ def test_a_parser_for_range_view_trainers(tmp_path: Path) -> None:
         write_parser(tmp_path / "mix.yaml", tmp_path / "mixed")
 
 
-@pytest.mark.parametrize("trainer", ["mmdet3d", "pointcept", "lightning"])
-def test_a_missing_trainer_is_named(trainer: str) -> None:
+@pytest.mark.parametrize(
+    ("adapter", "trainer"),
+    [("mmdet3d", "mmdet3d"), ("pointcept", "pointcept"), ("lightning", "lightning"), ("openpcdet", "pcdet")],
+)
+def test_a_missing_trainer_is_named(adapter: str, trainer: str) -> None:
     if find_spec(trainer) is not None:
         pytest.skip(f"{trainer} is installed")
     with pytest.raises(LibraryError, match=f"{trainer} cannot be imported"):
-        importlib.import_module(f"lidar_synth.integrations.{trainer}")
+        importlib.import_module(f"lidar_synth.integrations.{adapter}")
 
 
 def test_other_missing_trainers_are_named() -> None:
-    from lidar_synth.integrations import cylinder3d, open3d_ml, openpcdet, rangenet
+    from lidar_synth.integrations import cylinder3d, open3d_ml, rangenet
 
-    if any(find_spec(name) for name in ("dataloader", "pcdet", "tasks", "ml3d")):
+    if any(find_spec(name) for name in ("dataloader", "tasks", "ml3d")):
         pytest.skip("a checkout is on the path")
-    for call in (cylinder3d.register, openpcdet.dataset_class, rangenet.dataset_class):
+    for call in (cylinder3d.register, rangenet.dataset_class):
         with pytest.raises(LibraryError, match="cannot be imported"):
             call()
     with pytest.raises(LibraryError, match="ml3d.datasets cannot be imported"):

@@ -1,15 +1,18 @@
 # ruff: noqa: E402, NPY001, NPY002 - imports wait for what they need; Cylinder3D is of numpy's older days
 """Cylinder3D's own voxels, augmentation and collate code on mixed scans: CYLINDER3D_ROOT is a checkout."""
 
+import os
+import re
 import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 import yaml
-from checkouts import checkout, stand_in
+from checkouts import checkout, launch, stand_in
 from streets import semantic_kitti, synthetic
 
 ROOT = checkout("CYLINDER3D_ROOT", "Cylinder3D")
@@ -18,7 +21,7 @@ np.int = int  # type: ignore[attr-defined]  # Cylinder3D is written for numpy be
 stand_in("strictyaml")
 
 from dataloader.dataset_semantickitti import collate_fn_BEV, get_model_class
-from dataloader.pc_dataset import SemKITTI_sk, get_pc_model_class
+from dataloader.pc_dataset import get_pc_model_class
 from lidar_synth.integrations.cylinder3d import NAME, register
 from lidar_synth.integrations.mixture import VARIABLE, EpochLoader
 
@@ -31,7 +34,11 @@ LABELS = str(ROOT / "config/label_mapping/semantic-kitti.yaml")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("cylinder3d")
+    return make(tmp_path_factory.mktemp("cylinder3d"))
+
+
+def make(root: Path) -> Path:
+    """Real and synthetic scans, and the settings of a mixture."""
     semantic_kitti(root / "sk", REAL)
     for sequence in ("01", "02", "03", "04", "05", "06", "07", "09", "10"):
         (root / "sk" / "sequences" / sequence / "velodyne").mkdir(parents=True)
@@ -41,10 +48,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def points(made: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setenv(VARIABLE, str(made / "mix.yaml"))
+def points(made: Path) -> Any:
+    return both(made)[1]
+
+
+def both(made: Path) -> tuple[Any, Any]:
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
     register()
-    return get_pc_model_class(NAME)(f"{made}/sk/sequences", "train", return_ref=True, label_mapping=LABELS)
+    options = {"imageset": "train", "return_ref": True, "label_mapping": LABELS}
+    with patch.dict(os.environ, {VARIABLE: str(made / "mix.yaml")}):
+        return tuple(get_pc_model_class(name)(f"{made}/sk/sequences", **options) for name in ("SemKITTI_sk", NAME))
 
 
 def voxels(dataset: Any, augment: bool = True) -> Any:
@@ -77,7 +90,7 @@ def test_workers_give_the_scans_of_their_epoch(made: Path, points: Any) -> None:
 
 
 def test_real_samples_are_the_trainers_own(made: Path, points: Any) -> None:
-    own = SemKITTI_sk(f"{made}/sk/sequences", "train", return_ref=True, label_mapping=LABELS)
+    own = both(made)[0]
     for position in (i for i in range(len(points)) if not points.mixed.domain(i)):
         for a, b in zip(points[position], own[points.mixed[position]], strict=True):
             assert a.dtype == b.dtype and np.array_equal(a, b)
@@ -125,6 +138,18 @@ def register_once() -> Any:
     return register()
 
 
+def test_a_map_of_classes_that_does_not_fit_is_refused(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its labels are a file that the configuration names: synthetic ones would keep the stock ids."""
+    monkeypatch.setenv(VARIABLE, str(made / "mix.yaml"))
+    mapping = yaml.safe_load(Path(LABELS).read_text())
+    mapping["learning_map"][10] = 4
+    (tmp_path / "merged.yaml").write_text(yaml.safe_dump(mapping))
+    with pytest.raises(ConfigError, match="a map of classes with 10: 4"):
+        register()(f"{made}/sk/sequences", "train", label_mapping=str(tmp_path / "merged.yaml"))
+
+
 def test_missing_and_unlabelled_mixtures_are_refused(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -137,3 +162,26 @@ def test_missing_and_unlabelled_mixtures_are_refused(
         monkeypatch.setenv(VARIABLE, str(tmp_path / "mix.yaml"))
         with pytest.raises(ConfigError, match="labels"):
             register()(f"{made}/sk/sequences", "train", label_mapping=LABELS)
+
+
+def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> None:
+    """The stock network on a small grid: ``train_cylinder_asym.py`` as a user types it, with validation."""
+    (made / "sk" / "sequences" / "08").exists() or (made / "sk" / "sequences" / "08").symlink_to("00")
+    own = yaml.safe_load((ROOT / "config/semantickitti.yaml").read_text())
+    own["model_params"] |= {"output_shape": [48, 36, 8], "init_size": 4, "out_fea_dim": 32}
+    own["dataset_params"] |= {"pc_dataset_type": NAME, "label_mapping": LABELS}
+    for loader in ("train_data_loader", "val_data_loader"):
+        own[loader] |= {"data_path": f"{made}/sk/sequences", "num_workers": 2}
+    each = (REAL + EXTRA) // 2
+    model = str(tmp_path / "model.pt")
+    own["train_params"] |= {"max_num_epochs": 2, "eval_every_n_steps": each}
+    own["train_params"] |= {"model_load_path": model, "model_save_path": model}
+    (tmp_path / "mixed.yaml").write_text(yaml.safe_dump(own))
+    said = launch(
+        "cylinder3d", "train_cylinder_asym.py", "--config_path", str(tmp_path / "mixed.yaml"),
+        cwd=ROOT, mixture=made / "mix.yaml",
+    )  # fmt: skip
+    epochs = [(int(e), yaml.safe_load(of)) for e, of in re.findall(r"epoch (\d+) of (.*)", said)]
+    assert epochs == [(e, {0: REAL, 1: EXTRA}) for e in (0, 1)]
+    losses = [float(value) for value in re.findall(r"epoch \d+ iter +\d+, loss: (\S+)", said)]
+    assert len(losses) == 3 and np.isfinite(losses).all() and "Current val loss" in said

@@ -1,8 +1,10 @@
 # ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
 """MMDetection3D's own datasets, transforms and loaders on mixed lists; skipped where it is not installed."""
 
+import importlib
 import json
 import os
+import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +36,7 @@ from streets import CAMERA, held, kitti, semantic_kitti, street, synthetic
 from torch.utils.data import DataLoader
 
 from lidar_synth.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats import open_scans
 from lidar_synth.labels import ObjectBank
 from lidar_synth.scan import Boxes, Scan
@@ -288,6 +290,14 @@ def test_what_cannot_be_trained_on_is_refused_before(made: Path, tmp_path: Path)
             tmp_path / "g", made / "kitti" / "train.json", MIX | {"synthetic": boxless},
             data_root=made / "kitti", points="training/velodyne_reduced",
         )  # fmt: skip
+    named = tmp_path / "named"
+    boxes = [scan.boxes for scan in map(street, range(3))]
+    write_all("npz", named, [replace(street(i), boxes=replace(b, names=("car",) * 3)) for i, b in enumerate(boxes)])
+    with pytest.raises(DataError, match="boxes of .'car'. in synthetic scan"):
+        write_infos(
+            tmp_path / "h", made / "kitti" / "train.json", MIX | {"synthetic": named},
+            data_root=made / "kitti", points="training/velodyne_reduced",
+        )  # fmt: skip
     entries = json.loads((made / "kitti" / "train.json").read_text())
     del entries["data_list"][0]["images"]
     (tmp_path / "bare.json").write_text(json.dumps(entries))
@@ -359,6 +369,14 @@ def test_classes_that_do_not_fit_are_refused(made: Path) -> None:
         adapter.SynthEpochHook().before_train(FakeRunner(segmentation(made, [PACK], metainfo=meta)))
     with pytest.raises(ConfigError, match="without a mixed list"):
         adapter.SynthEpochHook().before_train(FakeRunner(object()))
+
+
+@pytest.mark.parametrize("version", ["1.3.0", "2.0.0"])
+def test_other_versions_are_refused(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mmdet3d, "__version__", version)
+    monkeypatch.delitem(sys.modules, adapter.__name__)
+    with pytest.raises(LibraryError, match=f"mmdet3d {version}.*install_mmdet3d.sh"):
+        importlib.import_module(adapter.__name__)
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:

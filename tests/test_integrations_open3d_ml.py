@@ -36,7 +36,11 @@ REAL, EXTRA = 6, 4
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("open3d")
+    return make(tmp_path_factory.mktemp("open3d"))
+
+
+def make(root: Path) -> Path:
+    """Real and synthetic scans."""
     semantic_kitti(root / "sk" / "dataset", REAL)
     synthetic(root / "synthetic", 11)
     return root
@@ -46,6 +50,12 @@ def build(made: Path, **options: Any) -> Any:
     mixture = {"synthetic": str(made / "synthetic"), "ratio": 0.4, "seed": 3}
     given = {"mixture": mixture, "training_split": ["00"], "validation_split": ["00"]} | options
     return dataset_class("ml3d.datasets")(str(made / "sk"), **given)
+
+
+def both(made: Path) -> tuple[Any, Any]:
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
+    own = SemanticKITTI(str(made / "sk"), training_split=["00"])
+    return own.get_split("training"), build(made).get_split("training")
 
 
 def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
@@ -64,8 +74,7 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
 
 
 def test_real_samples_are_the_trainers_own(made: Path) -> None:
-    split = build(made).get_split("training")
-    own = SemanticKITTI(str(made / "sk"), training_split=["00"]).get_split("training")
+    own, split = both(made)
     for position in (i for i in range(len(split)) if not split.mixed.domain(i)):
         mine, theirs = split.get_data(position), own.get_data(split.mixed[position])
         assert all(np.array_equal(mine[k], theirs[k]) and mine[k].dtype == theirs[k].dtype for k in theirs)
@@ -86,6 +95,14 @@ def test_its_cache_by_name_is_refused(made: Path) -> None:
     """Trap: it would give the first epoch's scans for ever."""
     with pytest.raises(ConfigError, match="use_cache=True"):
         build(made, use_cache=True)
+
+
+def test_unlabelled_scans_are_refused(made: Path, tmp_path: Path) -> None:
+    bare = str(synthetic(tmp_path / "bare", 3, labels=False))
+    with pytest.raises(ConfigError, match="a model or bank with labels"):
+        build(made, mixture={"synthetic": bare}).get_split("training")
+    with pytest.raises(ConfigError, match="is NaN"):
+        build(made, mixture={"synthetic": bare, "labels": "none"})
 
 
 def test_the_pipeline_tells_the_epoch() -> None:

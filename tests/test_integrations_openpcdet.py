@@ -1,38 +1,38 @@
 # ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
 """OpenPCDet's own dataset, augmentor and collate code on mixed scans: OPENPCDET_ROOT is a checkout, built or not."""
 
+import importlib
+import re
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from checkouts import checkout, overlaps, points_in_boxes, stand_in
+from checkouts import checkout, launch, openpcdet_stand_ins
 
 ROOT = checkout("OPENPCDET_ROOT", "OpenPCDet")
 easydict = pytest.importorskip("easydict", reason="easydict is not installed")
 pytest.importorskip("skimage", reason="scikit-image is not installed")
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
-stand_in("SharedArray")
-stand_in("torchvision")
-stand_in("pcdet.version", __version__="0.6.0")
-for name in ("nuscenes.nuscenes", "waymo.waymo", "pandaset.pandaset", "lyft.lyft", "once.once", "argo2.argo2"):
-    sys.modules[f"pcdet.datasets.{name}_dataset"] = stand_in(f"stands_for_{name.rpartition('.')[2]}")
-stand_in("pcdet.ops.iou3d_nms.iou3d_nms_cuda", boxes_iou_bev_cpu=overlaps)
-stand_in("pcdet.ops.roiaware_pool3d.roiaware_pool3d_cuda", points_in_boxes_cpu=points_in_boxes)
+openpcdet_stand_ins()
 
+import lidar_synth.integrations.openpcdet as adapter
+import pcdet
 import torch
+from layouts import write_all
 from lidar_synth.integrations.detection import in_view, write_gt_database
 from lidar_synth.integrations.openpcdet import NAME, register
 from pcdet.datasets import __all__ as registered
 from pcdet.datasets.kitti import kitti_dataset
 from pcdet.datasets.kitti.kitti_dataset import KittiDataset, create_kitti_infos
-from streets import held, kitti, synthetic
+from streets import held, kitti, street, synthetic
 from torch.utils.data import DataLoader
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats import open_scans
 from lidar_synth.labels import ObjectBank
 from lidar_synth.scan import Boxes
@@ -53,16 +53,25 @@ def config(root: Path, synthetic_scans: Path, sampling: bool = True, **settings:
     return easydict.EasyDict(loaded)
 
 
-def build(made: Path, scans: str = "synthetic", kitti: str = "kitti", **options: Any) -> Any:
+def build(made: Path, scans: str | Path = "synthetic", kitti: str = "kitti", **options: Any) -> Any:
     register()
     loaded = config(made / kitti, made / scans, **options)
     return registered[NAME](loaded, CLASSES, training=True, root_path=made / kitti)
 
 
+def both(made: Path) -> tuple[Any, Any]:
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
+    loaded = config(made / "kitti", made / "synthetic")
+    return KittiDataset(loaded, CLASSES, training=True, root_path=made / "kitti"), build(made)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make(tmp_path_factory.mktemp("openpcdet"))
+
+
+def make(root: Path) -> Path:
     """KITTI's folders, their info lists and GT database by OpenPCDet's own code, and synthetic scans."""
-    root = tmp_path_factory.mktemp("openpcdet")
     synthetic(root / "synthetic", 11)
     synthetic(root / "bare", 5, boxes=False)
     kitti(root / "kitti", REAL)
@@ -110,8 +119,7 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path, workers: int) -> N
 
 
 def test_real_samples_are_the_trainers_own(made: Path) -> None:
-    ours, loaded = build(made), config(made / "kitti", made / "synthetic")
-    theirs = KittiDataset(loaded, CLASSES, training=True, root_path=made / "kitti")
+    theirs, ours = both(made)
     positions = [i for i in range(len(ours)) if not ours.domain(i)]
     for position in positions:
         index = ours.mixed[position]
@@ -214,7 +222,7 @@ def test_what_cannot_be_mixed_is_refused(made: Path) -> None:
     loaded.GET_ITEM_LIST = ["points"]
     plane = made / "kitti" / "training" / "planes" / "000003.txt"
     plane.rename(plane.with_suffix(".gone"))
-    with pytest.raises(ConfigError, match="no plane for 1 scans .000003.*write_planes"):
+    with pytest.raises(ConfigError, match="planes without 1 scans .000003.*write_planes"):
         registered[NAME](loaded, CLASSES, training=True, root_path=made / "kitti")
     plane.with_suffix(".gone").rename(plane)
     del loaded["LIDAR_SYNTH"]
@@ -222,8 +230,33 @@ def test_what_cannot_be_mixed_is_refused(made: Path) -> None:
         registered[NAME](loaded, CLASSES, training=True, root_path=made / "kitti")
 
 
+@pytest.mark.parametrize("version", ["0.5.2", "1.0.0"])
+def test_other_versions_are_refused(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pcdet, "__version__", version)
+    monkeypatch.delitem(sys.modules, adapter.__name__)
+    with pytest.raises(LibraryError, match=f"OpenPCDet {version}"):
+        importlib.import_module(adapter.__name__)
+
+
+def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(made: Path, tmp_path: Path) -> None:
+    scans = [street(i) for i in range(4)]
+    write_all("npz", tmp_path / "without", [replace(scan, boxes=None) for scan in scans])
+    boxes = [scan.boxes for scan in scans]
+    renamed = [replace(s, boxes=replace(b, names=("car",) * 3)) for s, b in zip(scans, boxes, strict=True) if b]
+    write_all("npz", tmp_path / "named", renamed)
+    build(made, tmp_path / "without")
+    with pytest.raises(DataError, match="has no boxes, and there is no gt_sampling"):
+        build(made, tmp_path / "without", sampling=False)
+    with pytest.raises(DataError, match="boxes of .'car'. in synthetic scan .* some of Car"):
+        build(made, tmp_path / "named")
+    calib = made / "kitti" / "training" / "calib" / "000002.txt"
+    calib.rename(calib.with_suffix(".gone"))
+    with pytest.raises(ConfigError, match="calib without 1 scans .000002"):
+        build(made)
+    calib.with_suffix(".gone").rename(calib)
+
+
 def test_the_training_loop_tells_the_epoch(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stand_in("kornia")
     from lidar_synth.integrations.openpcdet import tell_epochs
     from train_utils import train_utils as loop
 
@@ -239,3 +272,33 @@ def test_the_training_loop_tells_the_epoch(made: Path, monkeypatch: pytest.Monke
         torch.nn.Linear(1, 1), None, loader, None, None, easydict.EasyDict(), 3, 5, 0, 0, None, made, cfg={}
     )
     assert told == [3, 4]
+
+
+def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> None:
+    """Stock PointPillars, only smaller: ``train.py`` as a user types it, two epochs with two workers."""
+    tools = ROOT / "tools"
+    own = yaml.safe_load((tools / "cfgs/kitti_models/pointpillar.yaml").read_text())
+    data, model = own["DATA_CONFIG"], own["MODEL"]
+    data |= {"DATA_PATH": str(made / "kitti"), "POINT_CLOUD_RANGE": [0, -12.8, -3, 25.6, 12.8, 1]}
+    data["DATA_PROCESSOR"][2]["VOXEL_SIZE"] = [0.4, 0.4, 4]
+    sampling = data["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]
+    sampling |= {"SAMPLE_GROUPS": ["Car:3"], "PREPARE": {"filter_by_min_points": ["Car:5"]}}
+    own["CLASS_NAMES"] = CLASSES
+    del model["DENSE_HEAD"]["ANCHOR_GENERATOR_CONFIG"][1:]
+    model["BACKBONE_2D"] |= {"NUM_FILTERS": [16, 16, 16], "NUM_UPSAMPLE_FILTERS": [16, 16, 16]}
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(own))
+    mixture = {"synthetic": str(made / "synthetic"), "ratio": 0.4, "seed": 3}
+    (tmp_path / "mix.yaml").write_text(yaml.safe_dump(mixture))
+    said = launch(
+        "openpcdet", "train.py", "--cfg_file", str(tmp_path / "small.yaml"), "--epochs", "2", "--batch_size", "2",
+        "--workers", "2", "--fix_random_seed", "--logger_iter_interval", "1", "--wo_gpu_stat",
+        "--set", "DATA_CONFIG.DATASET", NAME,
+        cwd=tools, mixture=tmp_path / "mix.yaml",
+    )  # fmt: skip
+    losses = [float(value) for value in re.findall(r"Loss: (\S+) ", said)]
+    batches = [yaml.safe_load(batch) for batch in re.findall(r"batch of (.*)", said)]
+    each = (REAL + EXTRA) // 2
+    assert len(losses) == len(batches) == 2 * each and np.isfinite(losses).all()
+    for epoch in (batches[:each], batches[each:]):
+        assert sum(map(Counter, epoch), Counter()) == {"real": REAL, "synthetic": EXTRA}
+    assert list(tmp_path.rglob("checkpoint_epoch_2.pth"))

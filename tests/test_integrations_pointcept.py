@@ -43,7 +43,11 @@ REAL, EXTRA = 6, 4
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("pointcept")
+    return make(tmp_path_factory.mktemp("pointcept"))
+
+
+def make(root: Path) -> Path:
+    """Real and synthetic scans."""
     for sequence in ("01", "02", "03", "04", "05", "06", "07", "09", "10"):
         (root / "sk" / "dataset" / "sequences" / sequence / "velodyne").mkdir(parents=True)
     semantic_kitti(root / "sk" / "dataset", REAL)
@@ -59,6 +63,11 @@ def build(made: Path, kind: str = "MixedSemanticKITTI", stock: bool = True, **op
     if not stock:
         train["transform"] = []
     return build_dataset(train | options)
+
+
+def both(made: Path) -> tuple[Any, Any]:
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
+    return build(made, "SemanticKITTIDataset"), build(made)
 
 
 def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
@@ -82,7 +91,7 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
 
 
 def test_real_samples_are_the_trainers_own(made: Path) -> None:
-    ours, theirs = build(made), build(made, "SemanticKITTIDataset")
+    theirs, ours = both(made)
     for position in (i for i in range(len(ours)) if not ours.domain(i)):
         np.random.seed(7)
         import random
@@ -132,6 +141,13 @@ def test_a_synthetic_scan_without_labels_never_becomes_cars(made: Path, tmp_path
     scan.label[:] = IGNORE
     with pytest.raises(DataError, match="no valid label"):
         adapter.class_ids(scan, dataset._ids)
+
+
+def test_a_map_of_classes_that_does_not_fit_is_refused(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    merged = adapter.SemanticKITTIDataset.get_learning_map(-1) | {10: 4}
+    monkeypatch.setattr(adapter.SemanticKITTIDataset, "get_learning_map", staticmethod(lambda ignore: merged))
+    with pytest.raises(ConfigError, match="a map of classes with 10: 4"):
+        build(made)
 
 
 def test_what_cannot_be_mixed_is_refused(made: Path) -> None:

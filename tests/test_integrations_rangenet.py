@@ -33,7 +33,11 @@ SALSA = hasattr(stock, "my_collate")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("rangenet")
+    return make(tmp_path_factory.mktemp("rangenet"))
+
+
+def make(root: Path) -> Path:
+    """Real and synthetic scans, and a parser."""
     semantic_kitti(root / "sk", REAL)
     synthetic(root / "synthetic", 11)
     mixture = {"synthetic": str(root / "synthetic"), "ratio": 0.4, "seed": 3}
@@ -71,6 +75,13 @@ def parser(made: Path, **others: Any) -> Any:
     return module.Parser(**arguments(made, **others))
 
 
+def both(made: Path) -> tuple[Any, Any]:
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
+    keys = ("labels", "color_map", "learning_map", "learning_map_inv", "sensor", "max_points", "gt")
+    options = {key: arguments(made)[key] for key in keys} | ({"transform": True} if SALSA else {})
+    return stock.SemanticKitti(str(made / "sk"), [0], **options), parser(made).train_dataset
+
+
 def test_two_epochs_see_exactly_the_planned_scans(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made_parser = parser(made, workers=2)
     loader, seen = made_parser.get_train_set(), []
@@ -96,11 +107,7 @@ def test_the_trainers_own_collate_takes_both_kinds(made: Path) -> None:
 
 
 def test_real_samples_are_the_trainers_own(made: Path) -> None:
-    made_parser = parser(made)
-    dataset = made_parser.train_dataset
-    keys = ("labels", "color_map", "learning_map", "learning_map_inv", "sensor", "max_points", "gt")
-    options = {key: arguments(made)[key] for key in keys} | ({"transform": True} if SALSA else {})
-    own = stock.SemanticKitti(str(made / "sk"), [0], **options)
+    own, dataset = both(made)
     for position in (i for i in range(len(dataset)) if not dataset.mixed.domain(i)):
         samples = []
         for each, index in ((dataset, position), (own, dataset.mixed[position])):

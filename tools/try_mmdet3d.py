@@ -1,11 +1,13 @@
 """Trains stock PointPillars and FRNet for a few iterations on a real and synthetic mixture and prints the losses.
 
-The scans are the town's: one seed stands for the real dataset, in KITTI's and SemanticKITTI's own layouts, another for
-the synthetic one. So this shows that the trainer takes the mixture, not that it helps. Run by ``try_mmdet3d.sh``.
+The synthetic scans are the town's. The real ones are those of KITTI's and SemanticKITTI's folders that are given, which
+are copied, or other scans of the town in their layouts. So this shows that the trainer takes the mixture, not that it
+helps. Run by ``try_mmdet3d.sh``.
 """
 
 import argparse
 import os
+import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -40,14 +42,17 @@ class Report(Hook):  # type: ignore[misc]
         print(f"epoch {runner.epoch} iteration {runner.iter + 1}: loss {losses['loss']:.3f}, {dict(kinds)}", flush=True)
 
 
-def prepare(out: Path, real: int, synthetic: int) -> None:
-    """Datasets, lists and GT database under ``out``."""
-    for layout in ("kitti", "semantic_kitti"):
-        export_town(Town(seed=1, scans=real), out / layout, layout, camera=False)
+def prepare(out: Path, scans: int, real: dict[str, Path | None]) -> None:
+    """Datasets, lists and GT database under ``out``; ``real`` has a folder, or none, for each layout."""
+    for layout, given in real.items():
+        if given is None:
+            export_town(Town(seed=1, scans=scans), out / layout, layout, camera=False)
+        else:
+            shutil.copytree(given, out / layout)  # planes and what a camera sees are written beside the scans
     made = out / "synthetic"
-    convert(Town(seed=2, scans=synthetic), WRITERS["npz"](made))
+    convert(Town(seed=2, scans=scans), WRITERS["npz"](made))
     settings = {"synthetic": made, "ratio": 0.5, "seed": 0}
-    write_planes(out / "kitti")
+    write_planes(out / "kitti", "train")
     kitti_list(out / "kitti", out / "kitti" / "train.json")
     write_infos(
         out / "det", out / "kitti" / "train.json", settings, data_root=out / "kitti", points="training/velodyne_reduced"
@@ -59,13 +64,13 @@ def prepare(out: Path, real: int, synthetic: int) -> None:
     write_infos(out / "seg", out / "semantic_kitti" / "train.json", settings, **root)
 
 
-def train(name: str, folder: Path, iterations: int, gt_root: Path) -> None:
+def train(name: str, folder: Path, iterations: int, batch_size: int, gt_root: Path) -> None:
     """A few iterations of a configuration on the mixed list in a folder."""
     config = Config.fromfile(str(CONFIGS / name))
     loader = config.train_dataloader
     dataset = loader.dataset.dataset if loader.dataset.type == "RepeatDataset" else loader.dataset
     dataset.ann_file = str(folder / "infos.json")
-    loader.update(batch_size=2, num_workers=1)
+    loader.update(batch_size=batch_size, num_workers=1)
     for step in dataset.pipeline:
         if step.type == "ObjectSample":
             step.db_sampler.update(data_root=str(gt_root), info_path=str(gt_root / "dbinfos.pkl"))
@@ -80,7 +85,7 @@ def train(name: str, folder: Path, iterations: int, gt_root: Path) -> None:
     config.default_hooks.checkpoint = None
     config.log_level = "WARNING"
     init_default_scope("mmdet3d")
-    print(f"{name}: {config.model.type}, {iterations} iterations", flush=True)
+    print(f"{name}: {config.model.type}, {iterations} iterations of {batch_size} scans", flush=True)
     Runner.from_cfg(config).train()
 
 
@@ -89,18 +94,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="folder for the scans")
     parser.add_argument("--iterations", type=int, default=4)
-    parser.add_argument("--scans", type=int, default=8, help="real ones, and as many synthetic")
+    parser.add_argument("--scans", type=int, default=8, help="of the town, of each kind")
+    parser.add_argument("--kitti", type=Path, help="KITTI's object set, with training and ImageSets")
+    parser.add_argument("--semantic-kitti", type=Path, help="SemanticKITTI's dataset, with sequences")
+    parser.add_argument("--batch-size", type=int, default=2)
     parser.add_argument("--only", choices=["pointpillars", "frnet"], help="one of the two")
     options = parser.parse_args()
     out = options.out.resolve()
     if not (out / "seg" / "infos.json").is_file():
-        prepare(out, options.scans, options.scans)
+        prepare(out, options.scans, {"kitti": options.kitti, "semantic_kitti": options.semantic_kitti})
     if options.only != "frnet":
-        train("pointpillars_kitti.py", out / "det", options.iterations, out / "kitti")
+        train("pointpillars_kitti.py", out / "det", options.iterations, options.batch_size, out / "kitti")
     if options.only == "pointpillars":
         return
     if os.environ.get("FRNET_ROOT"):
-        train("frnet_semantickitti.py", out / "seg", options.iterations, out / "kitti")
+        train("frnet_semantickitti.py", out / "seg", options.iterations, options.batch_size, out / "kitti")
     else:
         print("FRNET_ROOT is not set to a checkout of FRNet: skipped")
 

@@ -1,8 +1,10 @@
 #!/usr/bin/env bash
-# Trains stock PointPillars (KITTI) and FRNet (SemanticKITTI) for a few iterations on the CPU, on a mixture of two towns.
+# Trains stock PointPillars (KITTI) and FRNet (SemanticKITTI) for a few iterations on the CPU, on a mixture of real scans
+# and the town's; without --kitti and --semantic-kitti another town takes the place of the real ones.
 #
 #   bash tools/install_mmdet3d.sh .venv --ops
-#   FRNET_ROOT=/path/to/FRNet bash tools/try_mmdet3d.sh .venv OUT [--iterations 4] [--scans 8]
+#   FRNET_ROOT=/path/to/FRNet bash tools/try_mmdet3d.sh .venv OUT [--iterations 4] [--scans 8] [--batch-size 2] \
+#       [--kitti /data/kitti] [--semantic-kitti /data/SemanticKITTI/dataset]
 #
 # FRNet is a repository of its own (github.com/Xiangxu-0103/FRNet). Where torch_scatter is not installed, tools/stand_ins
 # has the two functions of it that FRNet calls.

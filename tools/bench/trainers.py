@@ -1,14 +1,19 @@
 """What an adapter adds to a trainer's own loading of a real sample, and what a synthetic sample costs beside it.
 
-Measured in turns by processor time, on MMDetection3D's stock SemanticKITTI pipeline (points, labels, flip, turn, pack),
-with scans of the town in SemanticKITTI's layout; needs an environment of ``tools/install_mmdet3d.sh``::
+Measured in turns by processor time, each trainer in a process of its own: MMDetection3D where it is installed
+(``tools/install_mmdet3d.sh``; stock SemanticKITTI pipeline of points, labels, flip, turn, pack; scans of the town), the
+others where a variable names their checkout, as for the tests, whose small scans make the adapter's share the larger::
 
-    python tools/bench/trainers.py
+    OPENPCDET_ROOT=/path/to/OpenPCDet python tools/bench/trainers.py
 """
 
+import os
+import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,10 +23,18 @@ sys.path.append(str(Path(__file__).parents[2] / "tests"))
 from timing import print_table, time_in_turns
 
 SCANS = 8
+OWN = "a real sample, the trainer's own dataset"
+MIXED = "the same through the mixture"
+SYNTHETIC = "a synthetic sample, from a folder of .npz"
+VARIABLES = {"openpcdet": "OPENPCDET_ROOT", "pointcept": "POINTCEPT_ROOT", "rangenet": "RANGENET_ROOT",
+             "cylinder3d": "CYLINDER3D_ROOT", "open3d_ml": "OPEN3D_ML_ROOT"}  # fmt: skip
 
 
-def datasets(root: Path) -> tuple[Any, Any]:
+def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
     """The stock dataset and the mixed one, of the same real scans."""
+    import mmcv_ext
+
+    mmcv_ext.install()
     from lidar_synth.integrations.mmdet3d_infos import write_infos
     from lidar_synth.integrations.mmdet3d_lists import semantic_kitti_list
     from mmdet3d.registry import DATASETS
@@ -42,28 +55,33 @@ def datasets(root: Path) -> tuple[Any, Any]:
     ours = config.train_dataloader.dataset.to_dict() | {"ann_file": str(mixed)}
     ours["pipeline"] = [*ours["pipeline"][:3], *ours["pipeline"][-2:]]  # without partners drawn at random
     theirs = ours | {"ann_file": str(listed), "data_root": str(root / "real")}
-    return DATASETS.build(theirs), DATASETS.build(ours)
+    stock, dataset, slots = DATASETS.build(theirs), DATASETS.build(ours), iter(range(10**9))
+    return {OWN: lambda: stock[0], MIXED: lambda: dataset[0], SYNTHETIC: lambda: dataset[SCANS + next(slots) % SCANS]}
+
+
+def of_tests(trainer: str, root: Path) -> dict[str, Callable[[], Any]]:
+    """The same of the datasets that a trainer's tests compare."""
+    tests = import_module(f"test_integrations_{trainer}")
+    own, ours = tests.both(tests.make(root))
+    where = [next(i for i in range(len(ours)) if ours.mixed.domain(i) == domain) for domain in (0, 1)]
+    load = "get_data" if trainer == "open3d_ml" else "__getitem__"
+    theirs, mine = getattr(own, load), getattr(ours, load)
+    number = ours.mixed[where[0]]
+    return {OWN: lambda: theirs(number), MIXED: lambda: mine(where[0]), SYNTHETIC: lambda: mine(where[1])}
 
 
 def main() -> None:
-    """Prints one table."""
-    if find_spec("mmdet3d") is None:
-        print("mmdet3d is not installed (tools/install_mmdet3d.sh): nothing measured")
+    """Prints a table for each trainer that is there, or of the one that is named."""
+    if sys.argv[1:]:
+        with tempfile.TemporaryDirectory() as folder:
+            calls = mmdet3d(Path(folder)) if sys.argv[1] == "mmdet3d" else of_tests(sys.argv[1], Path(folder))
+            print_table(f"{sys.argv[1]}, one sample", time_in_turns(calls, rounds=200, clock=time.process_time), OWN)
         return
-    import mmcv_ext
-
-    mmcv_ext.install()
-    with tempfile.TemporaryDirectory() as folder:
-        stock, mixed = datasets(Path(folder))
-        slots = iter(range(10**9))
-        own = "a real sample, the trainer's own dataset"
-        calls = {
-            own: lambda: stock[0],
-            "the same through the mixed list": lambda: mixed[0],
-            "a synthetic sample, from a folder of .npz": lambda: mixed[SCANS + next(slots) % SCANS],
-        }
-        seconds = time_in_turns(calls, rounds=40, clock=time.process_time)
-        print_table("MMDetection3D, SemanticKITTI, one sample", seconds, own)
+    for trainer in ("mmdet3d", *VARIABLES):
+        if os.environ.get(VARIABLES[trainer]) if trainer in VARIABLES else find_spec(trainer):
+            subprocess.run([sys.executable, __file__, trainer], check=True)
+        else:
+            print(f"{trainer} is not there (docs/trainers.md): not measured")
 
 
 if __name__ == "__main__":
