@@ -1,17 +1,14 @@
 """What a training configuration asks for: the networks, what they are trained on, and what the checkpoint will say."""
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import nn
 from tqdm import tqdm
 
-from lidar_synth import __version__
 from lidar_synth.checkpoint import (
     CODEC,
     ENCODER,
@@ -23,14 +20,13 @@ from lidar_synth.checkpoint import (
     split,
     weights_hash,
 )
+from lidar_synth.cli.start import fresh_networks, provenance_of, start_networks
 from lidar_synth.codec import Codec, make_codec
 from lidar_synth.conditions import CONDITIONS, Conditioned, blank
 from lidar_synth.config import DistillConfig, Run, TrainConfig
 from lidar_synth.errors import ConfigError
 from lidar_synth.files import write_file
 from lidar_synth.flow import METRICS, guided, velocity_loss
-from lidar_synth.nets import build_network
-from lidar_synth.sensor import load_sensor
 from lidar_synth.solvers import uniform_grid
 from lidar_synth.timesteps import Selection, select_timesteps
 from lidar_synth.train import (
@@ -95,7 +91,7 @@ def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -
 def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> Plan:
     """Flow matching, from fresh weights or from those of ``config.init``."""
     task = teacher_task(config.timesteps)
-    networks, header = _start(config) if config.init is not None else _fresh(config)
+    networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
     if config.codec is not None and CODEC not in networks:
         networks[CODEC] = load_checkpoint(config.codec).networks[CODEC]
     autoencoder = networks.get(CODEC)
@@ -106,7 +102,7 @@ def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> Plan:
 
 def plan_autoencoder(config: TrainConfig) -> Plan:
     """An autoencoder, from fresh weights or from those of ``config.init``."""
-    networks, header = _start(config) if config.init is not None else _fresh(config)
+    networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
     recipe = config.recipe
     network: Any = networks[CODEC]
     trained = Autoencoding(
@@ -125,7 +121,7 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
     velocity = join(teacher.networks).requires_grad_(False)
     if config.compile:
         velocity.compile()
-    provenance = _provenance(config) | {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
+    provenance = provenance_of(config) | {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
     header = replace(teacher.header, time_grid=config.grid or uniform_grid(config.intervals), provenance=provenance)
     student = join(load_checkpoint(config.teacher).networks)
     plan = Plan(student, teacher_task(), header, autoencoder=teacher.networks.get(CODEC))
@@ -166,75 +162,6 @@ def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, A
     return lambda scan: CONDITIONS[name].read(scan, sensor, shape, options)
 
 
-def _fresh(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
-    """New networks and the header that describes them."""
-    provenance = _provenance(config)
-    if config.codec is not None:
-        codec = load_checkpoint(config.codec)
-        if CODEC not in codec.networks:
-            raise ConfigError(f"codec {config.codec}", "the checkpoint of an autoencoder")
-        _check_held(config, codec.header, ("sensor", "channels", "normalisation"), config.codec)
-        sensor, tensors, fixed = codec.header.sensor, codec.header.tensors, {CODEC: codec.header.networks[CODEC]}
-        state = make_codec(codec.networks[CODEC], tensors, sensor.shape).shape
-        provenance |= {"codec": codec.hash, "codec_provenance": codec.header.provenance}
-    else:
-        sensor, tensors, fixed = load_sensor(config.sensor), config.tensors(), {}
-        state = (tensors.size, *sensor.shape)
-    parts = config.parts(state, sensor.shape)
-    torch.manual_seed(config.seed)
-    angles = torch.from_numpy(sensor.ray_angles(config.rays))
-    pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[0]
-    networks = {}
-    for name, part in parts.items():
-        looks = {"angles": pooled} if part.architecture in ("hdit", "denoiser") else {}
-        networks[name] = build_network(part.architecture, part.arguments | looks)
-    header = Header(
-        networks=parts | fixed,
-        sensor=sensor,
-        normalisation=tensors.normalisation,
-        channels=tensors.channels,
-        time_grid=uniform_grid(1 if config.autoencodes else config.steps),
-        provenance=provenance,
-        conditioning={config.condition.kind: config.condition.options()} if config.condition else {},
-    )
-    return networks, header
-
-
-def _start(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
-    """The networks of ``config.init``, and its header for the new run."""
-    assert config.init is not None
-    start = load_checkpoint(config.init)
-    if (CODEC if config.autoencodes else VELOCITY) not in start.networks or config.codec is not None:
-        raise ConfigError(f"init {config.init} with parts {sorted(start.networks)}", "a checkpoint of the same kind")
-    _check_held(config, start.header, ("sensor", "channels", "normalisation", "network"), config.init)
-    provenance = _provenance(config) | {"init": start.hash, "init_provenance": start.header.provenance}
-    grid = start.header.time_grid if config.autoencodes else uniform_grid(config.steps)
-    networks = {CODEC: start.networks[CODEC]} if config.autoencodes else start.networks
-    kept = {name: start.header.networks[name] for name in networks}
-    return networks, replace(start.header, networks=kept, time_grid=grid, provenance=provenance)
-
-
-def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path: Any) -> None:
-    """What the configuration says, if it says it, has to be what the checkpoint holds."""
-    part = header.networks[CODEC if config.autoencodes or "network" not in keys else VELOCITY]
-    held = {
-        "sensor": header.sensor.to_dict(),
-        "channels": list(header.channels),
-        "normalisation": header.normalisation.to_dict(),
-        "network": {"architecture": part.architecture, "arguments": part.arguments},
-    }
-    arguments = part.arguments | config.network.arguments
-    asked = {
-        "sensor": load_sensor(config.sensor).to_dict(),
-        "channels": list(config.channels),
-        "normalisation": config.tensors().normalisation.to_dict(),
-        "network": {"architecture": config.network.architecture, "arguments": arguments},
-    }
-    for key in set(keys) & config.model_fields_set:
-        if json.dumps(asked[key], sort_keys=True) != json.dumps(held[key], sort_keys=True):
-            raise ConfigError(f"{key} {asked[key]}", f"that of {path}: {held[key]}", f"Or leave out {key}.")
-
-
 def _guided(config: DistillConfig, teacher: Checkpoint) -> Any:
     """The teacher with guidance, of conditions as they are stored."""
     network = join(teacher.networks)
@@ -245,16 +172,6 @@ def _guided(config: DistillConfig, teacher: Checkpoint) -> Any:
         raise ConfigError(f"guidance {config.guidance} of a teacher that never met a blank condition", "1")
     empty = torch.zeros(CONDITIONS[name].shape(network.encoder), dtype=torch.uint8)
     return guided(network, config.guidance, blank(name, empty))
-
-
-def _provenance(config: Run) -> dict[str, Any]:
-    return {
-        "data": config.data.describe(),
-        "data_licence": config.data.licence,
-        "licence": config.licence,
-        "recipe": config.model_dump(mode="json", exclude={"output", "data", "licence", "samples", "save_every"}),
-        "software": f"lidar_synth {__version__}, torch {torch.__version__}",
-    }
 
 
 def _selection(config: DistillConfig, velocity: Any, plan: Plan, accelerator: "Accelerator") -> Selection:

@@ -95,7 +95,10 @@ class HDiT(nn.Module):
         self.time = TimeEmbedding(time_width, ratio, mapping_depth)
         self.rotary = nn.ModuleList(Rotary(g, h, w // h) for g, h, w in zip(self.grids, heads, widths, strict=True))
         self.near = nn.ModuleList(NeighbourhoodAttention(grid, self.window) for grid in self.grids[:-1])
-        self.tokenize = nn.Linear(cells * (channels + condition_channels), width, bias=False)
+        self.tokenize = nn.Linear(cells * channels, width, bias=False)
+        if condition_channels:  # begins at 0: the weights of an unconditional model are a start for this one
+            self.tokenize_condition = nn.Linear(cells * condition_channels, width, bias=False)
+            nn.init.zeros_(self.tokenize_condition.weight)
 
         def blocks(i: int) -> nn.ModuleList:
             return nn.ModuleList(Block(widths[i], time_width, heads[i], ratio) for _ in range(depths[i]))
@@ -124,7 +127,7 @@ class HDiT(nn.Module):
         Raises:
             DataError: on a state, times or a condition of another shape.
         """
-        x = self._input(y, cond).to(self.tokenize.weight.dtype)
+        self._check(y, cond)
         t = torch.as_tensor(t, dtype=torch.float32, device=y.device)
         if t.shape not in ((), (1,), (len(y),)):
             raise DataError(
@@ -132,9 +135,11 @@ class HDiT(nn.Module):
             )
         time = self.time(t.expand(len(y)))
         angles = self.angles(self.patch, len(self.grids))
-        levels = [self._level(i, angle, x.dtype) for i, angle in enumerate(angles)]
+        levels = [self._level(i, angle, self.tokenize.weight.dtype) for i, angle in enumerate(angles)]
         place = self.position(angles[0]).flatten(0, 1)
-        x = self.tokenize(to_patches(x.movedim(1, -1), self.patch)) + place
+        x = self.tokenize(self._patches(y)) + place
+        if cond is not None:
+            x = x + self.tokenize_condition(self._patches(cond))
         skips = []
         for i, merge in enumerate(self.merge):
             x = self._run(self.down[i], x, time, levels[i])
@@ -161,17 +166,20 @@ class HDiT(nn.Module):
                 x = block(x, time, level)
         return x
 
-    def _input(self, y: Tensor, cond: Tensor | None) -> Tensor:
+    def _patches(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) as tokens (B, N, C * cells)."""
+        return to_patches(x.movedim(1, -1).to(self.tokenize.weight.dtype), self.patch)
+
+    def _check(self, y: Tensor, cond: Tensor | None) -> None:
         shape = (self.channels, *self.resolution)
         if y.shape[1:] != shape:
             raise DataError(f"a state of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, shape))})")
         if cond is None and self.condition_channels == 0:
-            return y
+            return
         expected = (len(y), self.condition_channels, *self.resolution)
         if cond is None or cond.shape != expected:
             given = "no condition" if cond is None else f"a condition of shape {tuple(cond.shape)}"
             raise DataError(given, str(expected) if self.condition_channels else "none: the network takes no condition")
-        return torch.cat((y, cond.to(y.dtype)), 1)
 
 
 def _pair(values: Sequence[int]) -> Grid:
