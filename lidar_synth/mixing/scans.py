@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -225,6 +226,8 @@ class MixedScans(Dataset[Any]):
         real = self.real[source][index]
         if self._real_as_is:
             return real
+        if real.domain != REAL:  # to this mixture it is, the town for instance
+            real = replace(real, domain=REAL)
         rng = keyed_rng(self.seed, epoch, position)
         if self._augment is not None and self._augment_real:
             real = self._augment(real, rng)

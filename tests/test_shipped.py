@@ -1,0 +1,93 @@
+"""The weights that ship, as users meet them: every source and label policy, beside the town and beside real scans."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from lidar_synth import MixedScans, RollingBank, SemanticKITTI, Source, Town, load_generator
+from lidar_synth.bank import Bank
+from lidar_synth.bank.encoding import Encoding
+from lidar_synth.classes import IGNORE
+from lidar_synth.cli.bake import bake
+from lidar_synth.generator import Generator
+from lidar_synth.labels import POLICIES
+from lidar_synth.mixing import Generated
+from lidar_synth.projection import project
+from lidar_synth.scan import SYNTHETIC, Scan
+
+SCANS = 3
+FIELDS = ("reflectance", "label", "confidence")
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def generator() -> Generator:
+    return load_generator("town")
+
+
+@pytest.fixture(scope="module")
+def sources(generator: Generator, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+    """The same scans from everywhere."""
+    folder = tmp_path_factory.mktemp("shipped") / "bank"
+    bake(folder, count=SCANS, model="town", seed=0)
+    with RollingBank("town", seed=0, slots=SCANS, threads=1) as rolling:
+        held = generator.scans(0, range(SCANS))
+        yield {"generator": Generated(generator, seed=0), "bank": Bank(folder), "rolling": rolling, "list": held}
+
+
+@pytest.fixture(scope="module", params=["the town", "SemanticKITTI"])
+def real(request: pytest.FixtureRequest) -> Source:
+    if request.param == "the town":
+        return [Town(5, scans=SCANS)[i] for i in range(SCANS)]
+    root = os.environ.get("LIDAR_SYNTH_REAL_SCANS")
+    if not root:
+        pytest.skip("LIDAR_SYNTH_REAL_SCANS is not set")
+    source = SemanticKITTI(Path(root) / "semantic_kitti", split="train")
+    return [source[i] for i in range(SCANS)]
+
+
+def sure(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+    """A teacher for pseudo labels, sure of half of the points."""
+    return np.full(len(scan), 8, np.uint8), (np.arange(len(scan)) % 2).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["bank", "rolling", "list"])
+def test_a_scan_is_the_same_from_every_source(kind: str, sources: dict[str, Any], generator: Generator) -> None:
+    encoding = Encoding(generator.sensor, FIELDS)
+    for number in range(SCANS):
+        scan = sources[kind][number]
+        assert scan.domain == SYNTHETIC
+        index = int(scan.id.split("/")[-1])
+        given = encoding.encode(project(scan, generator.sensor, FIELDS))
+        whole = encoding.encode(generator.range_images(0, [index])[0])
+        for name, values in whole.items():
+            assert (abs(given[name].astype(int) - values.astype(int)) <= 1).mean() > 0.9999, (number, name)
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("kind", ["generator", "bank", "rolling", "list"])
+def test_every_source_and_policy_beside_real_scans(
+    kind: str, policy: str, sources: dict[str, Any], real: Source
+) -> None:
+    options = {"teacher": sure} if policy == "pseudo" else {"kind": "laser"} if policy == "mix" else {}
+    train = MixedScans(real, sources[kind], 0.5, labels=policy, label_options=options, unlabelled="allow")
+    seen = {0: 0, 1: 0}
+    for batch in DataLoader(train, 3, collate_fn=train.collate):
+        for i, domain in enumerate(batch["domain"].tolist()):
+            seen[domain] += 1
+            label = batch["label"][batch["offsets"][i] : batch["offsets"][i + 1]]
+            known = (label != IGNORE).float().mean()
+            if domain and policy in ("none", "ignore"):
+                assert known == 0
+            elif domain and policy == "pseudo":
+                assert set(torch.unique(label).tolist()) == {8, IGNORE}
+            else:
+                assert known > 0.5
+    assert seen == {0: SCANS, 1: SCANS}
