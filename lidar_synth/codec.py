@@ -5,7 +5,7 @@ Everything after the codec (path, solver, selection, distillation, sampling) is 
 """
 
 from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import ClassVar, Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -15,17 +15,21 @@ from lidar_synth.normalize import CHANNELS, TensorFormat
 
 
 class Codec(Protocol):
-    """``shape`` is that of a state, (channels, rows, columns); ``decode`` takes back what ``encode`` did."""
+    """``shape`` is that of a state, (channels, rows, columns); ``draws``, how many random numbers a cell of an image
+    takes; ``decode`` takes back what ``encode`` did."""
 
     @property
     def shape(self) -> tuple[int, int, int]: ...
+
+    @property
+    def draws(self) -> int: ...
 
     def encode(self, x: Tensor) -> Tensor:
         """Tensors (B, C, H, W) to states (B, *shape)."""
         ...
 
-    def decode(self, y: Tensor) -> Tensor:
-        """States (B, *shape) to tensors (B, C, H, W)."""
+    def decode(self, y: Tensor, chance: Tensor | None = None) -> Tensor:
+        """States (B, *shape) to tensors (B, C, H, W), drawn by (B, draws, H, W) numbers in (0, 1), or the likeliest."""
         ...
 
 
@@ -36,17 +40,19 @@ class Autoencoder(Protocol):
         channels: of its images.
         resolution: rows and columns of its images.
         latent_shape: channels, rows and columns of its latents.
+        draws: random numbers that a cell of an image takes; 0 where a latent stands for one image.
     """
 
     channels: int
     resolution: tuple[int, int]
     latent_shape: tuple[int, int, int]
+    draws: int
 
     def encode(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) to latents of about mean 0 and variance 1."""
         ...
 
-    def decode(self, z: Tensor) -> Tensor:
+    def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
         """Latents to images; label bits as logits."""
         ...
 
@@ -60,12 +66,13 @@ class Identity:
     """
 
     shape: tuple[int, int, int]
+    draws: ClassVar[int] = 0
 
     def encode(self, x: Tensor) -> Tensor:
         """(B, C, H, W), as it is."""
         return x
 
-    def decode(self, y: Tensor) -> Tensor:
+    def decode(self, y: Tensor, chance: Tensor | None = None) -> Tensor:
         """(B, C, H, W), as it is."""
         return y
 
@@ -87,21 +94,27 @@ class Latent:
         """Channels, rows and columns of a latent."""
         return self.network.latent_shape
 
+    @property
+    def draws(self) -> int:
+        """Random numbers per cell."""
+        return self.network.draws
+
     @torch.no_grad()
     def encode(self, x: Tensor) -> Tensor:
         """Tensors (B, C, H, W) to latents before the codebook, float32, mean 0 and variance 1 per channel."""
         return self.network.encode(x).float()
 
     @torch.no_grad()
-    def decode(self, y: Tensor) -> Tensor:
-        """Latents (B, *shape), through the codebook, to tensors (B, C, H, W).
+    def decode(self, y: Tensor, chance: Tensor | None = None) -> Tensor:
+        """Latents (B, *shape), through the codebook, to tensors (B, C, H, W), drawn by ``chance`` (B, draws, H, W) or
+        the likeliest.
 
         Raises:
             DataError: on latents of another shape.
         """
         if y.shape[1:] != self.shape:
             raise DataError(f"a latent of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, self.shape))})")
-        return expected(self.network.decode(y).float(), self.tensors)
+        return expected(self.network.decode(y, chance).float(), self.tensors)
 
 
 def expected(output: Tensor, tensors: TensorFormat) -> Tensor:

@@ -21,7 +21,7 @@ from lidar_synth.codec import Codec, make_codec
 from lidar_synth.conditions import CONDITIONS, Conditioned, batch_of, blank
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow import Velocity, guided
-from lidar_synth.noise import gaussian
+from lidar_synth.noise import gaussian, uniform
 from lidar_synth.normalize import TensorFormat
 from lidar_synth.projection import unproject
 from lidar_synth.scan import SYNTHETIC, RangeImage, Scan
@@ -171,13 +171,15 @@ class Generator:
     ) -> Iterator[Tensor]:
         _refuse_worker(self.device)
         codec = self.codec
+        drawn = (codec.draws, *self.sensor.shape)
         grid = self.header.time_grid if steps is None else uniform_grid(steps)
         for first in range(0, len(indices), self.batch):
             part = slice(first, first + self.batch)
             noise = gaussian(seed, indices[part], codec.shape, self.device)
+            chance = uniform(seed, indices[part], drawn, self.device) if codec.draws else None
             with torch.inference_mode():
                 velocity, cond = self._flow(None if condition is None else condition[part], guidance)
-                yield codec.decode(solve(velocity, noise, grid, solver, cond))
+                yield codec.decode(solve(velocity, noise, grid, solver, cond), chance)
 
     def _flow(self, condition: Tensor | None, guidance: float) -> tuple[Velocity, Tensor | None]:
         """The flow to solve and what to give it: a condition is encoded once, not at every step."""

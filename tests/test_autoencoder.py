@@ -7,13 +7,14 @@ import pytest
 import torch
 from conftest import random_scan
 from torch import Tensor
+from torch.distributions import Laplace
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.codec import make_codec
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow import METRICS
 from lidar_synth.nets import build_network
-from lidar_synth.nets.autoencoder import Autoencoder
+from lidar_synth.nets.autoencoder import ROUGHNESS, Autoencoder
 from lidar_synth.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.projection import project
 from lidar_synth.sensor import Sensor
@@ -71,7 +72,7 @@ def test_what_leaves_the_codec_is_what_was_said() -> None:
     seen = fields["range"] > 0
     assert not seen[(said.returned <= 0)[:, 0]].any()
     assert seen.any() and not seen.all()
-    metres = TENSORS.normalisation.decode(said.values[:, 0])
+    metres = TENSORS.normalisation.decode(said.surfaces.likeliest()[:, 0])
     assert torch.allclose(fields["range"][seen], metres[seen], rtol=1e-4)
     likely, code = said.classes.softmax(1).max(1)
     expected = torch.where(code == 19, IGNORE, code)
@@ -79,19 +80,44 @@ def test_what_leaves_the_codec_is_what_was_said() -> None:
     assert torch.allclose(fields["confidence"][seen], likely[seen].clamp(max=0.9999), atol=1e-4)
 
 
+def test_chance_draws_what_was_said() -> None:
+    """Over many draws: as many returns as the logit says, the medians and the spreads that were said."""
+    net = network()
+    z = torch.randn(1, *net.latent_shape)
+    said = net.expand(z)
+    draws = 4000
+    generator = torch.Generator().manual_seed(0)
+    chance = torch.rand(draws, net.draws, *SENSOR.shape, generator=generator).clamp(1e-6, 1 - 1e-6)
+    with torch.inference_mode():
+        images = torch.cat([net.decode(z.expand(len(part), -1, -1, -1), part) for part in chance.split(500)])
+    back = images[:, 0] > -1
+    share = torch.sigmoid(said.returned[0, 0])
+    assert (back.float().mean(0) - share).abs().max() < 5 * 0.5 / draws**0.5
+    assert (images[:, 1].median(0).values - said.values[0, 0]).abs().max() < 0.1 * said.spreads[0, 0].exp().max()
+    scale = (images[:, 1] - said.values[0, 0]).abs().mean(0)
+    assert torch.allclose(scale, said.spreads[0, 0].exp(), rtol=0.1)
+    off = torch.where(back, (images[:, 0] - said.surfaces.likeliest()[0, 0]).abs(), torch.nan).nanmean(0)
+    assert torch.allclose(off[share > 0.3], torch.tensor(ROUGHNESS), rtol=0.25)
+    same = net.decode(z)[:, 2:].expand(draws, -1, -1, -1)
+    assert torch.allclose(images[:, 2:], same, atol=1e-3), "labels are not drawn"
+
+
 def test_the_loss_by_hand() -> None:
     net, x = network(), tensors()
-    trained = Autoencoding(net, TENSORS, SENSOR, Losses(noise=0.0), METRICS["l1"], {"range": 5.0, "label": 2.0}).eval()
+    weights = {"range": 5.0, "reflectance": 0.5, "label": 2.0}
+    trained = Autoencoding(net, TENSORS, SENSOR, Losses(noise=0.0), METRICS["l1"], weights).eval()
     said = net.expand(net.squeeze(x))
     images = [project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS]
     mask = torch.from_numpy(np.stack([image.mask for image in images]))
     label = torch.from_numpy(np.stack([image.channels["label"] for image in images]).astype(np.int64))
     label = torch.where(label == IGNORE, 19, label)
-    values = (said.values - x[:, :2]).abs()
+    share = said.surfaces.chosen.softmax(1)
+    ranges = Laplace(said.surfaces.values, said.surfaces.spreads.exp()).log_prob(x[:, :1]).exp()
+    others = Laplace(said.values, said.spreads.exp()).log_prob(x[:, 1:2])
     by_hand = (
         torch.nn.functional.binary_cross_entropy_with_logits(said.returned[:, 0], mask.float())
-        + 5 * values[:, 0][mask].mean()
-        + values[:, 1][mask].mean()
+        - 5 * (share * ranges).sum(1).log()[mask].mean()
+        - 0.5 * others[:, 0][mask].mean()
         + 2 * torch.nn.functional.cross_entropy(said.classes, label)
     )
     assert trained(x).item() == pytest.approx(by_hand.item(), rel=1e-5)
@@ -111,7 +137,7 @@ def test_it_learns_scans_and_its_latents_have_variance_one() -> None:
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-    assert losses[-1] < 0.6 * losses[0]
+    assert losses[-1] < losses[0] - 1
     z = net.eval().encode(x)
     assert abs(z.mean().item()) < 0.3 and 0.7 < z.std().item() < 1.5
 
@@ -125,6 +151,7 @@ def test_it_learns_scans_and_its_latents_have_variance_one() -> None:
         {"codes": 40},
         {"channels": 5},
         {"depth": 1},
+        {"normalisation": "metres"},
     ],
 )
 def test_values_that_do_not_fit_together_are_refused(wrong: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ import yaml
 from accelerate.state import AcceleratorState
 from conftest import random_scan
 from PIL import Image
+from torch import nn
 from typer.testing import CliRunner
 
 from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint, read_header
@@ -181,6 +182,19 @@ def test_runs_go_on_as_if_nothing_had_happened(scans: Path, codec: Path, tmp_pat
             assert all(torch.equal(value, other[key]) for key, value in network.state_dict().items()), (name, part)
 
 
+class Fixed(nn.Module):
+    """An autoencoder that takes every latent for zero: what differs in its images was left to chance."""
+
+    def __init__(self, network: Any) -> None:
+        super().__init__()
+        self.network = network
+        self.channels, self.resolution, self.draws = network.channels, network.resolution, network.draws
+        self.latent_shape = network.latent_shape
+
+    def decode(self, z: torch.Tensor, chance: torch.Tensor) -> Any:
+        return self.network.decode(torch.zeros_like(z), chance)
+
+
 def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(scans: Path, tmp_path: Path) -> None:
     network = {"architecture": "autoencoder", "arguments": {"widths": [8, 8], "depth": 2, "fine": 8}}
     call("train", write_config(scans, tmp_path, "codec", network=network, samples={"every": 8, "count": 2}))
@@ -189,8 +203,15 @@ def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(scans: Pat
     data = {"latents": True, "cache": str(tmp_path / "cache")}
     call("train", write_config(scans, tmp_path, "teacher", data=data, **values))
     assert [p.name[:8] for p in (tmp_path / "cache").glob("latents*")] == ["latents-"]
-    [scan] = load_generator(tmp_path / "teacher" / "teacher.safetensors").scans(0, [3])
+    generator = load_generator(tmp_path / "teacher" / "teacher.safetensors")
+    [scan] = generator.scans(0, [3])
     assert len(scan) and scan.label is not None and scan.confidence is not None
+    # What the autoencoder leaves to chance is a function of seed and index too.
+    among = generator.range_images(0, [2, 3])[1]
+    assert np.array_equal(generator.range_images(0, [3])[0].mask, among.mask)
+    middle = replace(generator, autoencoder=Fixed(generator.autoencoder))
+    same = middle.range_images(0, [3, 4, 3])
+    assert np.array_equal(same[0].mask, same[2].mask) and not np.array_equal(same[0].mask, same[1].mask)
 
 
 def test_fine_tuning_a_latent_model(scans: Path, teacher: Path, codec: Path, tmp_path: Path) -> None:
@@ -208,6 +229,17 @@ def test_fine_tuning_a_latent_model(scans: Path, teacher: Path, codec: Path, tmp
             assert torch.allclose(a, b, atol=1e-6)
     with pytest.raises(ConfigError, match="expected a checkpoint of the same kind"):
         call("train", config, f"init={codec}", f"output={tmp_path / 'other'}")
+
+
+def test_a_network_that_takes_its_condition_among_its_channels_is_no_start(
+    scans: Path, codec: Path, tmp_path: Path
+) -> None:
+    call("train", write_config(scans, tmp_path, "blind", network=UNET, codec=str(codec), recipe={"iterations": 1}))
+    config = write_config(scans, tmp_path, "looking", condition=SEMANTIC, codec=str(codec))
+    values = {key: value for key, value in yaml.safe_load(config.read_text()).items() if key != "codec"}
+    config.write_text(yaml.safe_dump(values | {"init": str(tmp_path / "blind" / "blind.safetensors")}))
+    with pytest.raises(ConfigError, match="a condition for init .* a unet; expected init: a model of this condition"):
+        call("train", config)
 
 
 def test_a_pixel_model_of_label_maps(scans: Path, tmp_path: Path) -> None:
@@ -231,8 +263,21 @@ def test_a_latent_transformer(scans: Path, codec: Path, tmp_path: Path) -> None:
         "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2], "patch": [1, 1], "window": [3, 3],
     }}  # fmt: skip
     call("train", write_config(scans, tmp_path, "latent", network=network, codec=str(codec), steps=3))
-    [scan] = load_generator(tmp_path / "latent" / "latent.safetensors").scans(0, [0])
-    assert scan.label is not None
+    start = tmp_path / "latent" / "latent.safetensors"
+    [image] = load_generator(start).range_images(0, [0])
+    assert "label" in image.channels
+
+    # The start of a conditional model: until it has learnt to look, it generates what it did.
+    config = write_config(scans, tmp_path, "looking", condition=SEMANTIC, init=str(start), recipe={"rate": 1e-9})
+    values = yaml.safe_load(config.read_text())
+    config.write_text(yaml.safe_dump({k: v for k, v in values.items() if k not in ("sensor", "channels")}))
+    call("train", config)
+    looking = load_generator(tmp_path / "looking" / "looking.safetensors")
+    [same] = looking.range_images(0, [0], condition=random_scan(SENSOR, 400, 1), steps=50)
+    [before] = load_generator(start).range_images(0, [0], steps=50)
+    assert np.allclose(same.range, before.range, rtol=1e-3)
+    assert looking.condition == "semantic" and looking.header.conditioning["semantic"] == {"dropout": 0.2}
+    assert looking.header.provenance["init"] == load_checkpoint(start).hash
 
 
 @pytest.fixture(scope="module")

@@ -74,6 +74,8 @@ class TrainConfig(Run):
         if self.condition is not None:
             parts[ENCODER] = encoder = self.condition.part(resolution, state[1:])
             given[CONDITIONS[self.condition.kind].argument] = getattr(_checked(encoder), "channels", None)
+        if self.network.architecture == "autoencoder":
+            given["normalisation"] = self.normalisation
         if twice := sorted(set(given) & set(self.network.arguments)):
             raise ConfigError(f"network.arguments with {twice}", "no such keys: they follow from what the states are")
         part = Part(self.network.architecture, given | self.network.arguments)

@@ -4,6 +4,10 @@ An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 8) in (-1, 1), the
 Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024). In place of a codebook, the latent is bounded and
 the decoder is trained on latents with noise, so that it forgives what a flow leaves. Every norm is over the channels
 of one cell: a crop in training and the whole turn in use give the same.
+
+What a sensor leaves to chance (whether a ray returns, the speckle of a reflectance) no latent can hold. The decoder
+therefore says distributions, and an image is drawn from them: what it would be on average is smoother than any scan,
+and a network that is trained on such images takes the noise of real ones for something that it has never seen.
 """
 
 from collections.abc import Sequence
@@ -17,6 +21,8 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.nets.codebook import follow
 from lidar_synth.nets.convolution import check_shape, pair, reduced
 from lidar_synth.nets.layers import EPS
+from lidar_synth.nets.surfaces import Planes, Surfaces, laplace
+from lidar_synth.normalize import NORMALISATIONS
 
 DETAIL = (2, 4)
 """Rows and columns of the patches that the outer convolutions see."""
@@ -24,16 +30,28 @@ DOWN = (4, 8)
 """Rows and columns of one latent cell."""
 
 
+PLANES = 2
+"""Surfaces of a patch that a cell may see: one, and what is behind its edge."""
+SPREADS = -4.6, 0.0
+"""Limits of the logarithms of other values' spreads."""
+ROUGHNESS = 5e-4
+"""Scale of the noise of drawn ranges, normalised: 1.3 cm at 10 m in R2Flow's scale."""
+
+
 class Heads(NamedTuple):
     """What the decoder says of every cell.
 
     Args:
-        values: (B, V, H, W) channels as of the image; the range as if every cell had a return.
+        surfaces: what it may see, as if every cell had a return.
+        values: (B, V, H, W) medians of the other values, such as the reflectance.
+        spreads: (B, V, H, W) logarithms of their spreads.
         returned: (B, 1, H, W) logit of a return.
         classes: (B, K, H, W) logits of the label's codes; K = 0 without labels.
     """
 
+    surfaces: Surfaces
     values: Tensor
+    spreads: Tensor
     returned: Tensor
     classes: Tensor
 
@@ -80,6 +98,7 @@ class Autoencoder(nn.Module):
         widths: channels on patches of 2 x 4 cells and of 4 x 8.
         depth: residual blocks of the decoder on the coarser grid; one less after it, one less on it in the encoder.
         fine: channels of the decoder's last map, on single cells.
+        normalisation: a name of ``NORMALISATIONS``, that of the range.
 
     Raises:
         ConfigError: on values that do not fit together.
@@ -98,6 +117,7 @@ class Autoencoder(nn.Module):
         widths: Sequence[int] = (48, 96),
         depth: int = 3,
         fine: int = 24,
+        normalisation: str = "r2flow",
     ) -> None:
         super().__init__()
         self.resolution = pair(resolution)
@@ -107,8 +127,12 @@ class Autoencoder(nn.Module):
                 f"{channels} channels, {codes} codes in {bits} bits, depth {depth}",
                 "a range beside the bits, as many bits as the codes need (0 for 0), and depth >= 2",
             )
+        if normalisation not in NORMALISATIONS:
+            raise ConfigError(f"normalisation {normalisation!r}", f"one of {', '.join(NORMALISATIONS)}")
         outer, inner = widths
-        self.channels, self.values, self.bits, self.fine = channels, channels - bits, bits, fine
+        self.channels, self.values, self.bits, self.fine = channels, channels - bits - 1, bits, fine
+        self.draws = 2 + self.values
+        """Random numbers that an image takes per cell."""
         self.latent_shape = (latent_channels, *reduced(self.resolution, [DOWN], "an image"))
         """Channels, rows and columns of a latent."""
         # What lies where is known by row: on a road, a beam's elevation gives its range.
@@ -127,7 +151,9 @@ class Autoencoder(nn.Module):
         self.decode_outer = nn.Sequential(*(Residual(outer) for _ in range(depth - 1)))
         self.spread = nn.Conv2d(outer, DETAIL[0] * DETAIL[1] * fine, 1)
         self.refine = CircularConv(fine)
-        self.heads = nn.Conv2d(fine, self.values + 1 + codes, 1)
+        self.planes = Planes(outer, DETAIL, PLANES, NORMALISATIONS[normalisation])
+        self.sizes = [PLANES, self.values, self.values, 1, codes]
+        self.heads = nn.Conv2d(fine, sum(self.sizes), 1)
         # Latents leave with mean 0 and variance 1 per channel, as a flow from standard normal noise likes them.
         self.register_buffer("shift", torch.zeros(latent_channels))
         self.register_buffer("scale", torch.ones(latent_channels))
@@ -145,17 +171,29 @@ class Autoencoder(nn.Module):
         per channel."""
         return (self.squeeze(x) - _channel(self.shift)) / _channel(self.scale)
 
-    def decode(self, z: Tensor) -> Tensor:
-        """Latents (B, *latent_shape) to images (B, C, H, W): the range -1 where there is no return; the bits as logits
-        of the likeliest code, which are as far from 0 as this one is likely."""
+    def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
+        """Latents to images.
+
+        Args:
+            z: (B, *latent_shape).
+            chance: (B, draws, H, W) random numbers in (0, 1) to draw an image by; None = the likeliest of everything.
+
+        Returns:
+            (B, C, H, W): the range -1 where there is no return; the bits as logits of the likeliest code, which are as
+            far from 0 as this one is likely.
+        """
         check_shape(z, self.latent_shape, "a latent")
         said = self.expand(z * _channel(self.scale) + _channel(self.shift))
-        distance = torch.where(said.returned > 0, said.values[:, :1], -1.0)
-        if not self.bits:
-            return torch.cat([distance, said.values[:, 1:]], 1)
-        likely, code = said.classes.float().softmax(1).max(1)
-        bits = self._corners(code) * (2 * torch.atanh(likely.clamp(max=0.9999)))[:, None]
-        return torch.cat([distance, said.values[:, 1:], bits.to(distance.dtype)], 1)
+        distance, values, returned = said.surfaces.likeliest(), said.values, said.returned.float()
+        if chance is not None:
+            distance = distance + ROUGHNESS * laplace(chance[:, :1])
+            values = values + said.spreads.exp() * laplace(chance[:, 1:-1])
+            returned = returned + torch.logit(chance[:, -1:])
+        parts = [torch.where(returned > 0, distance, -1.0), values]
+        if self.bits:
+            likely, code = said.classes.float().softmax(1).max(1)
+            parts += [self._corners(code) * (2 * torch.atanh(likely.clamp(max=0.9999)))[:, None]]
+        return torch.cat(parts, 1)
 
     def squeeze(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) to bounded latents in (-1, 1), float32."""
@@ -171,9 +209,10 @@ class Autoencoder(nn.Module):
         z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
         h = self.decode_inner(self.from_latent(z) + self.place_latent)
         h = self.decode_outer(F.pixel_shuffle(self.split(h), 2) + self.place_outer)
+        ranges, doubts = self.planes(h)
         h = _unpatch(self.spread(h), self.fine) + self.place_fine
-        said = self.heads(h + F.silu(self.refine(h)))
-        return Heads(*said.split([self.values, 1, said.shape[1] - self.values - 1], 1))
+        chosen, values, spreads, *rest = self.heads(h + F.silu(self.refine(h))).split(self.sizes, 1)
+        return Heads(Surfaces(ranges, doubts, chosen.float()), values.float(), spreads.float().clamp(*SPREADS), *rest)
 
     def _corners(self, code: Tensor) -> Tensor:
         """Codes (B, H, W) as their bits (B, bits, H, W), -1 and 1, highest first."""

@@ -115,6 +115,7 @@ class VQVAE(nn.Module):
                 f"codebook {codebook!r}, multipliers {tuple(multipliers)} and strides {steps}",
                 f"one of {', '.join(CODEBOOKS)}, one multiplier more than strides, strides of {tuple(_STEPS)}",
             )
+        self.draws = 0
         self.latent_shape = (latent_channels, *reduced(self.resolution, [self.patch, *steps], "an image"))
         """Channels, rows and columns of a latent."""
         self.gradient_checkpointing = False
@@ -133,8 +134,8 @@ class VQVAE(nn.Module):
         """Images (B, C, H, W) to latents before the codebook, (B, *latent_shape), mean 0 and variance 1 per channel."""
         return (self._encode(x) - _channel(self.shift)) / _channel(self.scale)
 
-    def decode(self, z: Tensor) -> Tensor:
-        """Latents (B, *latent_shape), moved to their codes, to images (B, C, H, W)."""
+    def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
+        """Latents (B, *latent_shape), moved to their codes, to images (B, C, H, W); nothing is left to ``chance``."""
         check_shape(z, self.latent_shape, "a latent")
         z = z.to(self.to_latent.weight.dtype) * _channel(self.scale) + _channel(self.shift)
         return self._decode(self.codebook(z)[0])

@@ -12,8 +12,8 @@ It runs in the same loop as everything else: one network, one optimiser, one los
                      autoencoder's term goes through the discriminator as it stands, the discriminator's own looks at
                      detached reconstructions
 
-The architecture "autoencoder" says of every cell whether there is a return and how likely each class is. Its loss is
-that of these: l1 of the values where there is a return, cross-entropies of return and class.
+The architecture "autoencoder" says distributions. Its loss is how unlikely the scan is under them: the range and other
+values where there is a return, the return itself, the class.
 """
 
 import math
@@ -29,6 +29,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.flow import Example, Metric
 from lidar_synth.nets.autoencoder import Autoencoder, Heads
 from lidar_synth.nets.convolution import Norm, WrapConv
+from lidar_synth.nets.surfaces import log_laplace
 from lidar_synth.nets.vqvae import VQVAE, Encoding
 from lidar_synth.normalize import CHANNELS, TensorFormat
 from lidar_synth.scan import RangeImage
@@ -130,15 +131,17 @@ class Autoencoding(nn.Module):
 
     def _told(self, heads: Heads, x: Tensor) -> Tensor:
         """The loss of what an ``Autoencoder`` says, a scalar."""
-        returned = (x[:, :1] > -1).float()
-        error = (heads.values.float() - x[:, : heads.values.shape[1]]).abs() * returned
+        count = 1 + heads.values.shape[1]
+        distance, values, bits = x[:, :1], x[:, 1:count], x[:, count:]
+        returned = (distance > -1).float()
+        surprise = [heads.surfaces.surprise(distance), -log_laplace(values, heads.values, heads.spreads)]
         loss = F.binary_cross_entropy_with_logits(heads.returned.float(), returned)
-        names = [name for name in self.tensors.channels if name != "label"]
-        for name, part in zip(names, error.sum((0, 2, 3)) / returned.sum().clamp(min=1), strict=True):
-            loss = loss + self.weights.get(name, 1.0) * part
+        means = (torch.cat(surprise, 1) * returned).sum((0, 2, 3)) / returned.sum().clamp(min=1)
+        for name, mean in zip(self.tensors.channels, means, strict=False):  # the label has no mean
+            loss = loss + self.weights.get(name, 1.0) * mean
         if heads.classes.shape[1]:
             code = torch.zeros_like(x[:, 0], dtype=torch.long)
-            for bit in x[:, heads.values.shape[1] :].unbind(1):
+            for bit in bits.unbind(1):
                 code = 2 * code + (bit > 0)
             loss = loss + self.weights.get("label", 1.0) * F.cross_entropy(heads.classes.float(), code)
         return loss
