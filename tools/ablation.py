@@ -58,12 +58,12 @@ def main() -> None:
 
     judge, reference = load_judge(), town(REFERENCE, given.count)
     lines = [
-        row(f"teacher, {steps} steps", reference, generate(str(given.teacher), steps, given.count), judge)
+        row(f"teacher, {steps} steps", reference, generate(str(given.teacher), steps, reference), judge)
         for steps in (50, 4)
     ]
     for strategy in STRATEGIES:
         path, what = student(strategy, given.teacher, given.work, given.evaluations, given.overrides)
-        scans = generate(str(path), None, given.count)
+        scans = generate(str(path), None, reference)
         lines.append(row(f"{strategy}, 4 steps ({what})", reference, scans, judge))
     print(f"{given.evaluations} evaluations for each strategy, {given.count} scans\n\n{header(reference, judge)}")
     print("\n".join(lines))

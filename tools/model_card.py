@@ -7,19 +7,26 @@
 
 Every model makes scans from the same noise. They stand beside scans of a town that no model was trained on (seed 1);
 the first row is a third town (seed 2), which is as near as different streets of one kind come.
+
+A model of label maps gets the maps of these scans. Its last column then compares what the segmenter sees with the map,
+and a second row does so with the map of another scan: what the condition does is the difference. Its sheet shows each
+scan beside the one that its map is from.
 """
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from lidar_synth.classes import IGNORE
 from lidar_synth.generator import load_generator
 from lidar_synth.metrics import evaluate
 from lidar_synth.metrics.segmentation import Judge, load_judge, mean_iou
+from lidar_synth.projection import project, unproject
 from lidar_synth.scan import Scan, Source
 from lidar_synth.town import Town
 from lidar_synth.viz import write_view
@@ -31,10 +38,22 @@ SEED = 1
 TILES = 16
 
 
-def generate(model: str, steps: int | None, count: int) -> list[Scan]:
-    """Scans of one model."""
+def generate(model: str, steps: int | None, reference: Sequence[Scan]) -> list[Scan]:
+    """Scans of one model, one for each of the town's; labelled by the maps of these if it is a model of maps."""
     generator = load_generator(model)
-    return [generator.scans(SEED, [i], steps=steps)[0] for i in tqdm(range(count), desc=Path(model).stem, unit="scan")]
+    made = []
+    for i, real in enumerate(tqdm(reference, desc=Path(model).stem, unit="scan")):
+        asked = real if generator.condition else None
+        [scan] = generator.scans(SEED, [i], condition=asked, steps=steps)
+        made.append(scan if asked is None else relabelled(scan, asked))
+    return made
+
+
+def relabelled(scan: Scan, other: Scan) -> Scan:
+    """A scan on the grid, each return with the label that another one has in its cell."""
+    image, labels = project(scan, scan.sensor), project(other, scan.sensor, ["label"]).channels["label"]
+    image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(np.uint8)
+    return replace(unproject(image), id=scan.id, domain=scan.domain)
 
 
 def town(seed: int, count: int) -> list[Scan]:
@@ -84,11 +103,21 @@ def main() -> None:
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
-        scans = generate(model, int(steps) if steps else None, given.count)
+        scans = generate(model, int(steps) if steps else None, reference)
         lines.append(row(name, reference, scans, judge))
+        conditional = load_generator(model).condition
+        if conditional:
+            turned = [relabelled(scan, reference[k - given.count // 2]) for k, scan in enumerate(scans)]
+            lines.append(row(f"{name}, with the map of another scan", reference, turned, judge))
         if i == 0 and given.pictures:
-            picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans that were not chosen")
             apart = np.linspace(0, given.count - 1, TILES).astype(int)
+            if conditional:
+                pairs = [scan for k in apart[: TILES // 2] for scan in (reference[k], scans[k])]
+                picture(
+                    given.pictures / "semantic.png", pairs, f"{name}: the scan whose labels were given, and what came"
+                )
+                continue
+            picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans that were not chosen")
             picture(given.pictures / "town.png", [reference[k] for k in apart], f"{TILES} scans of the town")
     print(f"{given.count} scans a row, {given.count} of the town\n\n{header(reference, judge)}")
     print("\n".join(lines))

@@ -9,17 +9,14 @@ everything else. With --busy processor time is counted in place of the clock's, 
 
 import argparse
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from timing import print_table, time_in_turns
 from torch import nn
 
+from lidar_synth.generator import load_generator
 from lidar_synth.nets import assemble, build_network
-
-CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def network(architecture: str, **arguments: Any) -> Any:
@@ -27,12 +24,6 @@ def network(architecture: str, **arguments: Any) -> Any:
     torch.manual_seed(0)
     fresh: nn.Module = build_network(architecture, arguments)
     return assemble(architecture, arguments, fresh.state_dict(), architecture)
-
-
-def small(name: str) -> dict[str, Any]:
-    """The arguments of a configuration's network."""
-    arguments: dict[str, Any] = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())["network"]["arguments"]
-    return arguments
 
 
 def main() -> None:
@@ -44,21 +35,18 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     full, codec = network("unet", resolution=(16, 128)), network("vqvae", resolution=(64, 1024))
-    town = network("autoencoder", resolution=(64, 1024), channels=7, **small("town_codec"))
-    town_flow = network(
-        "unet", resolution=town.latent_shape[1:], channels=town.latent_shape[0], condition_channels=32,
-        **small("town_semantic_teacher"),
-    )  # fmt: skip
+    shipped = load_generator("town-semantic")
+    town, town_flow = shipped.autoencoder, shipped.network.velocity
     a = torch.randn(4096, 4096)
     image, latent = torch.randn(1, 1, 64, 1024), torch.randn(1, 8, 16, 128)
     town_image, town_latent = torch.randn(1, 7, 64, 1024), torch.randn(1, *town.latent_shape)
-    maps = torch.randn(1, 32, *town.latent_shape[1:])
+    maps = torch.randn(1, 16, *town.latent_shape[1:])
     calls = {
         "product of 4096 x 4096 (137 GFLOP)": lambda: a @ a,
         "LiDM's U-Net, one evaluation": lambda: full(latent, 0.5),
         "LiDM's autoencoder, encode": lambda: codec.encode(image),
         "LiDM's autoencoder, decode": lambda: codec.decode(latent),
-        "town's U-Net, one evaluation": lambda: town_flow(town_latent, 0.5, maps),
+        "town's HDiT, one evaluation": lambda: town_flow(town_latent, 0.5, maps),
         "town's autoencoder, encode": lambda: town.encode(town_image),
         "town's autoencoder, decode": lambda: town.decode(town_latent),
     }
