@@ -6,13 +6,13 @@ with the same settings write the same bytes, and a run with other ones is refuse
 """
 
 import platform
+import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import h5py
-import isal
 import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
@@ -132,7 +132,7 @@ def make_plan(out: str | Path, job: Job) -> Plan:
     open_conditions(job.condition, job.condition_layout, job.condition_split)
     fields = _fields(job, generator.fields)
     software = {"lidar_synth": lidar_synth.__version__, "torch": torch.__version__, "numpy": np.__version__,
-                "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "isal": isal.__version__,
+                "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "zlib": zlib.ZLIB_RUNTIME_VERSION,
                 "machine": platform.machine()}  # fmt: skip
     model = Path(job.model)
     settled = job.model_copy(
