@@ -28,8 +28,6 @@ DETAIL = (2, 4)
 """Rows and columns of the patches that the outer convolutions see."""
 DOWN = (4, 8)
 """Rows and columns of one latent cell."""
-
-
 PLANES = 2
 """Surfaces of a patch that a cell may see: one, and what is behind its edge."""
 SPREADS = -4.6, 0.0
