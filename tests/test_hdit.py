@@ -149,6 +149,21 @@ def test_conditions_are_further_channels() -> None:
         network()(y, 0.5, cond)
 
 
+@torch.no_grad()
+def test_tokens_of_a_condition_are_attended_to() -> None:
+    net = network(context_channels=5)
+    y, cond = torch.randn(2, 2, 8, 64), torch.randn(2, 7, 5)
+    v = net(y, 0.5, cond)
+    assert v.shape == y.shape
+    torch.testing.assert_close(net(y, 0.5, cond[:, torch.randperm(7)]), v, rtol=1e-4, atol=1e-4)  # they have no order
+    other = net(y, 0.5, torch.stack([cond[0], -cond[1]]))
+    torch.testing.assert_close(other[0], v[0], rtol=1e-5, atol=1e-5)
+    assert distance(other[1], v[1]) > 1e-3
+    for given_, found in ((None, "no condition"), (cond[..., :4], r"\(2, 7, 4\)"), (cond[:1], r"\(1, 7, 5\)")):
+        with pytest.raises(DataError, match=rf"{found}.*expected \(2, tokens, 5\)"):
+            net(y, 0.5, given_)
+
+
 def test_states_and_times_of_another_shape_are_refused() -> None:
     net = network()
     for shape in ((2, 3, 8, 64), (2, 2, 8, 32), (2, 8, 64)):

@@ -39,6 +39,13 @@ UNET = {
         "width": 16, "multipliers": [1, 2], "blocks": 1, "attention": [1], "head_channels": 8, "groups": 4,
     },
 }  # fmt: skip
+TRANSFORMER = {"architecture": "hdit", "arguments": {
+    "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2], "patch": [1, 1], "window": [3, 3],
+}}  # fmt: skip
+CAMERA = {
+    "kind": "camera", "dropout": 0.1, "view_dropout": 0.5, "image": [40, 80],
+    "arguments": {"resolution": [16, 32], "views": 2, "channels": 8, "widths": [4, 8]},
+}  # fmt: skip
 SEMANTIC = {"kind": "semantic", "arguments": {"channels": 3, "method": "patches"}, "dropout": 0.2}
 
 
@@ -244,9 +251,7 @@ def test_a_network_that_takes_its_condition_among_its_channels_is_no_start(
 
 def test_a_pixel_model_of_label_maps(scans: Path, tmp_path: Path) -> None:
     """The condition does not care for the codec."""
-    network = {"architecture": "hdit", "arguments": {
-        "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2], "patch": [2, 2], "window": [3, 3],
-    }}  # fmt: skip
+    network = TRANSFORMER | {"arguments": TRANSFORMER["arguments"] | {"patch": [2, 2]}}
     call(
         "train",
         write_config(scans, tmp_path, "pixel", network=network, condition=SEMANTIC, channels=["range"], steps=3),
@@ -255,29 +260,6 @@ def test_a_pixel_model_of_label_maps(scans: Path, tmp_path: Path) -> None:
     [scan] = generator.scans(0, [0], random_scan(SENSOR, 400, 1))
     assert generator.fields == {"label", "confidence"}
     assert scan.label is not None
-
-
-def test_a_latent_transformer(scans: Path, codec: Path, tmp_path: Path) -> None:
-    """Any velocity network lives on latents, which look where their cells look."""
-    network = {"architecture": "hdit", "arguments": {
-        "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2], "patch": [1, 1], "window": [3, 3],
-    }}  # fmt: skip
-    call("train", write_config(scans, tmp_path, "latent", network=network, codec=str(codec), steps=3))
-    start = tmp_path / "latent" / "latent.safetensors"
-    [image] = load_generator(start).range_images(0, [0])
-    assert "label" in image.channels
-
-    # The start of a conditional model: until it has learnt to look, it generates what it did.
-    config = write_config(scans, tmp_path, "looking", condition=SEMANTIC, init=str(start), recipe={"rate": 1e-9})
-    values = yaml.safe_load(config.read_text())
-    config.write_text(yaml.safe_dump({k: v for k, v in values.items() if k not in ("sensor", "channels")}))
-    call("train", config)
-    looking = load_generator(tmp_path / "looking" / "looking.safetensors")
-    [same] = looking.range_images(0, [0], condition=random_scan(SENSOR, 400, 1), steps=50)
-    [before] = load_generator(start).range_images(0, [0], steps=50)
-    assert np.allclose(same.range, before.range, rtol=1e-3)
-    assert looking.condition == "semantic" and looking.header.conditioning["semantic"] == {"dropout": 0.2}
-    assert looking.header.provenance["init"] == load_checkpoint(start).hash
 
 
 @pytest.fixture(scope="module")
@@ -292,12 +274,35 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_camera_model(scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
-    condition = {
-        "kind": "camera", "dropout": 0.1, "view_dropout": 0.5, "image": [40, 80],
-        "arguments": {"resolution": [16, 32], "views": 2, "channels": 8, "widths": [4, 8]},
-    }  # fmt: skip
-    config = write_config(scans, tmp_path, "camera", network=UNET, condition=condition, codec=str(codec), steps=3,
+@pytest.mark.parametrize("condition", [SEMANTIC, CAMERA], ids=lambda condition: condition["kind"])
+def test_a_latent_transformer(condition: dict[str, Any], scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
+    """Any velocity network lives on latents, which look where their cells look."""
+    call("train", write_config(scans, tmp_path, "latent", network=TRANSFORMER, codec=str(codec), steps=3))
+    start = tmp_path / "latent" / "latent.safetensors"
+    [image] = load_generator(start).range_images(0, [0])
+    assert "label" in image.channels
+
+    # The start of a conditional model: until it has learnt to look, it generates what it did.
+    data = {"path": str(kitti), "layout": "kitti360", "split": "all"}
+    config = write_config(
+        kitti, tmp_path, "looking", condition=condition, init=str(start), recipe={"rate": 1e-9}, data=data
+    )
+    values = yaml.safe_load(config.read_text())
+    config.write_text(yaml.safe_dump({k: v for k, v in values.items() if k not in ("sensor", "channels")}))
+    call("train", config)
+    looking = load_generator(tmp_path / "looking" / "looking.safetensors")
+    given = replace(random_scan(SENSOR, 400, 1), image_path=min(kitti.rglob("*.png")))
+    [same] = looking.range_images(0, [0], condition=given, steps=50)
+    [before] = load_generator(start).range_images(0, [0], steps=50)
+    assert np.allclose(same.range, before.range, rtol=1e-3)
+    kind = str(condition["kind"])
+    assert looking.condition == kind and looking.header.conditioning[kind]["dropout"] == condition["dropout"]
+    assert looking.header.provenance["init"] == load_checkpoint(start).hash
+
+
+@pytest.mark.parametrize("network", [UNET, TRANSFORMER], ids=lambda network: network["architecture"])
+def test_a_camera_model(network: dict[str, Any], scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
+    config = write_config(scans, tmp_path, "camera", network=network, condition=CAMERA, codec=str(codec), steps=3,
                           data={"path": str(kitti), "layout": "kitti360", "split": "all"})  # fmt: skip
     call("train", config)
     generator = load_generator(tmp_path / "camera" / "camera.safetensors")
@@ -323,9 +328,7 @@ def test_what_does_not_fit_together(scans: Path, codec: Path, teacher: Path, tmp
     refuse("one of semantic_map", condition=SEMANTIC | {"encoder": "views"})
     refuse(r"network.arguments with \['condition_channels'\]", condition=SEMANTIC,
            network={"architecture": "unet", "arguments": UNET["arguments"] | {"condition_channels": 3}})  # fmt: skip
-    refuse(
-        "unexpected keyword argument 'context_channels'", condition={"kind": "camera"}, network={"architecture": "hdit"}
-    )
+    refuse("unexpected keyword argument 'colour'", network={"architecture": "hdit", "arguments": {"colour": 1}})
     student = write_config(scans, tmp_path, "student", teacher=str(codec))
     with pytest.raises(ConfigError, match="an autoencoder; expected a model that generates"):
         call("distill", student)

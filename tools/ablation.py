@@ -54,16 +54,16 @@ def main() -> None:
     parser.add_argument("--evaluations", type=int, default=20_000, help="of the network, for each strategy")
     parser.add_argument("--count", type=int, default=256, help="scans to measure on")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
-    given = parser.parse_args()
+    given = parser.parse_intermixed_args()
 
     judge, reference = load_judge(), town(REFERENCE, given.count)
     lines = [
-        row(f"teacher, {steps} steps", reference, generate(str(given.teacher), steps, reference), judge)
+        row(f"teacher, {steps} steps", reference, generate(str(given.teacher), steps, given.count), judge)
         for steps in (50, 4)
     ]
     for strategy in STRATEGIES:
         path, what = student(strategy, given.teacher, given.work, given.evaluations, given.overrides)
-        scans = generate(str(path), None, reference)
+        scans = generate(str(path), None, given.count)
         lines.append(row(f"{strategy}, 4 steps ({what})", reference, scans, judge))
     print(f"{given.evaluations} evaluations for each strategy, {given.count} scans\n\n{header(reference, judge)}")
     print("\n".join(lines))

@@ -8,9 +8,7 @@
 Every model makes scans from the same noise. They stand beside scans of a town that no model was trained on (seed 1);
 the first row is a third town (seed 2), which is as near as different streets of one kind come.
 
-A model of label maps gets the maps of these scans. Its last column then compares what the segmenter sees with the map,
-and a second row does so with the map of another scan: what the condition does is the difference. Its sheet shows each
-scan beside the one that its map is from.
+Models with a condition have a card of their own: tools/condition_card.py.
 """
 
 import argparse
@@ -24,10 +22,10 @@ from tqdm import tqdm
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.generator import load_generator
-from lidar_synth.metrics import evaluate
+from lidar_synth.metrics import Score, evaluate
 from lidar_synth.metrics.segmentation import Judge, load_judge, mean_iou
 from lidar_synth.projection import project, unproject
-from lidar_synth.scan import Scan, Source
+from lidar_synth.scan import Scan
 from lidar_synth.town import Town
 from lidar_synth.viz import write_view
 
@@ -38,15 +36,11 @@ SEED = 1
 TILES = 16
 
 
-def generate(model: str, steps: int | None, reference: Sequence[Scan]) -> list[Scan]:
-    """Scans of one model, one for each of the town's; labelled by the maps of these if it is a model of maps."""
+def generate(model: str, steps: int | None, count: int) -> list[Scan]:
+    """Scans of one model, which all models make from the same noise."""
     generator = load_generator(model)
-    made = []
-    for i, real in enumerate(tqdm(reference, desc=Path(model).stem, unit="scan")):
-        asked = real if generator.condition else None
-        [scan] = generator.scans(SEED, [i], condition=asked, steps=steps)
-        made.append(scan if asked is None else relabelled(scan, asked))
-    return made
+    indices = tqdm(range(count), desc=Path(model).stem, unit="scan")
+    return [generator.scans(SEED, [i], steps=steps)[0] for i in indices]
 
 
 def relabelled(scan: Scan, other: Scan) -> Scan:
@@ -62,27 +56,35 @@ def town(seed: int, count: int) -> list[Scan]:
     return [source[i] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
 
 
-def row(name: str, reference: Source, scans: Sequence[Scan], judge: Judge) -> str:
+def row(name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge) -> str:
     """A line of the table."""
-    scores = evaluate(reference, scans, "town", {"the town segmenter": judge.features})
-    values = [f"{score.value:.4g}" for score in scores]
+    values = [f"{score.value:.4g}" for score in _scores(reference, scans, judge)]
     agreement = mean_iou(judge.agreement(scans)) if scans[0].label is not None else float("nan")
     return f"| {name} | {' | '.join(values)} | {100 * agreement:.1f} |"
 
 
-def header(reference: Source, judge: Judge) -> str:
+def header(reference: Sequence[Scan], judge: Judge) -> str:
     """The table's head, in the order of ``row``."""
-    names = [
-        s.metric
-        for s in evaluate(reference[:2], reference[2:4], "town", {"the town segmenter": judge.features}, progress=False)
-    ]
+    scores = _scores(reference[:2], reference[2:4], judge, progress=False)
+    names = [f"{score.metric} ({score.protocol})" for score in scores]
     return f"| scans | {' | '.join(names)} | mIoU with the town segmenter, % |\n|---|{'---:|' * (len(names) + 1)}"
+
+
+def _scores(reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge, progress: bool = True) -> list[Score]:
+    """By R2Flow's measures on the town's grid, by the segmenter's features, and by LiDM's measures."""
+    own = evaluate(reference, scans, "town", {"the town segmenter": judge.features}, progress=progress)
+    return own + evaluate(reference, scans, "lidm", progress=progress)
 
 
 def picture(path: Path, scans: Sequence[Scan], title: str) -> None:
     """A sheet of scans as a PNG of few colours: small enough for a repository."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_view(path, list(scans), title=title)
+    shrink(path)
+
+
+def shrink(path: Path) -> None:
+    """Fewer pixels and colours in a PNG."""
     image = Image.open(path).convert("RGB")
     width = 1500
     image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
@@ -103,20 +105,10 @@ def main() -> None:
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
-        scans = generate(model, int(steps) if steps else None, reference)
+        scans = generate(model, int(steps) if steps else None, given.count)
         lines.append(row(name, reference, scans, judge))
-        conditional = load_generator(model).condition
-        if conditional:
-            turned = [relabelled(scan, reference[k - given.count // 2]) for k, scan in enumerate(scans)]
-            lines.append(row(f"{name}, with the map of another scan", reference, turned, judge))
         if i == 0 and given.pictures:
             apart = np.linspace(0, given.count - 1, TILES).astype(int)
-            if conditional:
-                pairs = [scan for k in apart[: TILES // 2] for scan in (reference[k], scans[k])]
-                picture(
-                    given.pictures / "semantic.png", pairs, f"{name}: the scan whose labels were given, and what came"
-                )
-                continue
             picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans that were not chosen")
             picture(given.pictures / "town.png", [reference[k] for k in apart], f"{TILES} scans of the town")
     print(f"{given.count} scans a row, {given.count} of the town\n\n{header(reference, judge)}")

@@ -88,7 +88,7 @@ def _add_condition(
             f"a condition for init {config.init}, a {held.architecture}",
             "init: a model of this condition, or an unconditional hdit",
         ) from error
-    assert not new.unexpected_keys and all("condition" in key for key in new.missing_keys), new
+    assert not new.unexpected_keys and all("condition" in k or "context" in k for k in new.missing_keys), new
     conditioning: dict[str, Any] = {config.condition.kind: config.condition.options()}
     return networks | made, replace(header, networks=header.networks | parts, conditioning=conditioning)
 

@@ -228,3 +228,26 @@ def check_shape(x: Tensor, shape: tuple[int, ...], what: str) -> None:
     """
     if x.ndim != len(shape) + 1 or x.shape[1:] != shape:
         raise DataError(f"{what} of shape {tuple(x.shape)}", f"(B, {', '.join(map(str, shape))})")
+
+
+def check_condition(cond: Tensor | None, count: int, maps: tuple[int, int, int], tokens: int) -> None:
+    """Refuse what is not the condition that a network takes.
+
+    Args:
+        cond: what it was given.
+        count: B, of the states.
+        maps: channels, rows and columns of maps; 0 channels = it takes none.
+        tokens: channels of tokens; 0 = it takes none.
+
+    Raises:
+        DataError: naming both.
+    """
+    given = "no condition" if cond is None else f"a condition of shape {tuple(cond.shape)}"
+    if maps[0]:
+        if cond is None or cond.shape != (count, *maps):
+            raise DataError(given, str((count, *maps)))
+    elif tokens:
+        if cond is None or cond.ndim != 3 or (len(cond), cond.shape[2]) != (count, tokens):
+            raise DataError(given, f"({count}, tokens, {tokens})")
+    elif cond is not None:
+        raise DataError(given, "none: the network takes no condition")

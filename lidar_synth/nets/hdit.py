@@ -9,6 +9,9 @@ Transformers", ICML 2024::
       -> the coarsest level, attention to all tokens
       -> back up the levels, mixed with what was there on the way down
     -> velocity (B, C, H, W)
+
+A condition comes in one of two ways: maps on the grid of the state are added to the tokens (``condition_channels``),
+tokens are attended to by those of the coarsest level (``context_channels``). Both begin at 0.
 """
 
 from collections.abc import Sequence
@@ -19,6 +22,7 @@ from torch.utils.checkpoint import checkpoint
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.nets.attention import Grid, NeighbourhoodAttention
+from lidar_synth.nets.convolution import check_condition
 from lidar_synth.nets.layers import RMSNorm
 from lidar_synth.nets.positions import (
     LEARNED,
@@ -42,6 +46,7 @@ class HDiT(nn.Module):
         resolution: H, W of the image; each a multiple of the patch times 2^(levels - 1).
         channels: C of the image.
         condition_channels: channels of a condition on the same grid, set beside those of the image.
+        context_channels: channels of the tokens that are attended to; 0 = no context.
         width: channels of a token at the finest level; each further level has twice as many.
         time_width: channels of the time embedding, even.
         depths: blocks per level, finest first; those of all but the last stand again on the way up.
@@ -63,6 +68,7 @@ class HDiT(nn.Module):
         resolution: Sequence[int],
         channels: int = 2,
         condition_channels: int = 0,
+        context_channels: int = 0,
         width: int = 128,
         time_width: int = 256,
         depths: Sequence[int] = (3, 3, 3, 3),
@@ -76,7 +82,7 @@ class HDiT(nn.Module):
     ) -> None:
         super().__init__()
         self.resolution, self.patch, self.window = _pair(resolution), _pair(patch), _pair(window)
-        self.channels, self.condition_channels = channels, condition_channels
+        self.channels, self.condition_channels, self.context_channels = channels, condition_channels, context_channels
         self.grids = _grids(self.resolution, self.patch, len(depths))
         self.gradient_checkpointing = False
         """Forget what is inside the blocks and compute it again in the backward pass."""
@@ -96,17 +102,17 @@ class HDiT(nn.Module):
         self.rotary = nn.ModuleList(Rotary(g, h, w // h) for g, h, w in zip(self.grids, heads, widths, strict=True))
         self.near = nn.ModuleList(NeighbourhoodAttention(grid, self.window) for grid in self.grids[:-1])
         self.tokenize = nn.Linear(cells * channels, width, bias=False)
-        if condition_channels:  # begins at 0: the weights of an unconditional model are a start for this one
+        if condition_channels:
             self.tokenize_condition = nn.Linear(cells * condition_channels, width, bias=False)
             nn.init.zeros_(self.tokenize_condition.weight)
 
-        def blocks(i: int) -> nn.ModuleList:
-            return nn.ModuleList(Block(widths[i], time_width, heads[i], ratio) for _ in range(depths[i]))
+        def blocks(i: int, context: int = 0) -> nn.ModuleList:
+            return nn.ModuleList(Block(widths[i], time_width, heads[i], ratio, context) for _ in range(depths[i]))
 
         upper = range(len(depths) - 1)
         self.down = nn.ModuleList(blocks(i) for i in upper)
         self.merge = nn.ModuleList(Merge(widths[i]) for i in upper)
-        self.middle = blocks(len(depths) - 1)
+        self.middle = blocks(len(depths) - 1, context_channels)
         self.expand = nn.ModuleList(Expand(widths[i]) for i in upper)
         self.up = nn.ModuleList(blocks(i) for i in upper)
         self.norm = RMSNorm(width)
@@ -119,7 +125,7 @@ class HDiT(nn.Module):
         Args:
             y: (B, C, H, W) state.
             t: (B,) times, or one for all, in [0, 1]; 1 = noise.
-            cond: (B, condition_channels, H, W).
+            cond: (B, condition_channels, H, W) maps or (B, M, context_channels) tokens, whichever the network takes.
 
         Returns:
             (B, C, H, W).
@@ -138,14 +144,15 @@ class HDiT(nn.Module):
         levels = [self._level(i, angle, self.tokenize.weight.dtype) for i, angle in enumerate(angles)]
         place = self.position(angles[0]).flatten(0, 1)
         x = self.tokenize(self._patches(y)) + place
-        if cond is not None:
+        if cond is not None and self.condition_channels:
             x = x + self.tokenize_condition(self._patches(cond))
         skips = []
         for i, merge in enumerate(self.merge):
             x = self._run(self.down[i], x, time, levels[i])
             skips.append(x)
             x = merge(x, self.grids[i])
-        x = self._run(self.middle, x, time, levels[-1])
+        context = cond.to(x.dtype) if cond is not None and self.context_channels else None
+        x = self._run(self.middle, x, time, levels[-1]._replace(context=context))
         for i in reversed(range(len(skips))):
             x = self.expand[i](x, skips.pop(), self.grids[i])
             x = self._run(self.up[i], x, time, levels[i])
@@ -174,12 +181,7 @@ class HDiT(nn.Module):
         shape = (self.channels, *self.resolution)
         if y.shape[1:] != shape:
             raise DataError(f"a state of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, shape))})")
-        if cond is None and self.condition_channels == 0:
-            return
-        expected = (len(y), self.condition_channels, *self.resolution)
-        if cond is None or cond.shape != expected:
-            given = "no condition" if cond is None else f"a condition of shape {tuple(cond.shape)}"
-            raise DataError(given, str(expected) if self.condition_channels else "none: the network takes no condition")
+        check_condition(cond, len(y), (self.condition_channels, *self.resolution), self.context_channels)
 
 
 def _pair(values: Sequence[int]) -> Grid:

@@ -8,7 +8,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lidar_synth.nets.attention import Grid, NeighbourhoodAttention
-from lidar_synth.nets.layers import EPS, AdaRMSNorm, GatedFeedForward, piece_length
+from lidar_synth.nets.convolution import attend
+from lidar_synth.nets.layers import EPS, AdaRMSNorm, GatedFeedForward, RMSNorm, piece_length
 from lidar_synth.nets.positions import rotate
 
 
@@ -18,11 +19,13 @@ class Level(NamedTuple):
     Args:
         cosine, sine: (N, heads, D / 2) rotation of each token.
         near: attention to the neighbourhood; None where every token attends to all.
+        context: (B, M, K) tokens of a condition; None where there is none to look at.
     """
 
     cosine: Tensor
     sine: Tensor
     near: NeighbourhoodAttention | None
+    context: Tensor | None = None
 
 
 class SelfAttention(nn.Module):
@@ -66,6 +69,33 @@ class SelfAttention(nn.Module):
         return rotate(q * scale, cosine, sine).to(v.dtype), rotate(k, cosine, sine).to(v.dtype), v
 
 
+class ContextAttention(nn.Module):
+    """Residual attention to the tokens of a condition; begins at 0, so that the weights of an unconditional model are a
+    start for a conditional one.
+
+    Args:
+        dim: C, channels of a token.
+        embedding: E, channels of the time embedding.
+        heads: number of heads.
+        context: K, channels of a condition's token.
+    """
+
+    def __init__(self, dim: int, embedding: int, heads: int, context: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm, self.context_norm = AdaRMSNorm(dim, embedding), RMSNorm(context)
+        self.query = nn.Linear(dim, dim, bias=False)
+        self.key_value = nn.Linear(context, 2 * dim, bias=False)
+        self.out = nn.Linear(dim, dim, bias=False)
+        nn.init.zeros_(self.out.weight)
+
+    def forward(self, x: Tensor, time: Tensor, context: Tensor) -> Tensor:
+        """Tokens (B, N, C), time (B, E) and a context (B, M, K) to (B, N, C)."""
+        k, v = self.key_value(self.context_norm(context)).chunk(2, -1)
+        out: Tensor = x + self.out(attend(self.query(self.norm(x, time)), k, v, self.heads))
+        return out
+
+
 class FeedForward(nn.Module):
     """Residual gated feed-forward layer.
 
@@ -87,16 +117,20 @@ class FeedForward(nn.Module):
 
 
 class Block(nn.Module):
-    """Attention, then feed-forward; arguments as theirs."""
+    """Attention, attention to the context where it has channels, then feed-forward; arguments as theirs."""
 
-    def __init__(self, dim: int, embedding: int, heads: int, ratio: float) -> None:
+    def __init__(self, dim: int, embedding: int, heads: int, ratio: float, context: int = 0) -> None:
         super().__init__()
         self.attention = SelfAttention(dim, embedding, heads)
+        self.context_attention = ContextAttention(dim, embedding, heads, context) if context else None
         self.feed_forward = FeedForward(dim, embedding, ratio)
 
     def forward(self, x: Tensor, time: Tensor, level: Level) -> Tensor:
         """Tokens (B, N, C) and time (B, E) to (B, N, C)."""
-        out: Tensor = self.feed_forward(self.attention(x, time, level), time)
+        x = self.attention(x, time, level)
+        if self.context_attention is not None and level.context is not None:
+            x = self.context_attention(x, time, level.context)
+        out: Tensor = self.feed_forward(x, time)
         return out
 
 

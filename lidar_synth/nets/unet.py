@@ -26,6 +26,7 @@ from lidar_synth.nets.convolution import (
     Residual,
     WrapConv,
     activate,
+    check_condition,
     check_shape,
     fold,
     pair,
@@ -182,19 +183,10 @@ class UNet(nn.Module):
 
     def _condition(self, y: Tensor, cond: Tensor | None, dtype: torch.dtype) -> tuple[Tensor, Tensor | None]:
         """The state with the maps beside it, and the context."""
-        given = "no condition" if cond is None else f"a condition of shape {tuple(cond.shape)}"
-        if self.condition_channels:
-            shape = (len(y), self.condition_channels, *self.resolution)
-            if cond is None or cond.shape != shape:
-                raise DataError(given, str(shape))
-            return torch.cat((y, cond.to(y.dtype)), 1), None
-        if self.context_channels:
-            if cond is None or cond.ndim != 3 or (len(cond), cond.shape[2]) != (len(y), self.context_channels):
-                raise DataError(given, f"({len(y)}, tokens, {self.context_channels})")
-            return y, cond.to(dtype)
-        if cond is not None:
-            raise DataError(given, "none: the network takes no condition")
-        return y, None
+        check_condition(cond, len(y), (self.condition_channels, *self.resolution), self.context_channels)
+        if cond is None:
+            return y, None
+        return (torch.cat((y, cond.to(y.dtype)), 1), None) if self.condition_channels else (y, cond.to(dtype))
 
 
 class Downsample(nn.Module):

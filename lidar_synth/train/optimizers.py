@@ -12,9 +12,9 @@ from torch.optim import Optimizer
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.nets.layers import GatedFeedForward
-from lidar_synth.nets.transformer import SelfAttention
+from lidar_synth.nets.transformer import ContextAttention, SelfAttention
 
-BLOCKS = (SelfAttention, GatedFeedForward)
+BLOCKS = (SelfAttention, ContextAttention, GatedFeedForward)
 """Modules whose linear layers Muon moves."""
 
 

@@ -1,0 +1,141 @@
+"""Does the condition count? The figures and the pictures of conditional models in docs/models.md.
+
+    python tools/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64] [--picture OUT.png]
+
+    python tools/condition_card.py "student, 4 steps=town-semantic" "teacher, 50 steps=RUN/teacher.safetensors:50"
+    lidar-synth town unseen --seed 1 --scans 64 --interval 1 --layout kitti360          # camera models need images
+    python tools/condition_card.py "student, 4 steps=RUN/student.safetensors" --root unseen
+
+Every model gets the conditions of the same real scans, those of a town that it has not seen or of ROOT, and the same
+noise. The table says how near the generated scans come as a set. Below it stands how well each agrees with the scan
+whose condition it got, and with another one of them, half the set away:
+
+    semantic   mIoU between the label map and what the town's segmenter sees in the generated scan
+    camera     intersection over union of the bird's-eye cells that hold something above the ground, where the
+               camera looks: a metre wide, up to 40 m away
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from model_card import REFERENCE, SEED, header, relabelled, row, shrink, town
+from numpy.typing import NDArray
+from PIL import Image
+from tqdm import tqdm
+
+from lidar_synth import Scan, load_generator, open_scans
+from lidar_synth.metrics.segmentation import Judge, load_judge, mean_iou
+from lidar_synth.projection import project
+from lidar_synth.sensor import Sensor
+from lidar_synth.viz import picture, render
+
+FIELD, REACH = np.radians(50.0), 40
+"""To either side of straight ahead (the town's and KITTI-360's cameras see 52 degrees), and metres."""
+SENSOR_HEIGHT, ABOVE = 1.73, 0.5
+"""Of the LiDAR above the ground, and from where on something counts; metres."""
+SHOWN = 8
+
+
+def map_agreement(scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> float:
+    """mIoU between the real scans' labels, cell by cell, and what the segmenter sees in the generated ones."""
+    return mean_iou(judge.agreement([relabelled(a, b) for a, b in zip(scans, real, strict=True)]))
+
+
+def sight_agreement(scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> float:
+    """Mean intersection over union of what stands in the camera's sight."""
+    pairs = [(obstacles(a), obstacles(b)) for a, b in zip(scans, real, strict=True)]
+    return float(np.mean([(a & b).sum() / max((a | b).sum(), 1) for a, b in pairs]))
+
+
+def obstacles(scan: Scan) -> NDArray[np.bool_]:
+    """(REACH, 2 REACH) square metres ahead that hold a return above the ground."""
+    x, y, z = scan.points.T
+    seen = (np.abs(np.arctan2(y, x)) < FIELD) & (np.hypot(x, y) < REACH) & (z > ABOVE - SENSOR_HEIGHT)
+    cells = np.zeros((REACH, 2 * REACH), bool)
+    cells[np.floor(x[seen]).astype(int), np.floor(y[seen]).astype(int) + REACH] = True
+    return cells
+
+
+AGREEMENTS: dict[str, tuple[str, Callable[[Sequence[Scan], Sequence[Scan], Judge], float]]] = {
+    "semantic": ("mIoU of map and segmenter", map_agreement),
+    "camera": ("bird's-eye IoU in the camera's sight", sight_agreement),
+}
+
+
+def generate(model: str, steps: int | None, real: Sequence[Scan]) -> tuple[str, list[Scan]]:
+    """The kind of condition, and one scan from each real scan's."""
+    generator = load_generator(model)
+    if generator.condition is None:
+        raise SystemExit(f"{model} is unconditional: see tools/model_card.py")
+    made = (
+        generator.scans(SEED, [i], condition=scan, steps=steps)[0]
+        for i, scan in enumerate(tqdm(real, desc=Path(model).stem, unit="scan"))
+    )
+    return generator.condition, list(made)
+
+
+def seen(kind: str, scan: Scan, sensor: Sensor) -> NDArray[np.uint8]:
+    """A picture of a scan's condition."""
+    if kind == "camera":
+        assert scan.image_path is not None
+        return np.asarray(Image.open(scan.image_path).convert("RGB").resize((704, 188)))
+    shown = picture(project(scan, sensor, ["label"]), "label")
+    return np.repeat(shown, 4, axis=0)  # 64 rows are few
+
+
+def draw(path: Path, kind: str, made: Sequence[Scan], real: Sequence[Scan]) -> None:
+    """Condition, generated and real, side by side."""
+    figure = Figure(figsize=(15, 3.05 * len(made)), facecolor="#1e1014", layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(made), 3, squeeze=False, width_ratios=[1.25, 1, 1])
+    for axes, a, b in zip(grid, made, real, strict=True):
+        assert a.sensor is not None
+        images = (seen(kind, b, a.sensor), render(a, "label", size=(900, 540)), render(b, "label", size=(900, 540)))
+        for axis, image, title in zip(axes, images, ("condition", "generated", "real"), strict=True):
+            axis.imshow(image, aspect="equal" if kind == "camera" or title != "condition" else "auto")
+            axis.set_title(title, color="#9aa0ad", fontsize=9, loc="left")
+            axis.set_axis_off()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+    shrink(path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
+    parser.add_argument("--root", help="a dataset with labels, or images; without it a town")
+    parser.add_argument("--split", help="of ROOT")
+    parser.add_argument("--count", type=int, default=64, help="scans of every row")
+    parser.add_argument("--picture", type=Path, help="PNG of the first model's scans; of real data, for yourself only")
+    given = parser.parse_args()
+
+    judge = load_judge()
+    if given.root:
+        source = open_scans(given.root, split=given.split)
+        chosen = np.unique(np.linspace(0, len(source) - 1, given.count).astype(int))
+        real = [source[int(i)] for i in tqdm(chosen, desc=given.root, unit="scan")]
+    else:
+        real = town(REFERENCE, given.count)
+    other = real[len(real) // 2 :] + real[: len(real) // 2]
+    lines, verdicts = [], []
+    for i, text in enumerate(given.models):
+        name, model = text.split("=", 1)
+        model, _, steps = model.partition(":")
+        kind, scans = generate(model, int(steps) if steps else None, real)
+        lines.append(row(name, real, scans, judge))
+        measure, agreement = AGREEMENTS[kind]
+        values = [100 * agreement(scans, some, judge) for some in (real, other)]
+        verdicts.append(f"| {name} | {measure} | {values[0]:.1f} | {values[1]:.1f} |")
+        if i == 0 and given.picture:
+            apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
+            draw(given.picture, kind, [scans[k] for k in apart], [real[k] for k in apart])
+    print(f"{len(real)} scans a row\n\n{header(real, judge)}\n" + "\n".join(lines))
+    print("\n| scans | % | with its own condition | with another's |\n|---|---|---:|---:|\n" + "\n".join(verdicts))
+
+
+if __name__ == "__main__":
+    main()
