@@ -1,5 +1,6 @@
 """The latent path from configurations: autoencoder, conditioned teacher, student, scans; by the commands of pixels."""
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from PIL import Image
 from torch import nn
 from typer.testing import CliRunner
 
+from lidar_synth.bake.conditions import conditions_for
 from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint, read_header
 from lidar_synth.cli import app
 from lidar_synth.cli.plan import make_plan, open_data
@@ -313,6 +315,25 @@ def test_a_camera_model(network: dict[str, Any], scans: Path, kitti: Path, codec
     assert np.allclose(scan.points, same.points)
     with pytest.raises(ConfigError, match="roll with the condition 'camera'"):
         call("train", config, "data.roll=true", f"output={tmp_path / 'rolled'}")
+
+
+def test_the_camera_of_another_focal_length_is_refused(scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
+    config = write_config(scans, tmp_path, "camera", network=TRANSFORMER, condition=CAMERA | {"focal": 552.55},
+                          codec=str(codec), data={"path": str(kitti), "layout": "kitti360", "split": "all"})  # fmt: skip
+    call("train", config, "recipe.iterations=1")
+    generator = load_generator(tmp_path / "camera" / "camera.safetensors")
+    assert conditions_for(generator, str(kitti)) is not None
+    file = kitti / "calibration" / "perspective.txt"
+    for text, found in (
+        (file.read_text().replace("552.554261", "721.537700"), "a focal length of 721.5 pixels"),
+        (None, "no calibration"),
+    ):
+        other = tmp_path / found
+        shutil.copytree(kitti, other)
+        file = other / "calibration" / "perspective.txt"
+        file.write_text(text) if text else shutil.rmtree(file.parent)
+        with pytest.raises(DataError, match=f"a camera with {found}; expected 552.5 pixels"):
+            conditions_for(generator, str(other))
 
 
 def test_what_does_not_fit_together(scans: Path, codec: Path, teacher: Path, tmp_path: Path) -> None:

@@ -4,10 +4,13 @@ round again."""
 from collections.abc import Iterable
 from functools import lru_cache
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import ScanFiles, open_scans
 from lidar_synth.generator import Generator
 from lidar_synth.scan import Scan
+
+FOCAL_TOLERANCE = 0.02
+"""By which share a camera's focal length may differ from that of the training; datasets' drives differ by less."""
 
 
 @lru_cache(maxsize=1)
@@ -25,17 +28,40 @@ def open_conditions(path: str | None, layout: str | None = None, split: str | No
     return None
 
 
-def check_condition(generator: Generator, path: str | None) -> None:
-    """Refuse a conditional model without conditions, and the other way round.
+def conditions_for(
+    generator: Generator, path: str | None, layout: str | None = None, split: str | None = None
+) -> ScanFiles | None:
+    """The dataset that a model's conditions come from, if it is one that the model understands.
 
     Raises:
-        ConfigError: naming what is missing or too much.
+        ConfigError: where a conditional model gets none, or the other way round, and as ``open_conditions``.
+        DataError: where the model wants the images of another camera, or of a known one, and as ``open_conditions``.
+        FileError: as ``open_conditions``.
     """
     if (generator.condition is None) != (path is None):
         needs = f"{generator.condition} conditions" if generator.condition else "no condition"
         raise ConfigError(
             f"condition {path} for model {generator.name!r}, which takes {needs}",
             "a dataset whose scans have them" if generator.condition else "none",
+        )
+    source = open_conditions(path, layout, split)
+    if source is not None and generator.condition:
+        _check_camera(source, generator.header.conditioning[generator.condition].get("focal"))
+    return source
+
+
+def _check_camera(source: ScanFiles, focal: float | None) -> None:
+    """Refuse a camera of another focal length: its images show more or less than those of the training."""
+    if focal is None:
+        return
+    camera = source.calibration(0)
+    found = None if camera is None else float(camera.projection[0, 0])
+    if found is None or abs(found / focal - 1) > FOCAL_TOLERANCE:
+        given = "no calibration" if found is None else f"a focal length of {found:.1f} pixels"
+        raise DataError(
+            f"{source.root}: a camera with {given}",
+            f"{focal:.1f} pixels, those of the camera that the model was trained on",
+            "Crop and resize the images to what that camera sees, and say so in the dataset's calibration files.",
         )
 
 

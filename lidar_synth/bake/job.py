@@ -18,7 +18,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 import lidar_synth
-from lidar_synth.bake.conditions import check_condition, open_conditions
+from lidar_synth.bake.conditions import conditions_for
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
 from lidar_synth.errors import ConfigError
@@ -128,8 +128,7 @@ def make_plan(out: str | Path, job: Job) -> Plan:
     if job.first + job.count >= 2**63:
         raise ConfigError(f"scans up to index {job.first + job.count}", "less than 2^63")
     generator = load_generator(job.model)
-    check_condition(generator, job.condition)
-    open_conditions(job.condition, job.condition_layout, job.condition_split)
+    conditions_for(generator, job.condition, job.condition_layout, job.condition_split)
     fields = _fields(job, generator.fields)
     software = {"lidar_synth": lidar_synth.__version__, "torch": torch.__version__, "numpy": np.__version__,
                 "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "zlib": zlib.ZLIB_RUNTIME_VERSION,

@@ -41,7 +41,7 @@ def sample(
     import torch
     from tqdm import tqdm
 
-    from lidar_synth.bake.conditions import check_condition, conditions, open_conditions
+    from lidar_synth.bake.conditions import conditions, conditions_for
     from lidar_synth.formats import WRITERS
     from lidar_synth.formats.source import choose
     from lidar_synth.formats.writer import claim
@@ -50,8 +50,7 @@ def sample(
     writer = choose("format", to, WRITERS)(out)
     precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
     generator = load_generator(model, device=device, dtype=precision, batch=batch)
-    check_condition(generator, condition)
-    given = open_conditions(condition, condition_layout, condition_split)
+    given = conditions_for(generator, condition, condition_layout, condition_split)
     settings = {
         "checkpoint": generator.hash, "seed": seed, "steps": steps, "solver": solver, "dtype": dtype, "to": to,
         "condition": condition, "condition_layout": condition_layout, "condition_split": condition_split,

@@ -131,6 +131,7 @@ class Condition(Section):
         dropout: share of blank conditions in training; above 0 the model can be guided.
         view_dropout: share of camera images of which one view is left.
         image: rows and columns that camera images have to have: those of one camera.
+        focal: focal length in pixels that this camera's calibration has to tell.
     """
 
     kind: Literal["semantic", "camera"]
@@ -139,6 +140,7 @@ class Condition(Section):
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
     view_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     image: tuple[Count, Count] | None = None
+    focal: Annotated[float, Field(gt=0)] | None = None
 
     def part(self, resolution: tuple[int, int], target: tuple[int, int]) -> Part:
         """The encoder, for a sensor's ``resolution`` and a state of ``target`` rows and columns.
@@ -154,5 +156,5 @@ class Condition(Section):
 
     def options(self) -> dict[str, Any]:
         """What the checkpoint's header says about it."""
-        values = self.model_dump(mode="json", include={"dropout", "view_dropout", "image"})
+        values = self.model_dump(mode="json", include={"dropout", "view_dropout", "image", "focal"})
         return {key: value for key, value in values.items() if value}
