@@ -318,14 +318,14 @@ def test_a_camera_model(network: dict[str, Any], scans: Path, kitti: Path, codec
 
 
 def test_the_camera_of_another_focal_length_is_refused(scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
-    config = write_config(scans, tmp_path, "camera", network=TRANSFORMER, condition=CAMERA | {"focal": 552.55},
-                          codec=str(codec), data={"path": str(kitti), "layout": "kitti360", "split": "all"})  # fmt: skip
+    data, condition = {"path": str(kitti), "layout": "kitti360", "split": "all"}, CAMERA | {"focal": 552.55}
+    config = write_config(scans, tmp_path, "camera", network=UNET, condition=condition, codec=str(codec), data=data)
     call("train", config, "recipe.iterations=1")
     generator = load_generator(tmp_path / "camera" / "camera.safetensors")
     assert conditions_for(generator, str(kitti)) is not None
     file = kitti / "calibration" / "perspective.txt"
     for text, found in (
-        (file.read_text().replace("552.554261", "721.537700"), "a focal length of 721.5 pixels"),
+        (file.read_text().replace("5.52554261", "7.21537700"), "a focal length of 721.5 pixels"),
         (None, "no calibration"),
     ):
         other = tmp_path / found
