@@ -1,7 +1,6 @@
 """HDiT against the numbers that R2Flow's own code gave for the same weights."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,7 @@ from lidar_synth.importers.r2flow import convert
 from lidar_synth.nets.hdit import HDiT
 from lidar_synth.nets.positions import BASES, AnglePosition
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Small networks gain nothing from more threads, and wait for each other on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def distance(a: Tensor, b: Tensor) -> float:

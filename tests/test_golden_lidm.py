@@ -1,7 +1,6 @@
 """U-Net, autoencoder and label maps against the numbers that LiDM's own code gave for the same weights."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,14 +16,7 @@ from lidar_synth.importers.lidm_names import COND_STAGE, UNET
 from lidar_synth.nets.diffusion import DiffusionUNet
 from lidar_synth.nets.vqvae import VQVAE
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Small networks gain nothing from more threads, and wait for each other on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def distance(a: Tensor, b: Tensor) -> float:

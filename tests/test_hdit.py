@@ -1,7 +1,6 @@
 """HDiT: the attention against its definition, the network against its symmetries, bad input."""
 
 import copy
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -20,13 +19,7 @@ from lidar_synth.nets.transformer import from_patches, to_patches
 SMALL: dict[str, Any] = {"resolution": (8, 64), "width": 16, "time_width": 16, "depths": (1, 1, 1), "heads": (2, 4, 4)}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Small networks gain nothing from more threads, and wait for each other on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def angles(rows: int, columns: int) -> Tensor:
