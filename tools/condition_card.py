@@ -66,6 +66,14 @@ AGREEMENTS: dict[str, tuple[str, Callable[[Sequence[Scan], Sequence[Scan], Judge
 }
 
 
+def verdict(name: str, kind: str, scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> str:
+    """A line of the second table."""
+    measure, agreement = AGREEMENTS[kind]
+    other = [*real[len(real) // 2 :], *real[: len(real) // 2]]
+    values = [f"{100 * agreement(scans, some, judge):.1f}" for some in (real, other)]
+    return f"| {name} | {measure} | {' | '.join(values)} |"
+
+
 def generate(model: str, steps: int | None, real: Sequence[Scan]) -> tuple[str, list[Scan]]:
     """The kind of condition, and one scan from each real scan's."""
     generator = load_generator(model)
@@ -120,16 +128,15 @@ def main() -> None:
         real = [source[int(i)] for i in tqdm(chosen, desc=given.root, unit="scan")]
     else:
         real = town(REFERENCE, given.count)
-    other = real[len(real) // 2 :] + real[: len(real) // 2]
     lines, verdicts = [], []
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
         kind, scans = generate(model, int(steps) if steps else None, real)
         lines.append(row(name, real, scans, judge))
-        measure, agreement = AGREEMENTS[kind]
-        values = [100 * agreement(scans, some, judge) for some in (real, other)]
-        verdicts.append(f"| {name} | {measure} | {values[0]:.1f} | {values[1]:.1f} |")
+        if i == 0:
+            verdicts.append(verdict("the real scans", kind, real, real, judge))
+        verdicts.append(verdict(name, kind, scans, real, judge))
         if i == 0 and given.picture:
             apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
             draw(given.picture, kind, [scans[k] for k in apart], [real[k] for k in apart])

@@ -1,17 +1,22 @@
-"""The recipe of the weights that ship: autoencoder, teacher, timesteps, student, on scans of the town only.
+"""The recipe of the weights that ship, on scans of the town only: autoencoder, teacher, timesteps, student.
 
-    python tools/make_town_weights.py WORK [--codec 60] [--teacher 180] [--student 30] [--set RUN.KEY=VALUE ...]
+    python tools/make_town_weights.py WORK [--model town] [--codec 60] [--teacher 180] [--student 30]
+        [--set RUN.KEY=VALUE ...]
+    python tools/make_town_weights.py WORK --model town-semantic --teacher 60      # after the first, in the same folder
+    python tools/make_town_weights.py WORK --model town-camera --teacher 60
 
-The numbers are minutes: every run has a budget of time in place of iterations. It goes on at a constant rate until
-three quarters of it are over, then the rate falls to zero over a third of the steps done so far (the schedule
-"trapezoid"). A run that was stopped or killed goes on when the same is typed again, with the budget anew. --set changes
-the configurations (configs/town_codec.yaml, town_teacher.yaml, town_student.yaml), such as teacher.recipe.batch=16;
-data has to stay the same in all. On a machine that does other things too, set OMP_WAIT_POLICY=passive.
+The conditional models begin as the teacher of the first. The numbers are minutes: every run has a budget of time in
+place of iterations. It goes on at a constant rate until three quarters of it are over, then the rate falls to zero
+over a third of the steps done so far (the schedule "trapezoid"). A run that was stopped or killed goes on when the
+same is typed again, with the budget anew. --set changes the configurations (configs/town_codec.yaml,
+town_teacher.yaml, town_semantic_student.yaml ...), such as teacher.recipe.batch=16; data has to stay the same in all.
+On a machine that does other things too, set OMP_WAIT_POLICY=passive.
 """
 
 import argparse
 import json
 import math
+import os
 from pathlib import Path
 
 import torch
@@ -20,6 +25,7 @@ from lidar_synth.checkpoint import load_checkpoint, read_header, save_checkpoint
 from lidar_synth.cli.run import run
 from lidar_synth.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.files import write_file
+from lidar_synth.town import Town, export_town
 
 ROOT = Path(__file__).parents[1]
 PLATEAU = 0.75
@@ -27,26 +33,41 @@ PLATEAU = 0.75
 LIMIT = 16e6
 """Bytes that weights in the package may have."""
 
+CAMERA_SCANS, CAMERA_INTERVAL = 800, 2.0
+"""Scans with images, and the seconds between them; an image takes a second and a half."""
 
-RUNS = {"codec": TrainConfig, "teacher": TrainConfig, "student": DistillConfig}
+RUNS: dict[str, type[TrainConfig] | type[DistillConfig]] = {
+    "codec": TrainConfig,
+    "teacher": TrainConfig,
+    "student": DistillConfig,
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path, help="folder of the runs")
+    parser.add_argument("--model", choices=("town", "town-semantic", "town-camera"), default="town")
     for name, minutes in (("codec", 60), ("teacher", 180), ("student", 30)):
         parser.add_argument(f"--{name}", type=float, default=minutes, metavar="MINUTES")
     parser.add_argument("--set", nargs="*", default=[], metavar="RUN.KEY=VALUE")
-    parser.add_argument("--out", type=Path, default=ROOT / "lidar_synth" / "weights" / "town.safetensors")
+    parser.add_argument("--out", type=Path, help="by default where the package has its weights")
     given = parser.parse_args()
 
-    made: dict[str, Path] = {}
-    for name, kind in RUNS.items():
+    data = [f"data.cache={given.work / 'cache'}"]
+    if given.model == "town-camera":
+        data = [f"data.cache={given.work / 'camera_cache'}", f"data.path={given.work / 'town_camera'}"]
+        town = Town(0, scans=CAMERA_SCANS, interval=CAMERA_INTERVAL)
+        export_town(town, given.work / "town_camera", "kitti360", jobs=os.cpu_count() or 1)
+    first = given.work / "town_teacher" / "town_teacher.safetensors"
+    runs, made = list(RUNS), []  # what the next run is given
+    if given.model != "town":
+        runs, made = ["teacher", "student"], [f"init={first}"]
+    for name in runs:
         changes = [change.partition(".")[2] for change in given.set if change.startswith(f"{name}.")]
-        before = {"codec": [], "teacher": ["codec"], "student": ["teacher"]}[name]
-        changes = [f"data.cache={given.work / 'cache'}", *(f"{key}={made[key]}" for key in before), *changes]
-        made[name] = train(kind, given.work / f"town_{name}", getattr(given, name), changes)
-    ship(made["student"], given.out)
+        folder = given.work / f"{given.model.replace('-', '_')}_{name}"
+        path = train(RUNS[name], folder, getattr(given, name), [*data, *made, *changes])
+        made = [f"{name}={path}"]
+    ship(path, given.out or ROOT / "lidar_synth" / "weights" / f"{given.model}.safetensors")
 
 
 def train(kind: type[TrainConfig] | type[DistillConfig], folder: Path, minutes: float, overrides: list[str]) -> Path:
