@@ -34,7 +34,6 @@ class Condition(Protocol):
         name: in ``CONDITIONS``, in a checkpoint's header and in a user's dictionary.
         field: of ``train.ImageCache`` that holds it.
         encoders: architectures that take it, the default first.
-        argument: of the velocity network that says how many channels the encoder gives.
         turns: whether it turns with the scan about the vertical.
         blank: its value where nothing is known.
     """
@@ -42,7 +41,6 @@ class Condition(Protocol):
     name: str
     field: str
     encoders: tuple[str, ...]
-    argument: str
     turns: bool
     blank: int
 
@@ -65,7 +63,6 @@ class SemanticMap:
     name = "semantic"
     field = "label"
     encoders: tuple[str, ...] = ("semantic_map",)
-    argument = "condition_channels"
     turns = True
     blank = IGNORE
 
@@ -104,8 +101,7 @@ class CameraImage:
 
     name = "camera"
     field = "camera"
-    encoders: tuple[str, ...] = ("views", "clip_views")
-    argument = "context_channels"
+    encoders: tuple[str, ...] = ("views", "clip_views", "sight")
     turns = False
     blank = 0
 

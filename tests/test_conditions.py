@@ -20,13 +20,16 @@ from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.flow import guided
 from lidar_synth.nets import NETWORKS, build_network
 from lidar_synth.nets.encoders import CLIP_VARIABLE, CLIP_WIDTH, cut, frozen_clip
+from lidar_synth.nets.sight import SightEncoder
 from lidar_synth.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.projection import project
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.projection import project, unproject
+from lidar_synth.scan import RangeImage, Scan
+from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.town.camera import CAMERA
 from lidar_synth.train import Batches, Conditioning, Other, cache_scans
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+TOWN = load_sensor("town")
 TENSORS = TensorFormat(("range",), NORMALISATIONS["r2flow"])
 CAMERA_SHAPE = (3, 32, 64)
 OPTIONS: dict[str, Any] = {"image": [40, 80]}
@@ -100,6 +103,43 @@ def test_an_image_is_cut_into_views_from_left_to_right() -> None:
     assert not left[..., :4].any() and not left[..., 8:].any()
 
 
+def sight(sensor: Sensor = TOWN, **arguments: Any) -> SightEncoder:
+    torch.manual_seed(0)
+    return SightEncoder(
+        **{
+            "target": sensor.shape,
+            "image": (376, 1408),
+            "image_from_sensor": CAMERA.image_from_sensor.tolist(),
+            "resolution": (32, 64),
+            "channels": 5,
+            "widths": (4, 8),
+            "angles": torch.from_numpy(sensor.ray_angles()),
+        }
+        | arguments
+    ).eval()
+
+
+def test_every_cell_looks_where_the_calibration_says() -> None:
+    points = unproject(RangeImage(np.full(TOWN.shape, 15, np.float32), TOWN, {})).points
+    pixels, depth = CAMERA.pixels(points)
+    inside = (depth > 1) & (pixels > -0.5).all(1) & (pixels < np.array([1407.5, 375.5])).all(1)
+    places = sight(distance=15.0).places().reshape(-1, 2).numpy()
+    assert np.array_equal((np.abs(places) <= 1).all(1), inside) and 0.1 < inside.mean() < 0.3
+    assert np.allclose(((places + 1) * [1408, 376] - 1)[inside] / 2, pixels[inside], atol=0.01)
+
+
+@torch.no_grad()
+def test_a_cell_sees_its_own_part_of_the_image_only() -> None:
+    encoder, image = sight(), torch.zeros(1, 3, 32, 64, dtype=torch.uint8)
+    before = encoder(image)
+    image[..., :8] = 255  # the left eighth
+    changed = (encoder(image) != before).any(1)[0]
+    place, seen = encoder.places()[..., 0], (encoder.places().abs() <= 1).all(-1)
+    assert before.shape == (1, 5, *TOWN.shape)
+    assert changed[seen & (place < -0.8)].all() and not changed[place > -0.4].any()
+    assert torch.equal(before[0, -1] == 1, seen) and not before[0, :, ~seen].any()
+
+
 def test_the_place_of_a_view_and_of_a_cell_counts_and_trains() -> None:
     net = build_network("views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)})
     image = torch.randint(0, 256, (2, 3, 32, 64), dtype=torch.uint8)
@@ -165,6 +205,13 @@ def test_scans_that_lack_what_is_needed(tmp_path: Path) -> None:
 def test_sizes_that_an_encoder_cannot_reach(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build_network("semantic_map", {"resolution": (8, 32)} | arguments)
+
+
+def test_an_encoder_without_a_calibration() -> None:
+    with pytest.raises(ConfigError, match="expected 3 rows of 4 numbers"):
+        sight(image_from_sensor=[[1.0, 2.0]])
+    with pytest.raises(ConfigError, match="an image of"):
+        sight(resolution=(30, 64))
 
 
 # --- training ---------------------------------------------------------------------------------------------------------

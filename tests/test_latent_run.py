@@ -48,6 +48,10 @@ CAMERA = {
     "kind": "camera", "dropout": 0.1, "view_dropout": 0.5, "image": [40, 80],
     "arguments": {"resolution": [16, 32], "views": 2, "channels": 8, "widths": [4, 8]},
 }  # fmt: skip
+SIGHT = CAMERA | {"encoder": "sight", "view_dropout": 0.0, "arguments": {
+    "resolution": [16, 32], "channels": 5, "widths": [4, 8],
+    "image_from_sensor": [[40.0, -30.0, 0.0, 0.0], [20.0, 0.0, -30.0, 0.0], [1.0, 0.0, 0.0, 0.0]],
+}}  # fmt: skip
 SEMANTIC = {"kind": "semantic", "arguments": {"channels": 3, "method": "patches"}, "dropout": 0.2}
 
 
@@ -276,7 +280,7 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("condition", [SEMANTIC, CAMERA], ids=lambda condition: condition["kind"])
+@pytest.mark.parametrize("condition", [SEMANTIC, CAMERA, SIGHT], ids=["semantic", "camera", "sight"])
 def test_a_latent_transformer(condition: dict[str, Any], scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
     """Any velocity network lives on latents, which look where their cells look."""
     call("train", write_config(scans, tmp_path, "latent", network=TRANSFORMER, codec=str(codec), steps=3))
@@ -300,6 +304,12 @@ def test_a_latent_transformer(condition: dict[str, Any], scans: Path, kitti: Pat
     kind = str(condition["kind"])
     assert looking.condition == kind and looking.header.conditioning[kind]["dropout"] == condition["dropout"]
     assert looking.header.provenance["init"] == load_checkpoint(start).hash
+    if condition is SIGHT:  # it looks where the cells look
+        angles = {
+            name: load_checkpoint(tmp_path / "looking" / "looking.safetensors").networks[name].angles.cells
+            for name in (ENCODER, VELOCITY)
+        }
+        assert torch.equal(angles[ENCODER], angles[VELOCITY])
 
 
 @pytest.mark.parametrize("network", [UNET, TRANSFORMER], ids=lambda network: network["architecture"])

@@ -9,12 +9,12 @@ import torch.nn.functional as F
 from torch import nn
 
 from lidar_synth import __version__
-from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Header, load_checkpoint
+from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Header, Part, load_checkpoint
 from lidar_synth.codec import make_codec
 from lidar_synth.config import Network, Run, TrainConfig
 from lidar_synth.errors import ConfigError
 from lidar_synth.nets import build_network
-from lidar_synth.sensor import load_sensor
+from lidar_synth.sensor import Sensor, load_sensor
 from lidar_synth.solvers import uniform_grid
 
 
@@ -33,13 +33,7 @@ def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
         sensor, tensors, fixed = load_sensor(config.sensor), config.tensors(), {}
         state = (tensors.size, *sensor.shape)
     parts = config.parts(state, sensor.shape)
-    torch.manual_seed(config.seed)
-    angles = torch.from_numpy(sensor.ray_angles(config.rays))
-    pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[0]
-    networks = {}
-    for name, part in parts.items():
-        looks = {"angles": pooled} if part.architecture in ("hdit", "denoiser") else {}
-        networks[name] = build_network(part.architecture, part.arguments | looks)
+    networks = _build(config, parts, sensor, state)
     header = Header(
         networks=parts | fixed,
         sensor=sensor,
@@ -79,8 +73,7 @@ def _add_condition(
     asked = config.model_copy(update={"network": Network(architecture=held.architecture, arguments=own)})
     state = make_codec(networks.get(CODEC), header.tensors, header.sensor.shape).shape
     parts = asked.parts(state, header.sensor.shape)
-    torch.manual_seed(config.seed)
-    made = {name: build_network(part.architecture, part.arguments) for name, part in parts.items()}
+    made = _build(config, parts, header.sensor, state)
     try:
         new = made[VELOCITY].load_state_dict(networks[VELOCITY].state_dict(), strict=False)
     except RuntimeError as error:
@@ -91,6 +84,20 @@ def _add_condition(
     assert not new.unexpected_keys and all("condition" in k or "context" in k for k in new.missing_keys), new
     conditioning: dict[str, Any] = {config.condition.kind: config.condition.options()}
     return networks | made, replace(header, networks=header.networks | parts, conditioning=conditioning)
+
+
+def _build(
+    config: TrainConfig, parts: dict[str, Part], sensor: Sensor, state: tuple[int, int, int]
+) -> dict[str, nn.Module]:
+    """Networks with fresh weights, some of which look where the cells of the state look."""
+    torch.manual_seed(config.seed)
+    angles = torch.from_numpy(sensor.ray_angles(config.rays))
+    pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[0]
+    networks = {}
+    for name, part in parts.items():
+        looks = {"angles": pooled} if part.architecture in ("hdit", "denoiser", "sight") else {}
+        networks[name] = build_network(part.architecture, part.arguments | looks)
+    return networks
 
 
 def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path: Any) -> None:

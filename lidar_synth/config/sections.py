@@ -151,8 +151,9 @@ class Condition(Section):
         encoders = CONDITIONS[self.kind].encoders
         if (encoder := self.encoder or encoders[0]) not in encoders:
             raise ConfigError(f"condition.encoder {encoder!r}", f"one of {', '.join(encoders)}")
-        sizes = {"resolution": list(resolution), "target": list(target)} if self.kind == "semantic" else {}
-        return Part(encoder, sizes | self.arguments)
+        sizes = {"resolution": list(resolution), "target": list(target), "image": list(self.image or ())}
+        wanted = {"semantic_map": ("resolution", "target"), "sight": ("target", "image")}.get(encoder, ())
+        return Part(encoder, {name: sizes[name] for name in wanted} | self.arguments)
 
     def options(self) -> dict[str, Any]:
         """What the checkpoint's header says about it."""

@@ -7,7 +7,6 @@ import torch
 from torch import nn
 
 from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Part
-from lidar_synth.conditions import CONDITIONS
 from lidar_synth.config.sections import Condition, Count, Network, Run, Section
 from lidar_synth.errors import ConfigError
 from lidar_synth.nets import AUTOENCODERS, build_network
@@ -72,8 +71,9 @@ class TrainConfig(Run):
         given: dict[str, Any] = {"resolution": list(state[1:]), "channels": state[0]}
         parts = {}
         if self.condition is not None:
-            parts[ENCODER] = encoder = self.condition.part(resolution, state[1:])
-            given[CONDITIONS[self.condition.kind].argument] = getattr(_checked(encoder), "channels", None)
+            parts[ENCODER] = part = self.condition.part(resolution, state[1:])
+            encoder = _checked(part)
+            given[str(encoder.argument)] = encoder.channels
         if self.network.architecture == "autoencoder":
             given["normalisation"] = self.normalisation
         if twice := sorted(set(given) & set(self.network.arguments)):

@@ -16,6 +16,7 @@ from lidar_synth.nets.denoiser import Denoiser
 from lidar_synth.nets.diffusion import DiffusionUNet
 from lidar_synth.nets.encoders import ClipViewEncoder, SemanticMapEncoder, ViewEncoder
 from lidar_synth.nets.hdit import HDiT
+from lidar_synth.nets.sight import SightEncoder
 from lidar_synth.nets.unet import UNet
 from lidar_synth.nets.vqvae import VQVAE
 
@@ -29,6 +30,7 @@ NETWORKS: dict[str, type[nn.Module]] = {
     "semantic_map": SemanticMapEncoder,
     "views": ViewEncoder,
     "clip_views": ClipViewEncoder,
+    "sight": SightEncoder,
 }
 """Architectures by the name that a checkpoint holds: velocity networks, autoencoders, encoders of conditions."""
 

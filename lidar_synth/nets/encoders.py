@@ -1,7 +1,8 @@
 """Encoders of conditions: what a user gives becomes maps beside the state, or tokens that the state attends to.
 
 They take conditions as they are stored (whole numbers) and train together with the velocity network; only CLIP's
-vision tower is frozen, and it is no part of a checkpoint.
+vision tower is frozen, and it is no part of a checkpoint. ``argument`` names the argument of the velocity network that
+takes their ``channels``.
 """
 
 import os
@@ -41,6 +42,8 @@ class SemanticMapEncoder(nn.Module):
     Raises:
         ConfigError: on sizes that cannot be reached, or an unknown method.
     """
+
+    argument = "condition_channels"
 
     def __init__(
         self, resolution: Sequence[int], target: Sequence[int], channels: int = 8, method: str = "rescale"
@@ -87,6 +90,8 @@ class ViewEncoder(nn.Module):
         widths: channels of the convolutions, each of which halves rows and columns.
     """
 
+    argument = "context_channels"
+
     def __init__(
         self,
         resolution: Sequence[int] = (96, 320),
@@ -130,6 +135,8 @@ class ClipViewEncoder(nn.Module):
         views: how many side by side; each is resized to 224 x 224.
         channels: of a token.
     """
+
+    argument = "context_channels"
 
     def __init__(self, views: int = 4, channels: int = 512) -> None:
         super().__init__()
