@@ -30,9 +30,8 @@ class SightEncoder(nn.Module):
         channels: of the maps.
         widths: channels of the convolutions, each of which halves rows and columns.
         distance: metres.
-        angles: (2, rows, columns) elevation and azimuth of every cell, radians, the latter clockwise from ahead; without
-            them they have to come from
-            a checkpoint.
+        angles: (2, rows, columns) elevation and azimuth (clockwise from ahead) of every cell, radians; without them
+            they have to come from a checkpoint.
 
     Raises:
         ConfigError: on values that do not fit together.
@@ -83,7 +82,7 @@ class SightEncoder(nn.Module):
             DataError: on another size.
         """
         check_shape(image, (3, *self.resolution), "a camera image")
-        x = image.to(self.body[0].weight.dtype) / 127.5 - 1
+        x = image.to(next(self.body.parameters()).dtype) / 127.5 - 1
         features = self.body(x.contiguous(memory_format=torch.channels_last)).float()
         places = self.places()
         seen = (places.abs() <= 1).all(-1).float().expand(len(x), 1, *places.shape[:2])
