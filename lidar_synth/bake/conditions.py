@@ -10,7 +10,7 @@ from lidar_synth.generator import Generator
 from lidar_synth.scan import Scan
 
 FOCAL_TOLERANCE = 0.02
-"""By which share a camera's focal length may differ from that of the training; datasets' drives differ by less."""
+"""By which share a camera's focal length may differ from that of the training."""
 
 
 @lru_cache(maxsize=1)
@@ -35,7 +35,8 @@ def conditions_for(
 
     Raises:
         ConfigError: where a conditional model gets none, or the other way round, and as ``open_conditions``.
-        DataError: where the model wants the images of another camera, or of a known one, and as ``open_conditions``.
+        DataError: where the dataset's camera is another than that of the training, or not known, and as
+            ``open_conditions``.
         FileError: as ``open_conditions``.
     """
     if (generator.condition is None) != (path is None):
