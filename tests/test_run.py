@@ -147,12 +147,13 @@ def test_two_processes_train_as_one(scans: Path, tmp_path: Path) -> None:
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     done = subprocess.run(
         [*torchrun, "-m", "lidar_synth", "train", config],
-        env=os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}, capture_output=True, text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     one, two = state(tmp_path / "one"), state(tmp_path / "two")
     for name in one:
         assert torch.allclose(one[name], two[name], atol=1e-4), name
+    assert len(list((tmp_path / "two" / "run" / "logs").iterdir())) == 1  # and not a run each
 
 
 def test_minutes_stop_a_run_and_resume_goes_on(scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

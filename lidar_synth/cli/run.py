@@ -11,6 +11,7 @@ The folder holds::
 """
 
 import math
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -62,7 +63,9 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
     state = config.output / "state.safetensors"
     if state.exists() and not resume:
         raise ConfigError(f"{config.output} holds a run", "--resume to go on, or another output=FOLDER")
-    accelerator = Accelerator(mixed_precision=config.precision)
+    # Without being told so, Accelerate takes the processes of torchrun on CPUs for runs of their own.
+    gpu = torch.cuda.is_available() or torch.xpu.is_available() or torch.backends.mps.is_available()
+    accelerator = Accelerator(mixed_precision=config.precision, cpu="LOCAL_RANK" in os.environ and not gpu)
     if accelerator.is_main_process:
         write_file(config.output / "config.yaml", yaml.safe_dump(config.model_dump(mode="json")).encode())
     plan = make_plan(config, accelerator)
