@@ -1,17 +1,16 @@
 """Scans as the chunks of an HDF5 dataset, made and read in the same way as HDF5's own filters do it.
 
-They are made and read here and not by HDF5, because HDF5 does one thing at a time. ISA-L inflates in half of zlib's
-time (docs/benchmarks.md). It deflates faster still, but not always to the same bytes, by which a bake is known.
+They are made and read here and not by HDF5, because HDF5 does one thing at a time, and by libdeflate, which takes half
+of zlib's time both ways (docs/benchmarks.md).
 """
 
 import math
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
+import deflate as libdeflate
 import numba
 import numpy as np
-from isal import isal_zlib
 from numpy.typing import NDArray
 
 from lidar_synth.errors import LibraryError
@@ -21,9 +20,9 @@ _GZIP_LEVEL = 1
 
 def checksum(seed: int, index: int, arrays: Mapping[str, NDArray[Any]], condition: bytes = b"") -> int:
     """CRC-32 of what a scan is: seed and index (8 bytes each, lowest first), the condition's name, then the arrays."""
-    crc = isal_zlib.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
+    crc = libdeflate.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
     for values in arrays.values():
-        crc = isal_zlib.crc32(values.data, crc)
+        crc = libdeflate.crc32(values.data, crc)
     return crc
 
 
@@ -33,8 +32,8 @@ def deflate(values: NDArray[Any]) -> bytes:
     planes = np.empty((size, values.size), np.uint8)
     for k, plane in enumerate(planes):
         np.right_shift(values.reshape(-1), 8 * k, out=plane, casting="unsafe")
-    packed = zlib.compress(planes.data, _GZIP_LEVEL)
-    return packed + fletcher32(packed).to_bytes(4, "little")
+    packed = libdeflate.zlib_compress(planes.data, _GZIP_LEVEL)
+    return bytes(packed + fletcher32(packed).to_bytes(4, "little"))
 
 
 def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -48,9 +47,9 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
         raise ValueError("its Fletcher-32 does not match")
     size = math.prod(shape) * dtype.itemsize
     try:
-        plain = isal_zlib.decompress(packed, bufsize=size)
-    except isal_zlib.error as error:  # type: ignore[misc]  # its stubs take the class for an instance
-        raise ValueError(str(error)) from error
+        plain = libdeflate.zlib_decompress(packed, size)
+    except libdeflate.DeflateError as error:
+        raise ValueError(f"it is damaged or does not hold {size} bytes") from error
     if len(plain) != size:
         raise ValueError(f"it holds {len(plain)} bytes and not {size}")
     first, *others = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
@@ -60,7 +59,7 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
     return values.reshape(shape)
 
 
-def fletcher32(data: bytes | memoryview) -> int:
+def fletcher32(data: bytes | bytearray | memoryview) -> int:
     """The checksum of HDF5's filter of that name: over big-endian 16-bit words, an odd last byte as the higher one."""
     first, second = _fletcher_sums(np.frombuffer(data, np.uint8))
     if len(data) % 2:
