@@ -62,7 +62,8 @@ def trusted(
     """
     if confidence is None:
         confidence = (label != IGNORE).astype(np.float32)
-    label = np.where(confidence >= threshold, label, np.uint8(IGNORE))
+    if threshold > 0:
+        label = np.where(confidence >= threshold, label, np.uint8(IGNORE))
     return replace(scan, label=label, raw_label=None, confidence=confidence)
 
 
