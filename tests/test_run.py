@@ -1,5 +1,6 @@
 """Training runs from a configuration: what they leave, how they go on after a kill, what they refuse."""
 
+import json
 import os
 import signal
 import subprocess
@@ -238,6 +239,7 @@ def test_a_student_is_distilled(
     call("distill", config, *([f"grid={list(grid)}"] if grid else []))
     header, _ = read_header(tmp_path / "run" / "run.safetensors")
     assert header.provenance["teacher"] == load_checkpoint(teacher).hash
+    assert str(teacher) not in json.dumps(header.provenance)
     if strategy != "adaptive_piecewise":
         assert header.time_grid == uniform_grid(4)
         return

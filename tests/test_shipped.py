@@ -1,6 +1,8 @@
 """The weights that ship, as users meet them: every source and label policy, beside the town and beside real scans."""
 
+import json
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,10 @@ from torch.utils.data import DataLoader
 from lidar_synth import MixedScans, RollingBank, SemanticKITTI, Source, Town, load_generator
 from lidar_synth.bank import Bank
 from lidar_synth.bank.encoding import Encoding
+from lidar_synth.checkpoint import read_header
 from lidar_synth.classes import IGNORE
 from lidar_synth.cli.bake import bake
-from lidar_synth.generator import Generator
+from lidar_synth.generator import Generator, shipped_models
 from lidar_synth.labels import POLICIES
 from lidar_synth.mixing import Generated
 from lidar_synth.projection import project
@@ -51,6 +54,13 @@ def real(request: pytest.FixtureRequest) -> Source:
         pytest.skip("LIDAR_SYNTH_REAL_SCANS is not set")
     source = SemanticKITTI(Path(root) / "semantic_kitti", split="train")
     return [source[i] for i in range(SCANS)]
+
+
+@pytest.mark.parametrize("name", shipped_models())
+def test_weights_say_whose_they_are_and_name_no_machine(name: str) -> None:
+    provenance = read_header(shipped_models()[name])[0].provenance
+    assert (provenance["licence"], provenance["data_licence"][:3]) == ("MIT", "MIT")
+    assert not re.search(r"[\"']/\w", json.dumps(provenance))
 
 
 def sure(scan: Scan) -> tuple[np.ndarray, np.ndarray]:

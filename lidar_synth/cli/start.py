@@ -122,10 +122,12 @@ def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path
 
 
 def provenance_of(config: Run) -> dict[str, Any]:
+    """What a checkpoint says of its making; the checkpoints that it was made from stand beside, by their hash."""
+    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "init", "teacher", "codec"}
     return {
         "data": config.data.describe(),
         "data_licence": config.data.licence,
         "licence": config.licence,
-        "recipe": config.model_dump(mode="json", exclude={"output", "data", "licence", "samples", "save_every"}),
+        "recipe": config.model_dump(mode="json", exclude=beside),
         "software": f"lidar_synth {__version__}, torch {torch.__version__}",
     }
