@@ -64,7 +64,7 @@ def test_a_bank_holds_the_models_scans(plan: Plan, model: Path, expected: dict[s
         assert np.array_equal(bank[i].label, image.label[image.mask])
     facts = bank.facts
     assert (facts.checkpoint, facts.label_policy, facts.licence) == (generator.hash, "generated", "MIT")
-    assert facts.settings["seed"] == 4 and facts.software["torch"]
+    assert facts.settings["seed"] == 4 and facts.software["torch"] and facts.software["deflate"]
 
 
 def write_conditioned(path: Path) -> Path:

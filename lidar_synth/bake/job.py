@@ -6,12 +6,12 @@ with the same settings write the same bytes, and a run with other ones is refuse
 """
 
 import platform
-import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import deflate
 import h5py
 import numpy as np
 import torch
@@ -131,7 +131,7 @@ def make_plan(out: str | Path, job: Job) -> Plan:
     conditions_for(generator, job.condition, job.condition_layout, job.condition_split)
     fields = _fields(job, generator.fields)
     software = {"lidar_synth": lidar_synth.__version__, "torch": torch.__version__, "numpy": np.__version__,
-                "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "zlib": zlib.ZLIB_RUNTIME_VERSION,
+                "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "deflate": deflate.__version__,
                 "machine": platform.machine()}  # fmt: skip
     model = Path(job.model)
     settled = job.model_copy(
