@@ -278,6 +278,13 @@ def test_many_scans_on_one_sheet() -> None:
     assert "random-3" in captions[3]
     assert "synthetic" in captions[3]
     assert figure.texts[0].get_text() == "five"
+    shown = [axes.images[0].get_array() for axes in figure.axes if axes.images]
+    for scan, distance, label in zip(scans, shown[1::3], shown[2::3], strict=True):
+        image = project(scan, channels=["label"])
+        np.testing.assert_array_equal(label, picture(image, "label"))
+        np.testing.assert_array_equal((distance == EMPTY).all(-1), ~image.mask)
+    bare = contact_sheet([replace(scan, label=None) for scan in scans])
+    assert sum(bool(axes.images) for axes in bare.axes) == 10, "without labels nothing stands for them"
     with pytest.raises(ConfigError, match="no scans"):
         contact_sheet([])
 

@@ -61,7 +61,8 @@ def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: flo
 def contact_sheet(
     given: Sequence[Scan | RangeImage], *, columns: int | None = None, by: str | None = None, title: str = ""
 ) -> Figure:
-    """Many scans side by side, each in perspective above its range image.
+    """Many scans side by side, each in perspective above its range image, and the image of its labels if they colour
+    the points.
 
     Args:
         given: scans or range images.
@@ -81,17 +82,19 @@ def contact_sheet(
     rows = -(-len(given) // columns)
     width = 4.6 * columns
     legend = 0.25 + 0.22 * -(-(len(NAMES) + 1) // _per_row(width)) if by == "label" else 0.1
-    height = 3.8 * rows + 0.5 + legend
+    strips = ("range", "label") if by == "label" else ("range",)
+    height = (3.2 + 0.6 * len(strips)) * rows + 0.5 + legend
     figure = _figure(width, height)
     grid = figure.add_gridspec(
         rows, columns, hspace=0.11, wspace=0.03, left=0.01, right=0.99, bottom=legend / height, top=1 - 0.72 / height
     )
     figure.text(0.01, 1 - 0.25 / height, title, color=_INK, fontsize=15, va="center")
     for place, view in enumerate(tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)):
-        tile = grid[place].subgridspec(2, 1, height_ratios=[5, 1], hspace=0.02)
-        above, below = figure.add_subplot(tile[0]), figure.add_subplot(tile[1])
+        tile = grid[place].subgridspec(1 + len(strips), 1, height_ratios=[5, *[1] * len(strips)], hspace=0.02)
+        above, *below = (figure.add_subplot(part) for part in tile)
         _bare(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
-        _bare(below, picture(view.image, "range", colours["range"]))
+        for axes, channel in zip(below, strips, strict=True):
+            _bare(axes, picture(view.image, channel, colours[channel]))
         above.set_title(caption(view.scan, short=True), color=_DIM, fontsize=9, loc="left", pad=3)
     if by == "label":
         _legend(figure, all_views, colours[by].table)
