@@ -102,10 +102,11 @@ def test_chance_draws_what_was_said() -> None:
     assert torch.allclose(images[:, 2:], same, atol=1e-3), "labels are not drawn"
 
 
-def test_the_loss_by_hand() -> None:
+@pytest.mark.parametrize("rare", [0.0, 0.5])
+def test_the_loss_by_hand(rare: float) -> None:
     net, x = network(), tensors()
     weights = {"range": 5.0, "reflectance": 0.5, "label": 2.0}
-    trained = Autoencoding(net, TENSORS, SENSOR, Losses(noise=0.0), METRICS["l1"], weights).eval()
+    trained = Autoencoding(net, TENSORS, SENSOR, Losses(noise=0.0, rare=rare), METRICS["l1"], weights).eval()
     said = net.expand(net.squeeze(x))
     images = [project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS]
     mask = torch.from_numpy(np.stack([image.mask for image in images]))
@@ -114,11 +115,17 @@ def test_the_loss_by_hand() -> None:
     share = said.surfaces.chosen.softmax(1)
     ranges = Laplace(said.surfaces.values, said.surfaces.spreads.exp()).log_prob(x[:, :1]).exp()
     others = Laplace(said.values, said.spreads.exp()).log_prob(x[:, 1:2])
+    cells = torch.tensor([(label == code).double().mean().item() for code in label.flatten()]).reshape(label.shape)
+    weight = cells.pow(-rare)
+
+    def mean(values: Tensor, where: Tensor) -> Tensor:
+        return (weight * values)[where].sum() / weight[where].sum()
+
     by_hand = (
         torch.nn.functional.binary_cross_entropy_with_logits(said.returned[:, 0], mask.float())
-        - 5 * (share * ranges).sum(1).log()[mask].mean()
-        - 0.5 * others[:, 0][mask].mean()
-        + 2 * torch.nn.functional.cross_entropy(said.classes, label)
+        - 5 * mean((share * ranges).sum(1).log(), mask)
+        - 0.5 * mean(others[:, 0], mask)
+        + 2 * mean(torch.nn.functional.cross_entropy(said.classes, label, reduction="none"), torch.ones_like(mask))
     )
     assert trained(x).item() == pytest.approx(by_hand.item(), rel=1e-5)
     assert trained(x, torch.randn_like(x)).item() == pytest.approx(by_hand.item(), rel=1e-5), "noise of deviation 0"

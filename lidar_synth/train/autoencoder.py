@@ -53,6 +53,8 @@ class Losses:
         adversarial: of the discriminator's verdict.
         discriminator_width: channels of the discriminator.
         noise: standard deviation of what is added to the latents of an "autoencoder", which lie in (-1, 1).
+        rare: how much more the cells of rare classes count for an "autoencoder": each by the share of its class in the
+            batch to the power of -rare. A pole is a hundredth of a scan, but not of its use.
 
     Raises:
         ConfigError: on a negative weight.
@@ -66,9 +68,10 @@ class Losses:
     adversarial: float = 0.0
     discriminator_width: int = 32
     noise: float = 0.07
+    rare: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.commitment, self.codebook, self.geometric, self.adversarial, self.noise) < 0:
+        if min(self.commitment, self.codebook, self.geometric, self.adversarial, self.noise, self.rare) < 0:
             raise ConfigError(f"{self}", "weights of at least 0")
 
 
@@ -132,19 +135,26 @@ class Autoencoding(nn.Module):
     def _told(self, heads: Heads, x: Tensor) -> Tensor:
         """The loss of what an ``Autoencoder`` says, a scalar."""
         count = 1 + heads.values.shape[1]
-        distance, values, bits = x[:, :1], x[:, 1:count], x[:, count:]
+        distance, values = x[:, :1], x[:, 1:count]
         returned = (distance > -1).float()
         surprise = [heads.surfaces.surprise(distance), -log_laplace(values, heads.values, heads.spreads)]
         loss = F.binary_cross_entropy_with_logits(heads.returned.float(), returned)
-        means = (torch.cat(surprise, 1) * returned).sum((0, 2, 3)) / returned.sum().clamp(min=1)
+        weight = torch.ones_like(returned)
+        if codes := heads.classes.shape[1]:
+            code = _code(x[:, count:])
+            weight = self._rarity(code, codes)[:, None]
+            unlikely = F.cross_entropy(heads.classes.float(), code, reduction="none")
+            loss = loss + self.weights.get("label", 1.0) * (weight[:, 0] * unlikely).sum() / weight.sum()
+        weight = weight * returned
+        means = (torch.cat(surprise, 1) * weight).sum((0, 2, 3)) / weight.sum().clamp(min=1)
         for name, mean in zip(self.tensors.channels, means, strict=False):  # the label has no mean
             loss = loss + self.weights.get(name, 1.0) * mean
-        if heads.classes.shape[1]:
-            code = torch.zeros_like(x[:, 0], dtype=torch.long)
-            for bit in bits.unbind(1):
-                code = 2 * code + (bit > 0)
-            loss = loss + self.weights.get("label", 1.0) * F.cross_entropy(heads.classes.float(), code)
         return loss
+
+    def _rarity(self, code: Tensor, codes: int) -> Tensor:
+        """How much each cell of codes (B, H, W) counts, (B, H, W); see ``Losses.rare``."""
+        share = torch.bincount(code.flatten(), minlength=codes).float() / code.numel()
+        return share.clamp(min=1 / code.numel()).pow(-self.losses.rare)[code]
 
     def _points(self, x: Tensor) -> Tensor:
         """(B, 3, H, W / 4) mean points of neighbours, in units of the farthest range."""
@@ -157,6 +167,14 @@ class Autoencoding(nn.Module):
         fooled: Tensor = -torch.func.functional_call(judge, frozen, (output,)).mean()
         verdict = F.relu(1 - judge(x)).mean() + F.relu(1 + judge(output.detach())).mean()
         return self.losses.adversarial * fooled + verdict / 2
+
+
+def _code(bits: Tensor) -> Tensor:
+    """(B, bits, H, W), -1 and 1, highest first, as codes (B, H, W)."""
+    code = torch.zeros_like(bits[:, 0], dtype=torch.long)
+    for bit in bits.unbind(1):
+        code = 2 * code + (bit > 0)
+    return code
 
 
 class Discriminator(nn.Module):
