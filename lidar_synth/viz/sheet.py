@@ -91,7 +91,7 @@ def contact_sheet(
     figure.text(0.01, 1 - 0.25 / height, title, color=_INK, fontsize=15, va="center")
     for place, view in enumerate(tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)):
         tile = grid[place].subgridspec(1 + len(strips), 1, height_ratios=[5, *[1] * len(strips)], hspace=0.02)
-        above, *below = (figure.add_subplot(part) for part in tile)
+        above, *below = (figure.add_subplot(tile[row]) for row in range(1 + len(strips)))
         _bare(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
         for axes, channel in zip(below, strips, strict=True):
             _bare(axes, picture(view.image, channel, colours[channel]))
