@@ -1,0 +1,76 @@
+"""What the autoencoder of a latent model keeps of a scan, class by class: the figures of docs/models.md.
+
+    python tools/codec_card.py NAME=MODEL ... [--count 24]
+
+    python tools/codec_card.py "as it ships=town" "mine=runs/town_codec/town_codec.safetensors"
+
+Scans of a town that no model was trained on, there and back, the likeliest of everything that the decoder says. A flow
+on its latents comes no nearer than this.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from lidar_synth.checkpoint import CODEC, load_checkpoint
+from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.codec import Latent
+from lidar_synth.errors import ConfigError
+from lidar_synth.generator import find_model
+from lidar_synth.projection import project
+from lidar_synth.scan import RangeImage
+from lidar_synth.town import Town
+from lidar_synth.train import reconstruct
+
+SEED, INTERVAL = 7, 4.0
+"""Of the town, and the seconds between its scans."""
+CLASSES = ("road", "building", "fence", "vegetation", "car", "pole")
+
+
+def there_and_back(model: Path, images: list[RangeImage]) -> list[RangeImage]:
+    """Range images through the autoencoder of a checkpoint."""
+    checkpoint = load_checkpoint(model)
+    if CODEC not in checkpoint.networks:
+        raise ConfigError(f"{model} without an autoencoder", "the checkpoint of one, or of a latent model")
+    codec = Latent(checkpoint.networks[CODEC].eval(), checkpoint.header.tensors)
+    made = []
+    for image in tqdm(images, desc=model.stem, unit="scan"):
+        made += reconstruct(codec, codec.tensors.from_images([image]), image.sensor)
+    return made
+
+
+def row(name: str, real: list[RangeImage], made: list[RangeImage]) -> str:
+    """A line of the table, per cent."""
+    a, b = (np.stack([image.range for image in images]) for images in (real, made))
+    labels, said = (np.stack([image.channels["label"] for image in images]) for images in (real, made))
+    both = (a > 0) & (b > 0)
+    off = np.abs(np.divide(b, a, where=both, out=np.ones_like(a)) - 1)
+    right = [((a > 0) == (b > 0)).mean(), (labels == said)[both & (labels != IGNORE)].mean()]
+    medians = [np.median(off[both & (labels == TRAIN_ID[one])]) for one in CLASSES]
+    return f"| {name} | {' | '.join(f'{100 * v:.1f}' for v in (*right, *medians))} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="+", metavar="NAME=MODEL")
+    parser.add_argument("--count", type=int, default=24, help="scans")
+    given = parser.parse_args()
+
+    town = Town(SEED, scans=given.count, interval=INTERVAL)
+    images = [project(town[i], channels=["reflectance", "label"]) for i in tqdm(range(given.count), desc="town")]
+    lines = []
+    for text in given.models:
+        name, model = text.split("=", 1)
+        with torch.inference_mode():
+            lines.append(row(name, images, there_and_back(find_model(model), images)))
+    print(f"{given.count} scans of town {SEED}; per cent: cells, labels; medians of |range / true range - 1|\n")
+    columns = ("returns right", "labels right", *CLASSES)
+    print(f"| autoencoder | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
