@@ -151,6 +151,7 @@ def test_two_processes_train_as_one(scans: Path, tmp_path: Path) -> None:
         env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [str(tmp_path / "two" / "run" / "run.safetensors")]
     one, two = state(tmp_path / "one"), state(tmp_path / "two")
     for name in one:
         assert torch.allclose(one[name], two[name], atol=1e-4), name

@@ -1,5 +1,6 @@
 """``lidar-synth train`` and ``lidar-synth distill``: train a teacher, distil a student."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -28,7 +29,7 @@ def train(config: ConfigFile, overrides: Overrides = None, resume: Resume = Fals
     from lidar_synth.cli.run import run
     from lidar_synth.config import TrainConfig, load_config
 
-    typer.echo(run(load_config(TrainConfig, config, overrides or ()), resume, minutes))
+    _say(run(load_config(TrainConfig, config, overrides or ()), resume, minutes))
 
 
 def distill(config: ConfigFile, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
@@ -45,4 +46,10 @@ def distill(config: ConfigFile, overrides: Overrides = None, resume: Resume = Fa
     from lidar_synth.cli.run import run
     from lidar_synth.config import DistillConfig, load_config
 
-    typer.echo(run(load_config(DistillConfig, config, overrides or ()), resume, minutes))
+    _say(run(load_config(DistillConfig, config, overrides or ()), resume, minutes))
+
+
+def _say(path: Path) -> None:
+    """Where the checkpoint is, once for all processes of torchrun."""
+    if os.environ.get("RANK", "0") == "0":
+        typer.echo(path)
