@@ -26,7 +26,7 @@ from lidar_synth.metrics import Score, evaluate
 from lidar_synth.metrics.segmentation import Judge, load_judge, mean_iou
 from lidar_synth.projection import project, unproject
 from lidar_synth.scan import Scan
-from lidar_synth.town import Town
+from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.viz import write_view
 
 REFERENCE, OTHER = 1, 2
@@ -51,9 +51,9 @@ def relabelled(scan: Scan, other: Scan) -> Scan:
 
 
 def town(seed: int, count: int) -> list[Scan]:
-    """Scans of one town, a second apart."""
-    source = Town(seed, scans=count, interval=1.0)
-    return [source[i] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
+    """Scans of one town, each on another street: neighbouring ones would make a town of three or four streets."""
+    source = Town(seed, scans=count * STRETCH_FRAMES, interval=1.0)
+    return [source[i * STRETCH_FRAMES] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
 
 
 def row(name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge) -> str:
