@@ -4,8 +4,8 @@
 
     python tools/codec_card.py "as it ships=town" "mine=runs/town_codec/town_codec.safetensors"
 
-Scans of a town that no model was trained on, there and back, the likeliest of everything that the decoder says. A flow
-on its latents comes no nearer than this.
+Scans of a town that no model was trained on, each on another street, there and back, the likeliest of everything that
+the decoder says. A flow on its latents comes no nearer than this.
 """
 
 import argparse
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from model_card import town
 from tqdm import tqdm
 
 from lidar_synth.checkpoint import CODEC, load_checkpoint
@@ -22,11 +23,10 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.generator import find_model
 from lidar_synth.projection import project
 from lidar_synth.scan import RangeImage
-from lidar_synth.town import Town
 from lidar_synth.train import reconstruct
 
-SEED, INTERVAL = 7, 4.0
-"""Of the town, and the seconds between its scans."""
+SEED = 7
+"""Of the town."""
 CLASSES = ("road", "building", "fence", "vegetation", "car", "pole")
 
 
@@ -59,8 +59,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=24, help="scans")
     given = parser.parse_args()
 
-    town = Town(SEED, scans=given.count, interval=INTERVAL)
-    images = [project(town[i], channels=["reflectance", "label"]) for i in tqdm(range(given.count), desc="town")]
+    images = [project(scan, channels=["reflectance", "label"]) for scan in town(SEED, given.count)]
     lines = []
     for text in given.models:
         name, model = text.split("=", 1)

@@ -154,7 +154,7 @@ class Autoencoding(nn.Module):
     def _rarity(self, code: Tensor, codes: int) -> Tensor:
         """How much each cell of codes (B, H, W) counts, (B, H, W); see ``Losses.rare``."""
         share = torch.bincount(code.flatten(), minlength=codes).float() / code.numel()
-        return share.clamp(min=1 / code.numel()).pow(-self.losses.rare)[code]
+        return share.pow(-self.losses.rare)[code]
 
     def _points(self, x: Tensor) -> Tensor:
         """(B, 3, H, W / 4) mean points of neighbours, in units of the farthest range."""
