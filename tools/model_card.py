@@ -27,13 +27,16 @@ from lidar_synth.metrics.segmentation import Judge, load_judge, mean_iou
 from lidar_synth.projection import project, unproject
 from lidar_synth.scan import Scan
 from lidar_synth.town import STRETCH_FRAMES, Town
-from lidar_synth.viz import write_view
+from lidar_synth.viz import Orbit, render, write_view
 
 REFERENCE, OTHER = 1, 2
 """Seeds of the towns to compare with."""
 SEED = 1
 """Of the noise."""
 TILES = 16
+CLOSE = 4
+NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)).camera()
+"""Where cars and poles can be told from each other."""
 
 
 def generate(model: str, steps: int | None, count: int) -> list[Scan]:
@@ -83,6 +86,14 @@ def picture(path: Path, scans: Sequence[Scan], title: str) -> None:
     shrink(path)
 
 
+def near(path: Path, scans: Sequence[Scan], reference: Sequence[Scan]) -> None:
+    """Fewer scans, from nearer by: generated ones on the left, the town's on the right."""
+    pairs = zip(scans, reference, strict=True)
+    rows = [[render(scan, "label", camera=NEAR, size=(900, 480), boxes=False) for scan in pair] for pair in pairs]
+    Image.fromarray(np.vstack([np.hstack(row) for row in rows])).save(path)
+    shrink(path)
+
+
 def shrink(path: Path) -> None:
     """Fewer pixels and colours in a PNG."""
     image = Image.open(path).convert("RGB")
@@ -96,7 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
     parser.add_argument("--count", type=int, default=512, help="scans of every row")
-    parser.add_argument("--pictures", type=Path, help="folder for a sheet of the first model and one of the town")
+    parser.add_argument("--pictures", type=Path, help="folder for sheets of the first model and of the town")
     given = parser.parse_args()
 
     judge = load_judge()
@@ -111,6 +122,7 @@ def main() -> None:
             apart = np.linspace(0, given.count - 1, TILES).astype(int)
             picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans that were not chosen")
             picture(given.pictures / "town.png", [reference[k] for k in apart], f"{TILES} scans of the town")
+            near(given.pictures / "near.png", scans[:CLOSE], [reference[k] for k in apart[:CLOSE]])
     print(f"{given.count} scans a row, {given.count} of the town\n\n{header(reference, judge)}")
     print("\n".join(lines))
 

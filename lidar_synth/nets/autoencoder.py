@@ -21,6 +21,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.nets.codebook import follow
 from lidar_synth.nets.convolution import check_shape, pair, reduced
 from lidar_synth.nets.layers import EPS
+from lidar_synth.nets.readings import Readings
 from lidar_synth.nets.surfaces import Planes, Surfaces, laplace
 from lidar_synth.normalize import NORMALISATIONS
 
@@ -41,15 +42,13 @@ class Heads(NamedTuple):
 
     Args:
         surfaces: what it may see, as if every cell had a return.
-        values: (B, V, H, W) medians of the other values, such as the reflectance.
-        spreads: (B, V, H, W) logarithms of their spreads.
+        readings: the other values, such as the reflectance.
         returned: (B, 1, H, W) logit of a return.
         classes: (B, K, H, W) logits of the label's codes; K = 0 without labels.
     """
 
     surfaces: Surfaces
-    values: Tensor
-    spreads: Tensor
+    readings: Readings
     returned: Tensor
     classes: Tensor
 
@@ -150,7 +149,7 @@ class Autoencoder(nn.Module):
         self.spread = nn.Conv2d(outer, DETAIL[0] * DETAIL[1] * fine, 1)
         self.refine = CircularConv(fine)
         self.planes = Planes(outer, DETAIL, PLANES, NORMALISATIONS[normalisation])
-        self.sizes = [PLANES, self.values, self.values, 1, codes]
+        self.sizes = [PLANES, self.values, self.values, self.values, 1, codes]
         self.heads = nn.Conv2d(fine, sum(self.sizes), 1)
         # Latents leave with mean 0 and variance 1 per channel, as a flow from standard normal noise likes them.
         self.register_buffer("shift", torch.zeros(latent_channels))
@@ -182,10 +181,10 @@ class Autoencoder(nn.Module):
         """
         check_shape(z, self.latent_shape, "a latent")
         said = self.expand(z * _channel(self.scale) + _channel(self.shift))
-        distance, values, returned = said.surfaces.likeliest(), said.values, said.returned.float()
+        distance, values, returned = said.surfaces.likeliest(), said.readings.likeliest(), said.returned.float()
         if chance is not None:
             distance = distance + ROUGHNESS * laplace(chance[:, :1])
-            values = values + said.spreads.exp() * laplace(chance[:, 1:-1])
+            values = said.readings.drawn(chance[:, 1:-1])
             returned = returned + torch.logit(chance[:, -1:])
         parts = [torch.where(returned > 0, distance, -1.0), values]
         if self.bits:
@@ -209,8 +208,9 @@ class Autoencoder(nn.Module):
         h = self.decode_outer(F.pixel_shuffle(self.split(h), 2) + self.place_outer)
         ranges, doubts = self.planes(h)
         h = _unpatch(self.spread(h), self.fine) + self.place_fine
-        chosen, values, spreads, *rest = self.heads(h + F.silu(self.refine(h))).split(self.sizes, 1)
-        return Heads(Surfaces(ranges, doubts, chosen.float()), values.float(), spreads.float().clamp(*SPREADS), *rest)
+        chosen, middles, spreads, blank, *rest = self.heads(h + F.silu(self.refine(h))).split(self.sizes, 1)
+        readings = Readings(middles.float(), spreads.float().clamp(*SPREADS), blank.float())
+        return Heads(Surfaces(ranges, doubts, chosen.float()), readings, *rest)
 
     def _corners(self, code: Tensor) -> Tensor:
         """Codes (B, H, W) as their bits (B, bits, H, W), -1 and 1, highest first."""

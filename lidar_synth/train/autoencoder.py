@@ -29,7 +29,6 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.flow import Example, Metric
 from lidar_synth.nets.autoencoder import Autoencoder, Heads
 from lidar_synth.nets.convolution import Norm, WrapConv
-from lidar_synth.nets.surfaces import log_laplace
 from lidar_synth.nets.vqvae import VQVAE, Encoding
 from lidar_synth.normalize import CHANNELS, TensorFormat
 from lidar_synth.scan import RangeImage
@@ -134,10 +133,10 @@ class Autoencoding(nn.Module):
 
     def _told(self, heads: Heads, x: Tensor) -> Tensor:
         """The loss of what an ``Autoencoder`` says, a scalar."""
-        count = 1 + heads.values.shape[1]
+        count = 1 + heads.readings.middles.shape[1]
         distance, values = x[:, :1], x[:, 1:count]
         returned = (distance > -1).float()
-        surprise = [heads.surfaces.surprise(distance), -log_laplace(values, heads.values, heads.spreads)]
+        surprise = [heads.surfaces.surprise(distance), heads.readings.surprise(values)]
         loss = F.binary_cross_entropy_with_logits(heads.returned.float(), returned)
         weight = torch.ones_like(returned)
         if codes := heads.classes.shape[1]:

@@ -1,0 +1,48 @@
+"""What a sensor reads of a return beside its range, such as the reflectance: a number, or 0 for no visible reason.
+
+One return in fifteen of an HDL-64E has the reflectance 0, most of them where it is dark or far. A distribution with one
+peak makes too few of them or everything darker; so 0 has a chance of its own.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+BLANK = -1.0
+"""A reading of 0, normalised."""
+_SURE = 1e-6
+
+
+class Readings(NamedTuple):
+    """What each cell may read of V channels: 0, or a logistic distribution.
+
+    Args:
+        middles: (B, V, H, W) medians, normalised, of what is not 0.
+        spreads: (B, V, H, W) logarithms of the distributions' scales.
+        blank: (B, V, H, W) logits of a 0.
+    """
+
+    middles: Tensor
+    spreads: Tensor
+    blank: Tensor
+
+    def surprise(self, x: Tensor) -> Tensor:
+        """(B, V, H, W) negative log-likelihoods of normalised readings (B, V, H, W); what would lie below 0 reads 0."""
+        off = (x - self.middles) * torch.exp(-self.spreads)
+        number = F.logsigmoid(-self.blank)
+        below = torch.logaddexp(F.logsigmoid(self.blank), number + F.logsigmoid(off))
+        density = number + F.logsigmoid(off) + F.logsigmoid(-off) - self.spreads
+        return -torch.where(x > BLANK, density, below)
+
+    def likeliest(self) -> Tensor:
+        """(B, V, H, W) 0, or the median."""
+        return torch.where(self.blank > 0, BLANK, self.middles)
+
+    def drawn(self, chance: Tensor) -> Tensor:
+        """(B, V, H, W) readings by as many numbers in (0, 1)."""
+        blank = torch.sigmoid(self.blank)
+        rest = ((chance - blank) / (1 - blank)).clamp(_SURE, 1 - _SURE)
+        numbers = (self.middles + self.spreads.exp() * torch.logit(rest)).clamp(min=BLANK)
+        return torch.where(chance < blank, BLANK, numbers)
