@@ -20,10 +20,10 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.classes import IGNORE, TRAIN_ID
 from lidar_synth.generator import load_generator
 from lidar_synth.metrics import Score, evaluate
-from lidar_synth.metrics.segmentation import Judge, load_judge, mean_iou
+from lidar_synth.metrics.segmentation import Judge, class_ious, load_judge, mean_iou
 from lidar_synth.projection import project, unproject
 from lidar_synth.scan import Scan
 from lidar_synth.town import STRETCH_FRAMES, Town
@@ -33,6 +33,7 @@ REFERENCE, OTHER = 1, 2
 """Seeds of the towns to compare with."""
 SEED = 1
 """Of the noise."""
+CLASSES = ("road", "sidewalk", "terrain", "car", "building", "fence", "vegetation", "trunk", "pole")
 TILES = 16
 CLOSE = 4
 NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)).camera()
@@ -64,6 +65,12 @@ def row(name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judg
     values = [f"{score.value:.4g}" for score in _scores(reference, scans, judge)]
     agreement = mean_iou(judge.agreement(scans)) if scans[0].label is not None else float("nan")
     return f"| {name} | {' | '.join(values)} | {100 * agreement:.1f} |"
+
+
+def class_row(name: str, scans: Sequence[Scan], judge: Judge) -> str:
+    """A line of the second table: where the segmenter sees what the labels say, class by class."""
+    ious = class_ious(judge.agreement(scans))
+    return f"| {name} | {' | '.join(f'{100 * ious[TRAIN_ID[one]]:.0f}' for one in CLASSES)} |"
 
 
 def header(reference: Sequence[Scan], judge: Judge) -> str:
@@ -99,8 +106,9 @@ def shrink(path: Path) -> None:
     image = Image.open(path).convert("RGB")
     width = 1500
     image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
-    # Few cells are cars or poles: a palette by number of pixels would lose their colours.
-    image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True)
+    # Few cells are cars or poles: a palette by number of pixels would lose their colours, one by coverage alone the
+    # background's.
+    image.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def main() -> None:
@@ -112,12 +120,15 @@ def main() -> None:
 
     judge = load_judge()
     reference = town(REFERENCE, given.count)
-    lines = [row("another town", reference, town(OTHER, given.count), judge)]
+    other = town(OTHER, given.count)
+    lines, classes = [row("another town", reference, other, judge)], [class_row("another town", other, judge)]
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
         scans = generate(model, int(steps) if steps else None, given.count)
         lines.append(row(name, reference, scans, judge))
+        if scans[0].label is not None:
+            classes.append(class_row(name, scans, judge))
         if i == 0 and given.pictures:
             apart = np.linspace(0, given.count - 1, TILES).astype(int)
             picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans that were not chosen")
@@ -125,6 +136,8 @@ def main() -> None:
             near(given.pictures / "near.png", scans[:CLOSE], [reference[k] for k in apart[:CLOSE]])
     print(f"{given.count} scans a row, {given.count} of the town\n\n{header(reference, judge)}")
     print("\n".join(lines))
+    print(f"\n| IoU with the segmenter, % | {' | '.join(CLASSES)} |\n|---|{'---:|' * len(CLASSES)}")
+    print("\n".join(classes))
 
 
 if __name__ == "__main__":
