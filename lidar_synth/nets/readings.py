@@ -1,7 +1,7 @@
 """What a sensor reads of a return beside its range, such as the reflectance: a number, or 0 for no visible reason.
 
-One return in fifteen of an HDL-64E has the reflectance 0, most of them where it is dark or far. A distribution with one
-peak makes too few of them or everything darker; so 0 has a chance of its own.
+One return in eleven reads 0 in scans of KITTI-360, one in six in KITTI's. A distribution with one peak makes too few of
+them, or everything darker; so 0 has a chance of its own.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from torch import Tensor
 
 BLANK = -1.0
 """A reading of 0, normalised."""
-_SURE = 1e-6
+_SURE = 1e-6  # how near to 0 and 1 a chance may come: its logit stays finite
 
 
 class Readings(NamedTuple):
