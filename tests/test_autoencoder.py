@@ -93,7 +93,15 @@ def test_chance_draws_what_was_said() -> None:
     back = images[:, 0] > -1
     share = torch.sigmoid(said.returned[0, 0])
     assert (back.float().mean(0) - share).abs().max() < 5 * 0.5 / draws**0.5
-    assert ((images[:, 1:2] - said.readings.drawn(chance[:, 1:2])).abs() > 1e-3).float().mean() < 1e-3
+    blank, middle, scale = (
+        said.readings.blank[0, 0].sigmoid(),
+        said.readings.middles[0, 0],
+        said.readings.spreads[0, 0].exp(),
+    )
+    for widths, below in ((0.0, 0.5), (1.0, 0.731)):  # of a logistic distribution
+        expected = torch.where(middle + widths * scale > -1, blank + (1 - blank) * below, 0)
+        found = (images[:, 1] <= middle + widths * scale).float().mean(0)
+        assert (found - expected).abs().max() < 5 * 0.5 / draws**0.5
     off = torch.where(back, (images[:, 0] - said.surfaces.likeliest()[0, 0]).abs(), torch.nan).nanmean(0)
     assert torch.allclose(off[share > 0.3], torch.tensor(ROUGHNESS), rtol=0.25)
     same = net.decode(z)[:, 2:].expand(draws, -1, -1, -1)
@@ -112,7 +120,9 @@ def test_the_loss_by_hand(rare: float) -> None:
     label = torch.where(label == IGNORE, 19, label)
     share = said.surfaces.chosen.softmax(1)
     ranges = Laplace(said.surfaces.values, said.surfaces.spreads.exp()).log_prob(x[:, :1]).exp()
-    others = -said.readings.surprise(x[:, 1:2])
+    blank, off = said.readings.blank.sigmoid(), (x[:, 1:2] - said.readings.middles) / said.readings.spreads.exp()
+    number = (1 - blank) / (4 * said.readings.spreads.exp() * torch.cosh(off / 2) ** 2)
+    others = torch.where(x[:, 1:2] > -1, number, blank + (1 - blank) * torch.sigmoid(off)).log()
     cells = torch.tensor([(label == code).double().mean().item() for code in label.flatten()]).reshape(label.shape)
     weight = cells.pow(-rare)
 

@@ -11,7 +11,7 @@ tools/model_card.py; the time grid is the selected one for adaptive_piecewise an
 import argparse
 from pathlib import Path
 
-from model_card import REFERENCE, generate, header, row, town
+from model_card import REFERENCE, generate, header, rows, town
 
 from lidar_synth.checkpoint import read_header
 from lidar_synth.cli.run import checkpoint_path, run
@@ -58,13 +58,13 @@ def main() -> None:
 
     judge, reference = load_judge(), town(REFERENCE, given.count)
     lines = [
-        row(f"teacher, {steps} steps", reference, generate(str(given.teacher), steps, given.count), judge)
+        rows(f"teacher, {steps} steps", reference, generate(str(given.teacher), steps, given.count), judge)[0]
         for steps in (50, 4)
     ]
     for strategy in STRATEGIES:
         path, what = student(strategy, given.teacher, given.work, given.evaluations, given.overrides)
         scans = generate(str(path), None, given.count)
-        lines.append(row(f"{strategy}, 4 steps ({what})", reference, scans, judge))
+        lines.append(rows(f"{strategy}, 4 steps ({what})", reference, scans, judge)[0])
     print(f"{given.evaluations} evaluations for each strategy, {given.count} scans\n\n{header(reference, judge)}")
     print("\n".join(lines))
 

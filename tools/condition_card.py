@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import REFERENCE, SEED, header, relabelled, row, shrink, town
+from model_card import REFERENCE, SEED, header, relabelled, rows, shrink, town
 from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
@@ -133,7 +133,7 @@ def main() -> None:
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
         kind, scans = generate(model, int(steps) if steps else None, real)
-        lines.append(row(name, real, scans, judge))
+        lines.append(rows(name, real, scans, judge)[0])
         if i == 0:
             verdicts.append(verdict("the real scans", kind, real, real, judge))
         verdicts.append(verdict(name, kind, scans, real, judge))

@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.classes import IGNORE, NAMES, TRAIN_ID
 from lidar_synth.generator import load_generator
 from lidar_synth.metrics import Score, evaluate
 from lidar_synth.metrics.segmentation import Judge, class_ious, load_judge, mean_iou
@@ -60,21 +60,19 @@ def town(seed: int, count: int) -> list[Scan]:
     return [source[i * STRETCH_FRAMES] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
 
 
-def row(name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge) -> str:
-    """A line of the table."""
+def rows(name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge) -> tuple[str, str]:
+    """A line of the table, and one of the second table: what the segmenter sees as the labels say, class by class."""
     values = [f"{score.value:.4g}" for score in _scores(reference, scans, judge)]
-    agreement = mean_iou(judge.agreement(scans)) if scans[0].label is not None else float("nan")
-    return f"| {name} | {' | '.join(values)} | {100 * agreement:.1f} |"
-
-
-def class_row(name: str, scans: Sequence[Scan], judge: Judge) -> str:
-    """A line of the second table: where the segmenter sees what the labels say, class by class."""
-    ious = class_ious(judge.agreement(scans))
-    return f"| {name} | {' | '.join(f'{100 * ious[TRAIN_ID[one]]:.0f}' for one in CLASSES)} |"
+    mean, ious = float("nan"), np.full(len(NAMES), np.nan)
+    if scans[0].label is not None:
+        table = judge.agreement(scans)
+        mean, ious = mean_iou(table), class_ious(table)
+    classes = [f"{100 * ious[TRAIN_ID[one]]:.0f}" for one in CLASSES]
+    return f"| {name} | {' | '.join(values)} | {100 * mean:.1f} |", f"| {name} | {' | '.join(classes)} |"
 
 
 def header(reference: Sequence[Scan], judge: Judge) -> str:
-    """The table's head, in the order of ``row``."""
+    """The table's head, in the order of ``rows``."""
     scores = _scores(reference[:2], reference[2:4], judge, progress=False)
     names = [f"{score.metric} ({score.protocol})" for score in scores]
     return f"| scans | {' | '.join(names)} | mIoU with the town segmenter, % |\n|---|{'---:|' * (len(names) + 1)}"
@@ -96,8 +94,8 @@ def picture(path: Path, scans: Sequence[Scan], title: str) -> None:
 def near(path: Path, scans: Sequence[Scan], reference: Sequence[Scan]) -> None:
     """Fewer scans, from nearer by: generated ones on the left, the town's on the right."""
     pairs = zip(scans, reference, strict=True)
-    rows = [[render(scan, "label", camera=NEAR, size=(900, 480), boxes=False) for scan in pair] for pair in pairs]
-    Image.fromarray(np.vstack([np.hstack(row) for row in rows])).save(path)
+    seen = [[render(scan, "label", camera=NEAR, size=(900, 480), boxes=False) for scan in pair] for pair in pairs]
+    Image.fromarray(np.vstack([np.hstack(pair) for pair in seen])).save(path)
     shrink(path)
 
 
@@ -120,24 +118,21 @@ def main() -> None:
 
     judge = load_judge()
     reference = town(REFERENCE, given.count)
-    other = town(OTHER, given.count)
-    lines, classes = [row("another town", reference, other, judge)], [class_row("another town", other, judge)]
+    lines = [rows("another town", reference, town(OTHER, given.count), judge)]
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
         scans = generate(model, int(steps) if steps else None, given.count)
-        lines.append(row(name, reference, scans, judge))
-        if scans[0].label is not None:
-            classes.append(class_row(name, scans, judge))
+        lines.append(rows(name, reference, scans, judge))
         if i == 0 and given.pictures:
             apart = np.linspace(0, given.count - 1, TILES).astype(int)
             picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans that were not chosen")
             picture(given.pictures / "town.png", [reference[k] for k in apart], f"{TILES} scans of the town")
             near(given.pictures / "near.png", scans[:CLOSE], [reference[k] for k in apart[:CLOSE]])
     print(f"{given.count} scans a row, {given.count} of the town\n\n{header(reference, judge)}")
-    print("\n".join(lines))
+    print("\n".join(line for line, _ in lines))
     print(f"\n| IoU with the segmenter, % | {' | '.join(CLASSES)} |\n|---|{'---:|' * len(CLASSES)}")
-    print("\n".join(classes))
+    print("\n".join(classes for _, classes in lines))
 
 
 if __name__ == "__main__":
