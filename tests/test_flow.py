@@ -113,8 +113,11 @@ def test_distributions_of_t_are_quantile_functions_within_0_and_1(name: str) -> 
     u = torch.tensor([2.0**-24, 0.1, 0.5, 0.7, 1 - 2.0**-24])
     t = TIMESTEPS[name](u)
     assert (t.diff() > 0).all() and t[0] >= 0 and t[-1] <= 1
+    odds = 2 if name.endswith("shifted") else 1
+    t = t / (odds - (odds - 1) * t)
     assert t[2].item() == pytest.approx(0.5)
-    assert (TIMESTEPS[name](1 - u) + t - 1).abs().max() < 1e-5
+    other = TIMESTEPS[name](1 - u)
+    assert (other / (odds - (odds - 1) * other) + t - 1).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize(

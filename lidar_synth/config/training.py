@@ -39,7 +39,7 @@ class TrainConfig(Run):
     codec: Path | None = None
     condition: Condition | None = None
     init: Path | None = None
-    timesteps: Literal["uniform", "u_shaped", "logit_normal"] = "uniform"
+    timesteps: Literal["uniform", "u_shaped", "logit_normal", "logit_normal_shifted"] = "uniform"
     steps: Count = 50
     losses: Losses = Losses()
 
