@@ -13,14 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from model_card import town
+from model_card import open_codec, town
 from tqdm import tqdm
 
-from lidar_synth.checkpoint import CODEC, load_checkpoint
 from lidar_synth.classes import IGNORE, TRAIN_ID
-from lidar_synth.codec import Latent
-from lidar_synth.errors import ConfigError
-from lidar_synth.generator import find_model
 from lidar_synth.projection import project
 from lidar_synth.scan import RangeImage
 from lidar_synth.train import reconstruct
@@ -30,14 +26,10 @@ SEED = 7
 CLASSES = ("road", "building", "fence", "vegetation", "car", "pole")
 
 
-def there_and_back(model: Path, images: list[RangeImage]) -> list[RangeImage]:
+def there_and_back(model: str, images: list[RangeImage]) -> list[RangeImage]:
     """Range images through the autoencoder of a checkpoint."""
-    checkpoint = load_checkpoint(model)
-    if CODEC not in checkpoint.networks:
-        raise ConfigError(f"{model} without an autoencoder", "the checkpoint of one, or of a latent model")
-    codec = Latent(checkpoint.networks[CODEC].eval(), checkpoint.header.tensors)
-    made = []
-    for image in tqdm(images, desc=model.stem, unit="scan"):
+    codec, made = open_codec(model), []
+    for image in tqdm(images, desc=Path(model).stem, unit="scan"):
         made += reconstruct(codec, codec.tensors.from_images([image]), image.sensor)
     return made
 
@@ -64,7 +56,7 @@ def main() -> None:
     for text in given.models:
         name, model = text.split("=", 1)
         with torch.inference_mode():
-            lines.append(row(name, images, there_and_back(find_model(model), images)))
+            lines.append(row(name, images, there_and_back(model, images)))
     print(f"{given.count} scans of town {SEED}; per cent: cells, labels; medians of |range / true range - 1|\n")
     columns = ("returns right", "labels right", *CLASSES)
     print(f"| autoencoder | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")

@@ -6,7 +6,8 @@
         "teacher, 4 steps=RUN/town_teacher.safetensors:4" --pictures docs/models
 
 Every model makes scans from the same noise. They stand beside scans of a town that no model was trained on (seed 1);
-the first row is a third town (seed 2), which is as near as different streets of one kind come.
+the first row is a third town (seed 2), which is as near as different streets of one kind come. STEPS of 0 stand for the
+third town's scans through the autoencoder of a latent model, which is as near as its flow can come.
 
 Models with a condition have a card of their own: tools/condition_card.py.
 """
@@ -20,12 +21,16 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from lidar_synth.checkpoint import CODEC, load_checkpoint
 from lidar_synth.classes import IGNORE, NAMES, TRAIN_ID
-from lidar_synth.generator import load_generator
+from lidar_synth.codec import Latent
+from lidar_synth.errors import ConfigError
+from lidar_synth.generator import find_model, load_generator
 from lidar_synth.metrics import Score, evaluate
 from lidar_synth.metrics.segmentation import Judge, class_ious, load_judge, mean_iou
+from lidar_synth.noise import uniform
 from lidar_synth.projection import project, unproject
-from lidar_synth.scan import Scan
+from lidar_synth.scan import SYNTHETIC, Scan
 from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.viz import Orbit, render, write_view
 
@@ -34,6 +39,8 @@ REFERENCE, OTHER = 1, 2
 SEED = 1
 """Of the noise."""
 CLASSES = ("road", "sidewalk", "terrain", "car", "building", "fence", "vegetation", "trunk", "pole")
+SPAN = 8
+"""Columns to either side in which a wall shall be straight."""
 TILES = 16
 CLOSE = 4
 NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)).camera()
@@ -45,6 +52,29 @@ def generate(model: str, steps: int | None, count: int) -> list[Scan]:
     generator = load_generator(model)
     indices = tqdm(range(count), desc=Path(model).stem, unit="scan")
     return [generator.scans(SEED, [i], steps=steps)[0] for i in indices]
+
+
+def open_codec(model: str) -> Latent:
+    """The autoencoder of a checkpoint.
+
+    Raises:
+        ConfigError: on one without.
+    """
+    checkpoint = load_checkpoint(find_model(model))
+    if CODEC not in checkpoint.networks:
+        raise ConfigError(f"{model} without an autoencoder", "the checkpoint of one, or of a latent model")
+    return Latent(checkpoint.networks[CODEC].eval(), checkpoint.header.tensors)
+
+
+def drawn_again(model: str, scans: Sequence[Scan]) -> list[Scan]:
+    """Scans through the autoencoder of a model, drawn from what it says."""
+    codec, made = open_codec(model), []
+    for i, scan in enumerate(tqdm(scans, desc=f"{Path(model).stem}, autoencoder", unit="scan")):
+        image = project(scan, channels=["reflectance", "label"])
+        chance = uniform(SEED, [i], (codec.draws, *image.sensor.shape), "cpu")
+        x = codec.decode(codec.encode(codec.tensors.from_images([image])), chance)
+        made.append(replace(unproject(codec.tensors.to_images(x, image.sensor)[0]), domain=SYNTHETIC))
+    return made
 
 
 def relabelled(scan: Scan, other: Scan) -> Scan:
@@ -61,14 +91,29 @@ def town(seed: int, count: int) -> list[Scan]:
 
 
 def rows(name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge) -> tuple[str, str]:
-    """A line of the table, and one of the second table: what the segmenter sees as the labels say, class by class."""
+    """A line of the table, and one of the second table: what the segmenter sees as the labels say, class by class, and
+    how straight walls are."""
     values = [f"{score.value:.4g}" for score in _scores(reference, scans, judge)]
-    mean, ious = float("nan"), np.full(len(NAMES), np.nan)
+    mean, bent, ious = float("nan"), float("nan"), np.full(len(NAMES), np.nan)
     if scans[0].label is not None:
         table = judge.agreement(scans)
-        mean, ious = mean_iou(table), class_ious(table)
-    classes = [f"{100 * ious[TRAIN_ID[one]]:.0f}" for one in CLASSES]
+        mean, bent, ious = mean_iou(table), bend(scans), class_ious(table)
+    classes = [f"{100 * ious[TRAIN_ID[one]]:.0f}" for one in CLASSES] + [f"{100 * bent:.1f}"]
     return f"| {name} | {' | '.join(values)} | {100 * mean:.1f} |", f"| {name} | {' | '.join(classes)} |"
+
+
+def bend(scans: Sequence[Scan]) -> float:
+    """How far walls are from straight: median of |q(j - 8) - 2 q(j) + q(j + 8)| / q(j) of the inverse ranges q of rows,
+    where all cells from j - 8 to j + 8 are a building's. A plane has 0.0024 on 1024 columns."""
+    found = []
+    for scan in scans:
+        image = project(scan, scan.sensor, ["label"])
+        wall = image.mask & (image.channels["label"] == TRAIN_ID["building"])
+        near = np.divide(1, image.range, where=wall, out=np.zeros_like(image.range))
+        inside = np.logical_and.reduce([np.roll(wall, k, 1) for k in range(-SPAN, SPAN + 1)])
+        second = np.roll(near, SPAN, 1) - 2 * near + np.roll(near, -SPAN, 1)
+        found.append(np.abs(second[inside]) / near[inside])
+    return float(np.median(np.concatenate(found)))
 
 
 def header(reference: Sequence[Scan], judge: Judge) -> str:
@@ -118,11 +163,13 @@ def main() -> None:
 
     judge = load_judge()
     reference = town(REFERENCE, given.count)
-    lines = [rows("another town", reference, town(OTHER, given.count), judge)]
+    other = town(OTHER, given.count)
+    lines = [rows("another town", reference, other, judge)]
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
-        scans = generate(model, int(steps) if steps else None, given.count)
+        real = steps == "0"
+        scans = drawn_again(model, other) if real else generate(model, int(steps or 0) or None, given.count)
         lines.append(rows(name, reference, scans, judge))
         if i == 0 and given.pictures:
             apart = np.linspace(0, given.count - 1, TILES).astype(int)
@@ -131,7 +178,8 @@ def main() -> None:
             near(given.pictures / "near.png", scans[:CLOSE], [reference[k] for k in apart[:CLOSE]])
     print(f"{given.count} scans a row, {given.count} of the town\n\n{header(reference, judge)}")
     print("\n".join(line for line, _ in lines))
-    print(f"\n| IoU with the segmenter, % | {' | '.join(CLASSES)} |\n|---|{'---:|' * len(CLASSES)}")
+    columns = (*CLASSES, "bend of walls, %")
+    print(f"\n| IoU with the segmenter, % | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
     print("\n".join(classes for _, classes in lines))
 
 
