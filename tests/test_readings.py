@@ -43,6 +43,23 @@ def test_draws_are_as_likely_as_was_said(case: tuple[float, float, float]) -> No
     assert between.item() == pytest.approx(0.2 * len(numbers) / count, rel=0.01)
 
 
+@pytest.mark.parametrize("case", [CASES[0], CASES[2]])
+def test_what_was_said_is_not_unexpected(case: tuple[float, float, float]) -> None:
+    """Draws are 0 as often as expected, and around the median."""
+    count = 100_000
+    said = readings(*case, cells=count)
+    nothing, off = said.unexpected(said.drawn(column((torch.arange(count) + 0.5) / count))).unbind(1)
+    assert nothing.mean().item() == pytest.approx(0, abs=0.002)
+    assert off.median().item() == pytest.approx(0, abs=0.01)
+
+
+def test_the_unexpected_is_in_scales_and_has_an_end() -> None:
+    said = readings(0.1, 0.15, 0.2, cells=4)
+    nothing, off = said.unexpected(column(torch.tensor([0.1, 0.25, 90.0, BLANK]))).flatten(2).squeeze(2).unbind(1)
+    assert torch.allclose(off, torch.tensor([0, 0.5, 4, 0], dtype=off.dtype), atol=1e-6)
+    assert torch.allclose(nothing, torch.tensor([-0.2, -0.2, -0.2, 0.8], dtype=off.dtype), atol=1e-6)
+
+
 def test_the_likeliest_is_0_or_the_median() -> None:
     assert readings(0.1, 0.15, 0.6).likeliest().item() == BLANK
     assert readings(0.1, 0.15, 0.4).likeliest().item() == pytest.approx(0.1)

@@ -10,8 +10,8 @@ therefore says distributions, and an image is drawn from them: what it would be 
 and a network that is trained on such images takes the noise of real ones for something that it has never seen.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -20,6 +20,8 @@ from torch import Tensor, nn
 from lidar_synth.errors import ConfigError
 from lidar_synth.nets.codebook import follow
 from lidar_synth.nets.convolution import check_shape, pair, reduced
+from lidar_synth.nets.heads import Heads
+from lidar_synth.nets.lattices import LATTICES, Neighbours, on, ratio
 from lidar_synth.nets.layers import EPS
 from lidar_synth.nets.readings import Readings
 from lidar_synth.nets.surfaces import Planes, Surfaces, laplace
@@ -35,22 +37,6 @@ SPREADS = -4.6, 0.0
 """Limits of the logarithms of other values' spreads."""
 ROUGHNESS = 5e-4
 """Scale of the noise of drawn ranges, normalised: 1.3 cm at 10 m in R2Flow's scale."""
-
-
-class Heads(NamedTuple):
-    """What the decoder says of every cell.
-
-    Args:
-        surfaces: what it may see, as if every cell had a return.
-        readings: the other values, such as the reflectance.
-        returned: (B, 1, H, W) logit of a return.
-        classes: (B, K, H, W) logits of the label's codes; K = 0 without labels.
-    """
-
-    surfaces: Surfaces
-    readings: Readings
-    returned: Tensor
-    classes: Tensor
 
 
 class CircularConv(nn.Conv2d):
@@ -151,6 +137,9 @@ class Autoencoder(nn.Module):
         self.planes = Planes(outer, DETAIL, PLANES, NORMALISATIONS[normalisation])
         self.sizes = [PLANES, self.values, self.values, self.values, 1, codes]
         self.heads = nn.Conv2d(fine, sum(self.sizes), 1)
+        self.neighbours = nn.ModuleList(
+            Neighbours(fine, 1 + 2 * self.values, 2 * fine, ratio(a, b)) for a, b in pairwise(LATTICES)
+        )
         # Latents leave with mean 0 and variance 1 per channel, as a flow from standard normal noise likes them.
         self.register_buffer("shift", torch.zeros(latent_channels))
         self.register_buffer("scale", torch.ones(latent_channels))
@@ -161,7 +150,7 @@ class Autoencoder(nn.Module):
         z = self.squeeze(x)
         if self.training:
             follow(z.detach(), self.shift, self.scale)
-        return self.expand(z + noise)
+        return self.expand(z + noise, x)
 
     def encode(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of mean 0 and variance 1
@@ -180,13 +169,14 @@ class Autoencoder(nn.Module):
             far from 0 as this one is likely.
         """
         check_shape(z, self.latent_shape, "a latent")
-        said = self.expand(z * _channel(self.scale) + _channel(self.shift))
-        distance, values, returned = said.surfaces.likeliest(), said.readings.likeliest(), said.returned.float()
+        said = self._tell(
+            z * _channel(self.scale) + _channel(self.shift),
+            lambda said, lattice: said.drawn(None if chance is None else on(lattice, chance)),
+        )
+        distance, seen = said.surfaces.likeliest(), said.drawn(chance)
         if chance is not None:
             distance = distance + ROUGHNESS * laplace(chance[:, :1])
-            values = said.readings.drawn(chance[:, 1:-1])
-            returned = returned + torch.logit(chance[:, -1:])
-        parts = [torch.where(returned > 0, distance, -1.0), values]
+        parts = [torch.where(seen[:, :1] > 0, distance, -1.0), seen[:, 1:]]
         if self.bits:
             likely, code = said.classes.float().softmax(1).max(1)
             parts += [self._corners(code) * (2 * torch.atanh(likely.clamp(max=0.9999)))[:, None]]
@@ -201,14 +191,32 @@ class Autoencoder(nn.Module):
         h = self.encode_outer(h + self.place_stem)
         return torch.tanh(self.to_latent(self.encode_inner(self.merge(h))).float())
 
-    def expand(self, z: Tensor) -> Heads:
-        """Bounded latents to what is said of every cell."""
+    def expand(self, z: Tensor, image: Tensor) -> Heads:
+        """Bounded latents to what is said of every cell, its neighbours on coarser ``LATTICES`` being as in an image
+        (B, C, H, W)."""
+        seen = torch.cat([(image[:, :1] > -1).to(image.dtype), image[:, 1 : 1 + self.values]], 1)
+        return self._tell(z, lambda said, lattice: on(lattice, seen))
+
+    def _tell(self, z: Tensor, see: Callable[[Heads, tuple[int, int]], Tensor]) -> Heads:
+        """What is said of every cell, lattice by lattice; ``see`` tells what came out on one."""
         z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
         h = self.decode_inner(self.from_latent(z) + self.place_latent)
         h = self.decode_outer(F.pixel_shuffle(self.split(h), 2) + self.place_outer)
-        ranges, doubts = self.planes(h)
+        planes = self.planes(h)
         h = _unpatch(self.spread(h), self.fine) + self.place_fine
-        chosen, middles, spreads, blank, *rest = self.heads(h + F.silu(self.refine(h))).split(self.sizes, 1)
+        h = h + F.silu(self.refine(h))
+        said = self.heads(on(LATTICES[0], h))
+        for (known, finer), neighbours in zip(pairwise(LATTICES), self.neighbours, strict=True):
+            seen = see(self._named(planes, said, known), known)
+            alone = self._named(planes, self.heads(on(known, h)), known)
+            closer = self.heads(neighbours(on(finer, h), alone.unexpected(seen)))
+            on(ratio(known, finer), closer)[:] = said
+            said = closer
+        return self._named(planes, said, LATTICES[-1])
+
+    def _named(self, planes: tuple[Tensor, Tensor], said: Tensor, lattice: tuple[int, int]) -> Heads:
+        chosen, middles, spreads, blank, *rest = torch.split(said, self.sizes, 1)
+        ranges, doubts = (on(lattice, part) for part in planes)
         readings = Readings(middles.float(), spreads.float().clamp(*SPREADS), blank.float())
         return Heads(Surfaces(ranges, doubts, chosen.float()), readings, *rest)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 BLANK = -1.0
 """A reading of 0, normalised."""
+_FAR = 8.0  # scales of a reading that could hardly be less expected
 _SURE = 1e-6  # how near to 0 and 1 a chance may come: its logit stays finite
 
 
@@ -35,6 +36,12 @@ class Readings(NamedTuple):
         below = torch.logaddexp(F.logsigmoid(self.blank), number + F.logsigmoid(off))
         density = number + F.logsigmoid(off) + F.logsigmoid(-off) - self.spreads
         return -torch.where(x > BLANK, density, below)
+
+    def unexpected(self, x: Tensor) -> Tensor:
+        """(B, 2 V, H, W) how far readings (B, V, H, W) are from what was said: 0 or not, and the numbers in scales."""
+        nothing = x <= BLANK
+        off = ((x - self.middles) * torch.exp(-self.spreads)).clamp(-_FAR, _FAR) / 2
+        return torch.cat([nothing.float() - torch.sigmoid(self.blank), torch.where(nothing, 0.0, off)], 1)
 
     def likeliest(self) -> Tensor:
         """(B, V, H, W) 0, or the median."""

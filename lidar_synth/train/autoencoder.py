@@ -27,8 +27,9 @@ from torch import Tensor, nn
 from lidar_synth.codec import Latent, expected
 from lidar_synth.errors import ConfigError
 from lidar_synth.flow import Example, Metric
-from lidar_synth.nets.autoencoder import Autoencoder, Heads
+from lidar_synth.nets.autoencoder import Autoencoder
 from lidar_synth.nets.convolution import Norm, WrapConv
+from lidar_synth.nets.heads import Heads
 from lidar_synth.nets.vqvae import VQVAE, Encoding
 from lidar_synth.normalize import CHANNELS, TensorFormat
 from lidar_synth.scan import RangeImage
