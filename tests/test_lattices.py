@@ -54,6 +54,16 @@ def test_cells_look_at_coarser_lattices_only(depth: int, channel: int) -> None:
     assert told.any() == (depth < len(LATTICES) - 1)
 
 
+def test_a_cell_without_a_return_reads_nothing() -> None:
+    net, x = network(0.3), torch.rand(1, 7, *SHAPE) - 0.5
+    x[:, 0, 0, 0] = -1.0
+    other = x.clone()
+    other[:, 1, 0, 0] = 0.9
+    z = torch.randn(1, *net.latent_shape)
+    with torch.inference_mode():
+        assert torch.equal(net.expand(z, x).returned, net.expand(z, other).returned)
+
+
 def test_drawn_neighbours_are_alike_where_those_that_were_learnt_were() -> None:
     """Nearly all that readings differ by is common to blocks of cells, and the latent does not say it: cells that were
     drawn one by one would have nothing to do with each other."""
