@@ -95,7 +95,7 @@ def test_pseudo_huber_is_r2flows(golden: Path, case: int) -> None:
     assert other.item() == pytest.approx(vectors["loss_coef_0.03"].item(), rel=1e-6, abs=2**-24 * c)
 
 
-@pytest.mark.parametrize("name", TIMESTEPS)
+@pytest.mark.parametrize("name", ["uniform", "u_shaped", "logit_normal"])
 def test_distributions_of_t_are_r2flows(golden: Path, name: str) -> None:
     """Their time runs the other way; all three are symmetric, and so are tested both ways."""
     vectors = load_file(golden / "r2flow_losses.safetensors")
