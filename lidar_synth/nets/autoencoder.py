@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.nets.codebook import follow
-from lidar_synth.nets.convolution import check_shape, pair, reduced
+from lidar_synth.nets.convolution import WrapConv, check_shape, pair, reduced
 from lidar_synth.nets.heads import Heads
 from lidar_synth.nets.lattices import LATTICES, Neighbours, on, ratio
 from lidar_synth.nets.layers import EPS
@@ -39,17 +39,6 @@ ROUGHNESS = 5e-4
 """Scale of the noise of drawn ranges, normalised: 1.3 cm at 10 m in R2Flow's scale."""
 
 
-class CircularConv(nn.Conv2d):
-    """3 x 3 convolution; columns wrap, rows end."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__(channels, channels, 3)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to the same shape."""
-        return super().forward(F.pad(F.pad(x, (1, 1, 0, 0), "circular"), (0, 0, 1, 1)))
-
-
 class Residual(nn.Module):
     """x + conv(silu(conv(norm(x)))).
 
@@ -59,7 +48,7 @@ class Residual(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.first, self.second = CircularConv(channels), CircularConv(channels)
+        self.first, self.second = WrapConv(channels, channels), WrapConv(channels, channels)
         nn.init.zeros_(self.second.weight)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -133,7 +122,7 @@ class Autoencoder(nn.Module):
         self.split = nn.Conv2d(inner, 4 * outer, 1)
         self.decode_outer = nn.Sequential(*(Residual(outer) for _ in range(depth - 1)))
         self.spread = nn.Conv2d(outer, DETAIL[0] * DETAIL[1] * fine, 1)
-        self.refine = CircularConv(fine)
+        self.refine = WrapConv(fine, fine)
         self.planes = Planes(outer, DETAIL, PLANES, NORMALISATIONS[normalisation])
         self.sizes = [PLANES, self.values, self.values, self.values, 1, codes]
         self.heads = nn.Conv2d(fine, sum(self.sizes), 1)

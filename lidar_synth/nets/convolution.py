@@ -29,6 +29,7 @@ class WrapConv(nn.Conv2d):
         stride: rows and columns.
         pad: columns to the left and to the right, rows above and below; by default what keeps the size, the odd one
             to the right or below.
+        bias: whether it has one.
     """
 
     def __init__(
@@ -38,12 +39,13 @@ class WrapConv(nn.Conv2d):
         kernel: Grid = (3, 3),
         stride: Grid = (1, 1),
         pad: tuple[int, int, int, int] | None = None,
+        bias: bool = True,
     ) -> None:
         rows, columns = (k - 1 for k in kernel)
         self.left, self.right, above, below = pad or (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
         # What is the same above and below, the convolution adds by itself, without a copy.
         self.below = 0 if above == below else below - above
-        super().__init__(inputs, outputs, kernel, stride, padding=(above, 0))
+        super().__init__(inputs, outputs, kernel, stride, padding=(above, 0), bias=bias)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs, H, W) to (B, outputs, H / stride, W / stride)."""

@@ -9,6 +9,8 @@ product of their chances, which is that of the image, comes from one pass.
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lidar_synth.nets.convolution import WrapConv
+
 LATTICES = (4, 8), (2, 4), (1, 2), (1, 1)
 """Rows and columns from one cell to the next, coarsest first; the last are all cells of an image."""
 
@@ -36,7 +38,7 @@ class Neighbours(nn.Module):
     def __init__(self, channels: int, surprises: int, hidden: int, steps: tuple[int, int]) -> None:
         super().__init__()
         self.steps = steps
-        self.own, self.others = nn.Conv2d(channels, hidden, 1), nn.Conv2d(surprises, hidden, 3, bias=False)
+        self.own, self.others = nn.Conv2d(channels, hidden, 1), WrapConv(surprises, hidden, bias=False)
         self.answer = nn.Conv2d(hidden, channels, 1)
         nn.init.zeros_(self.answer.weight)
         nn.init.zeros_(self.answer.bias)  # type: ignore[arg-type]  # it has one
@@ -45,6 +47,5 @@ class Neighbours(nn.Module):
         """Features (B, C, h, w) of this lattice, and surprises of the one before, to features (B, C, h, w)."""
         wide = surprise.new_zeros(*surprise.shape[:2], *x.shape[-2:])
         on(self.steps, wide)[:] = surprise
-        around = F.pad(F.pad(wide, (1, 1, 0, 0), "circular"), (0, 0, 1, 1)).to(x.dtype)
-        out: Tensor = x + self.answer(F.silu(self.own(x) + self.others(around)))
+        out: Tensor = x + self.answer(F.silu(self.own(x) + self.others(wide.to(x.dtype))))
         return out
