@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lidar_synth.errors import ConfigError
 from lidar_synth.nets.layers import piece_length
 
 Grid = tuple[int, int]
@@ -29,6 +30,9 @@ class NeighbourhoodAttention(nn.Module):
         grid: rows and columns of tokens.
         window: rows and columns of a neighbourhood, odd; no more rows than the grid, half of its columns at most
             as many as the grid's.
+
+    Raises:
+        ConfigError: on a window that is not.
     """
 
     tokens: Tensor
@@ -38,6 +42,8 @@ class NeighbourhoodAttention(nn.Module):
 
     def __init__(self, grid: Grid, window: Grid) -> None:
         super().__init__()
+        if min(window) < 1 or not window[0] % 2 & window[1] % 2 or window[0] > grid[0] or window[1] // 2 > grid[1]:
+            raise ConfigError(f"window {window} on a grid of {grid} tokens", "odd, and within the grid")
         tile = (_divisor(grid[0], TILE[0]), _divisor(grid[1], TILE[1]))
         span = (tile[0] + window[0] - 1, tile[1] + window[1] - 1)
         numbers = torch.arange(grid[0] * grid[1], device="cpu").view(grid)  # real, even where weights are not (meta)
@@ -52,14 +58,25 @@ class NeighbourhoodAttention(nn.Module):
             self.register_buffer(name, buffer, persistent=False)
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Queries, keys and values (B, N, heads, D), scaled already, tokens row by row, to (B, N, heads, D)."""
+        """Queries and keys (B, N, heads, D), scaled already, and values (B, N, heads, E), tokens row by row, to
+        (B, N, heads, E)."""
         length = piece_length(q, len(self.keys), self.keys.shape[1] * q[:, 0].numel())
         out = []
         for tokens, keys in zip(torch.split(self.tokens, length), torch.split(self.keys, length), strict=True):
             tiles = _tiled(q, tokens), _tiled(k, keys), _tiled(v, keys)
-            h = F.scaled_dot_product_attention(*tiles, self.mask, scale=1.0)
-            out.append(h.transpose(1, 2).reshape(len(q), -1, *q.shape[2:]))
+            h = attention(*tiles, self.mask)
+            out.append(h.transpose(1, 2).reshape(len(v), -1, *v.shape[2:]))
         return _pick(torch.cat(out, 1), self.place)
+
+
+def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
+    """softmax(q k^T) v of (B, heads, n, D) and (B, heads, m, D), scaled already, where ``mask`` (n, m) is true."""
+    if q.device.type != "cpu" or not torch.is_grad_enabled():
+        return F.scaled_dot_product_attention(q, k, v, mask, scale=1.0)
+    # For so few keys the backward pass of the fused product is the slower one on a CPU, by far in bfloat16.
+    scores = q @ k.transpose(-1, -2)
+    scores = scores if mask is None else scores.masked_fill(~mask, -torch.inf)
+    return scores.softmax(-1).to(v.dtype) @ v
 
 
 def _tiled(x: Tensor, index: Tensor) -> Tensor:

@@ -86,7 +86,7 @@ class HDiT(nn.Module):
         self.grids = _grids(self.resolution, self.patch, len(depths))
         self.gradient_checkpointing = False
         """Forget what is inside the blocks and compute it again in the backward pass."""
-        _check(self.grids, self.window, width, heads, position)
+        _check(self.grids, width, heads, position)
         if angles is not None and angles.shape != (2, *self.resolution):
             raise ConfigError(f"ray angles of shape {tuple(angles.shape)}", f"{(2, *self.resolution)}")
 
@@ -202,7 +202,7 @@ def _grids(resolution: Grid, patch: Grid, levels: int) -> list[Grid]:
     return [(rows >> i, columns >> i) for i in range(levels)]
 
 
-def _check(grids: list[Grid], window: Grid, width: int, heads: Sequence[int], position: str) -> None:
+def _check(grids: list[Grid], width: int, heads: Sequence[int], position: str) -> None:
     if position not in POSITIONS:
         raise ConfigError(f"position {position!r}", f"one of {', '.join(POSITIONS)}")
     if len(heads) != len(grids) or any((width << i) % (4 * h) for i, h in enumerate(heads)):
@@ -210,6 +210,3 @@ def _check(grids: list[Grid], window: Grid, width: int, heads: Sequence[int], po
             f"heads {tuple(heads)} for width {width} and {len(grids)} levels",
             "for each level a number that divides its width into multiples of 4",
         )
-    for rows, columns in grids[:-1]:
-        if min(window) < 1 or window[0] % 2 == 0 or window[1] % 2 == 0 or window[0] > rows or window[1] // 2 > columns:
-            raise ConfigError(f"window {window} on a grid of {(rows, columns)} tokens", "odd, and within the grid")

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidar_synth.nets.attention import Grid, NeighbourhoodAttention
+from lidar_synth.nets.attention import Grid, NeighbourhoodAttention, attention
 from lidar_synth.nets.convolution import attend
 from lidar_synth.nets.layers import EPS, AdaRMSNorm, GatedFeedForward, RMSNorm, piece_length
 from lidar_synth.nets.positions import rotate
@@ -56,7 +56,7 @@ class SelfAttention(nn.Module):
             h = level.near(q, k, v)
         else:
             q, k, v = (z.transpose(1, 2) for z in (q, k, v))
-            h = F.scaled_dot_product_attention(q, k, v, scale=1.0).transpose(1, 2)
+            h = attention(q, k, v).transpose(1, 2)
         out: Tensor = x + self.out(h.flatten(2))
         return out
 
