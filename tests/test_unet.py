@@ -155,14 +155,22 @@ def test_unfold_is_the_inverse_of_fold(p: int, q: int, rows: int, columns: int, 
 
 
 @pytest.mark.parametrize(
-    ("kernel", "stride", "pad"), [((3, 3), (1, 1), None), ((1, 4), (1, 1), None), ((3, 3), (2, 2), (0, 1, 0, 1))]
+    ("kernel", "stride", "pad", "dilation"),
+    [
+        ((3, 3), (1, 1), None, (1, 1)),
+        ((1, 4), (1, 1), None, (1, 1)),
+        ((3, 3), (2, 2), (0, 1, 0, 1), (1, 1)),
+        ((3, 3), (1, 1), None, (1, 3)),
+    ],
 )
-def test_a_wrapping_convolution_is_one_on_a_padded_image(kernel: Any, stride: Any, pad: Any) -> None:
-    conv, x = WrapConv(2, 3, kernel, stride, pad), torch.randn(1, 2, 4, 8)
-    rows, columns = kernel[0] - 1, kernel[1] - 1
+def test_a_wrapping_convolution_is_one_on_a_padded_image(kernel: Any, stride: Any, pad: Any, dilation: Any) -> None:
+    conv, x = WrapConv(2, 3, kernel, stride, pad, dilation=dilation), torch.randn(1, 2, 4, 8)
+    rows, columns = (d * (k - 1) for k, d in zip(kernel, dilation, strict=True))
     left, right, above, below = pad or (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
     padded = nn.functional.pad(nn.functional.pad(x, (left, right, 0, 0), "circular"), (0, 0, above, below))
-    assert torch.allclose(conv(x), nn.functional.conv2d(padded, conv.weight, conv.bias, stride), atol=1e-6)
+    assert torch.allclose(
+        conv(x), nn.functional.conv2d(padded, conv.weight, conv.bias, stride, dilation=dilation), atol=1e-6
+    )
 
 
 # --- a network of denoising diffusion as a velocity ------------------------------------------------------------------

@@ -17,6 +17,9 @@ from lidar_synth.nets import build_network
 from lidar_synth.sensor import Sensor, load_sensor
 from lidar_synth.solvers import uniform_grid
 
+LOOKING = ("hdit", "denoiser", "sight", "autoencoder")
+"""Architectures that take the angles of rays."""
+
 
 def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     """New networks and the header that describes them."""
@@ -50,11 +53,12 @@ def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     """The networks of ``config.init``, and its header for the new run."""
     assert config.init is not None
     start = load_checkpoint(config.init)
-    if (CODEC if config.autoencodes else VELOCITY) not in start.networks or config.codec is not None:
+    wanted = {CODEC, VELOCITY} if config.decoder else {CODEC if config.autoencodes else VELOCITY}
+    if not wanted <= set(start.networks) or config.codec is not None:
         raise ConfigError(f"init {config.init} with parts {sorted(start.networks)}", "a checkpoint of the same kind")
     _check_held(config, start.header, ("sensor", "channels", "normalisation", "network"), config.init)
     provenance = provenance_of(config) | {"init": start.hash, "init_provenance": start.header.provenance}
-    grid = start.header.time_grid if config.autoencodes else uniform_grid(config.steps)
+    grid = start.header.time_grid if config.autoencodes or config.decoder else uniform_grid(config.steps)
     networks = {CODEC: start.networks[CODEC]} if config.autoencodes else start.networks
     kept = {name: start.header.networks[name] for name in networks}
     header = replace(start.header, networks=kept, time_grid=grid, provenance=provenance)
@@ -95,7 +99,7 @@ def _build(
     pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[0]
     networks = {}
     for name, part in parts.items():
-        looks = {"angles": pooled} if part.architecture in ("hdit", "denoiser", "sight") else {}
+        looks = {"angles": pooled} if part.architecture in LOOKING else {}
         networks[name] = build_network(part.architecture, part.arguments | looks)
     return networks
 

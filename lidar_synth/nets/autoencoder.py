@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.nets.codebook import follow
+from lidar_synth.nets.consensus import Consensus
 from lidar_synth.nets.convolution import WrapConv, check_shape, pair, reduced
 from lidar_synth.nets.heads import Heads
 from lidar_synth.nets.lattices import LATTICES, Neighbours, on, ratio
@@ -44,11 +45,12 @@ class Residual(nn.Module):
 
     Args:
         channels: C.
+        reach: columns from one cell that the second convolution sees to the next.
     """
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, reach: int = 1) -> None:
         super().__init__()
-        self.first, self.second = WrapConv(channels, channels), WrapConv(channels, channels)
+        self.first, self.second = WrapConv(channels, channels), WrapConv(channels, channels, dilation=(1, reach))
         nn.init.zeros_(self.second.weight)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -69,8 +71,12 @@ class Autoencoder(nn.Module):
         latent_channels: Z.
         widths: channels on patches of 2 x 4 cells and of 4 x 8.
         depth: residual blocks of the decoder on the coarser grid; one less after it, one less on it in the encoder.
+        wide: reaches of further blocks of the decoder on the coarser grid: a wall is straight over many cells.
+        window: rows and columns of patches of 2 x 4 cells that settle on common planes; none without.
         fine: channels of the decoder's last map, on single cells.
         normalisation: a name of ``NORMALISATIONS``, that of the range.
+        angles: (2, H, W) elevation and azimuth of the cells' rays, radians; without them they have to come from a
+            checkpoint.
 
     Raises:
         ConfigError: on values that do not fit together.
@@ -88,8 +94,11 @@ class Autoencoder(nn.Module):
         latent_channels: int = 8,
         widths: Sequence[int] = (48, 96),
         depth: int = 3,
+        wide: Sequence[int] = (),
+        window: Sequence[int] = (),
         fine: int = 24,
         normalisation: str = "r2flow",
+        angles: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.resolution = pair(resolution)
@@ -115,15 +124,18 @@ class Autoencoder(nn.Module):
         self.stem = nn.Conv2d(self.channels + 1, outer, DETAIL, DETAIL)
         self.encode_outer = Residual(outer)
         self.merge = nn.Conv2d(outer, inner, 2, 2)
-        self.encode_inner = nn.Sequential(*(Residual(inner) for _ in range(depth - 1)))
+        self.encode_inner = _blocks(inner, depth - 1)
         self.to_latent = nn.Conv2d(inner, latent_channels, 1)
         self.from_latent = nn.Conv2d(latent_channels, inner, 1)
-        self.decode_inner = nn.Sequential(*(Residual(inner) for _ in range(depth)))
+        self.decode_inner = _blocks(inner, depth, wide)
         self.split = nn.Conv2d(inner, 4 * outer, 1)
-        self.decode_outer = nn.Sequential(*(Residual(outer) for _ in range(depth - 1)))
+        self.decode_outer = _blocks(outer, depth - 1)
         self.spread = nn.Conv2d(outer, DETAIL[0] * DETAIL[1] * fine, 1)
         self.refine = WrapConv(fine, fine)
-        self.planes = Planes(outer, DETAIL, PLANES, NORMALISATIONS[normalisation])
+        grid = rows // DETAIL[0], self.resolution[1] // DETAIL[1]
+        rise = torch.zeros(rows) if angles is None else angles[0].mean(1).tan()
+        consensus = Consensus(outer, grid, DETAIL, PLANES, pair(window), rise) if window else None
+        self.planes = Planes(outer, DETAIL, PLANES, NORMALISATIONS[normalisation], consensus)
         self.sizes = [PLANES, self.values, self.values, self.values, 1, codes]
         self.heads = nn.Conv2d(fine, sum(self.sizes), 1)
         self.neighbours = nn.ModuleList(
@@ -140,6 +152,15 @@ class Autoencoder(nn.Module):
         if self.training:
             follow(z.detach(), self.shift, self.scale)
         return self.expand(z + noise, x)
+
+    def encoder(self) -> list[nn.Parameter]:
+        """The weights that make latents; all others make images of them."""
+        parts = self.stem, self.encode_outer, self.merge, self.encode_inner, self.to_latent
+        return [self.place_stem, *(weight for part in parts for weight in part.parameters())]
+
+    def bounded(self, z: Tensor) -> Tensor:
+        """Latents (B, *latent_shape) of mean 0 and variance 1 as they leave ``squeeze``."""
+        return z * _channel(self.scale) + _channel(self.shift)
 
     def encode(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of mean 0 and variance 1
@@ -159,7 +180,7 @@ class Autoencoder(nn.Module):
         """
         check_shape(z, self.latent_shape, "a latent")
         said = self._tell(
-            z * _channel(self.scale) + _channel(self.shift),
+            self.bounded(z),
             lambda said, lattice: said.drawn(None if chance is None else on(lattice, chance)),
         )
         distance, seen = said.surfaces.likeliest(), said.drawn(chance)
@@ -212,6 +233,10 @@ class Autoencoder(nn.Module):
     def _corners(self, code: Tensor) -> Tensor:
         """Codes (B, H, W) as their bits (B, bits, H, W), -1 and 1, highest first."""
         return torch.stack([(code >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
+
+
+def _blocks(channels: int, depth: int, wide: Sequence[int] = ()) -> nn.Sequential:
+    return nn.Sequential(*(Residual(channels, reach) for reach in (*[1] * depth, *wide)))
 
 
 def _rows(channels: int, rows: int) -> nn.Parameter:

@@ -30,6 +30,7 @@ class WrapConv(nn.Conv2d):
         pad: columns to the left and to the right, rows above and below; by default what keeps the size, the odd one
             to the right or below.
         bias: whether it has one.
+        dilation: rows and columns from one weight of the kernel to the next.
     """
 
     def __init__(
@@ -40,12 +41,13 @@ class WrapConv(nn.Conv2d):
         stride: Grid = (1, 1),
         pad: tuple[int, int, int, int] | None = None,
         bias: bool = True,
+        dilation: Grid = (1, 1),
     ) -> None:
-        rows, columns = (k - 1 for k in kernel)
+        rows, columns = (d * (k - 1) for k, d in zip(kernel, dilation, strict=True))
         self.left, self.right, above, below = pad or (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
         # What is the same above and below, the convolution adds by itself, without a copy.
         self.below = 0 if above == below else below - above
-        super().__init__(inputs, outputs, kernel, stride, padding=(above, 0), bias=bias)
+        super().__init__(inputs, outputs, kernel, stride, padding=(above, 0), dilation=dilation, bias=bias)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs, H, W) to (B, outputs, H / stride, W / stride)."""

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from lidar_synth.nets.consensus import Consensus
 from lidar_synth.normalize import Normalisation
 
 SLOPES = 0.3, 0.1
@@ -62,11 +63,19 @@ class Planes(nn.Module):
         patch: rows and columns of a patch.
         count: planes per patch.
         normalisation: of the ranges.
+        consensus: of the same patches; None = each speaks for itself.
     """
 
-    def __init__(self, channels: int, patch: tuple[int, int], count: int, normalisation: Normalisation) -> None:
+    def __init__(
+        self,
+        channels: int,
+        patch: tuple[int, int],
+        count: int,
+        normalisation: Normalisation,
+        consensus: Consensus | None = None,
+    ) -> None:
         super().__init__()
-        self.patch, self.normalisation = patch, normalisation
+        self.patch, self.normalisation, self.consensus = patch, normalisation, consensus
         self.planes = nn.Conv2d(channels, 4 * count, 1)
         nn.init.normal_(self.planes.weight, std=0.02)
         with torch.no_grad():  # near and far, facing the sensor, not sure
@@ -76,16 +85,26 @@ class Planes(nn.Module):
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Maps (B, C, h, w) to normalised ranges and log spreads (B, count, H, W)."""
-        rows, columns = self.patch
-        given = self.planes(x).float().unflatten(1, (-1, 4))
-        up = given.repeat_interleave(rows, -2).repeat_interleave(columns, -1)
-        distance, across, down, spread = up.unbind(2)
-        i = _offsets(up.shape[-2], rows, x.device)[:, None]
-        j = _offsets(up.shape[-1], columns, x.device)
-        inverse = (1 + SLOPES[0] * down * i + SLOPES[1] * across * j).clamp_min(0.05)
+        with torch.autocast(x.device.type, enabled=False):  # bfloat16 would round off half a per cent of a range
+            return self._told(x.to(self.planes.weight.dtype))
+
+    def _told(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        distance, across, down, spread = self.planes(x).float().unflatten(1, (-1, 4)).unbind(2)
+        distance = distance.clamp(-1, 5)
+        i = _offsets(self.patch[0] * x.shape[-2], self.patch[0], x.device)[:, None]
+        j = _offsets(self.patch[1] * x.shape[-1], self.patch[1], x.device)
+        slopes = 1 + SLOPES[0] * self._up(down) * i + SLOPES[1] * self._up(across) * j
+        inverse = self._up((-distance).exp()) * slopes.clamp_min(0.05)
+        if self.consensus is not None:
+            agreed, trust = self.consensus(x, distance)
+            inverse = torch.lerp(inverse, agreed.float(), self._up(trust.float()))
         low, high = self.normalisation.range_min, self.normalisation.range_max
-        metres = (distance.clamp(-1, 5).exp() / inverse).clamp(1.001 * low, 0.999 * high)
-        return self.normalisation.encode(metres), spread.clamp(*map(math.log, SPREADS))
+        metres = 1 / inverse.clamp(1 / (0.999 * high), 1 / (1.001 * low))
+        return self.normalisation.encode(metres), self._up(spread.clamp(*map(math.log, SPREADS)))
+
+    def _up(self, x: Tensor) -> Tensor:
+        """(B, K, h, w) as (B, K, H, W), the same for all cells of a patch."""
+        return x.repeat_interleave(self.patch[0], -2).repeat_interleave(self.patch[1], -1)
 
 
 def _offsets(size: int, patch: int, device: torch.device) -> Tensor:
