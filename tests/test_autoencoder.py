@@ -19,7 +19,17 @@ from lidar_synth.nets.lattices import LATTICES, on
 from lidar_synth.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.projection import project
 from lidar_synth.sensor import Sensor
-from lidar_synth.train import Autoencoding, Batches, Losses, cache_latents, cache_scans
+from lidar_synth.train import (
+    Autoencoding,
+    Batch,
+    Batches,
+    Decoding,
+    Losses,
+    cache_latents,
+    cache_scans,
+    decoding_loss,
+    decoding_task,
+)
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 TENSORS = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow"])
@@ -46,8 +56,9 @@ def tensors() -> Tensor:
     return TENSORS.from_images([project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS])
 
 
-def test_columns_turn_together_in_image_and_latent() -> None:
-    net, x = network(), tensors()
+@pytest.mark.parametrize("arguments", [{}, {"wide": (1, 2)}, {"window": (3, 3)}])
+def test_columns_turn_together_in_image_and_latent(arguments: dict[str, Any]) -> None:
+    net, x = network(**arguments), tensors()
     z = net.encode(x)
     assert z.shape[1:] == net.latent_shape == (8, 2, 4)
     assert torch.allclose(net.encode(x.roll(8, -1)), z.roll(1, -1), atol=1e-5)
@@ -174,6 +185,34 @@ def test_it_learns_scans_and_its_latents_have_variance_one() -> None:
     assert abs(z.mean().item()) < 0.3 and 0.7 < z.std().item() < 1.5
 
 
+def test_a_decoder_meets_what_the_flow_leaves() -> None:
+    """Every other latent is where the student's last step ends; the others have noise of up to the given strength."""
+    net, x = network(), tensors()
+    with torch.no_grad():
+        net.scale.uniform_(0.5, 2)
+    asked: list[Tensor] = []
+
+    def velocity(y: Tensor, t: Tensor, cond: Tensor | None) -> Tensor:
+        asked.append(y)
+        assert t.tolist() == pytest.approx([0.25] * len(x))
+        return 3 * y
+
+    z, noise = net.encode(x), torch.randn_like(x)
+    some = noise.flatten(1)[:, : z[0].numel()].reshape(z.shape)
+    batch = Batch(x, noise, torch.tensor([0.0, 0.4, 0.75, 1.0]))
+    example = decoding_task(net, velocity, 0.25, 0.2)(batch)
+    torch.testing.assert_close(asked[0], 0.75 * z + 0.25 * some)
+    torch.testing.assert_close(example.y[:2], (asked[0] - 0.25 * 3 * asked[0])[:2])
+    shaken = net.bounded(example.y)[2:] - net.bounded(z)[2:]
+    torch.testing.assert_close(shaken, torch.tensor([0.1, 0.2]).view(-1, 1, 1, 1) * some[2:], atol=1e-5, rtol=1e-4)
+    assert example.velocity is x
+    trained = Decoding(net, TENSORS, SENSOR, Losses(), METRICS["l1"], {})
+    decoding_loss(trained, example, METRICS["l1"]).backward()
+    told = {name for name, weight in net.named_parameters() if weight.grad is not None}
+    assert {"from_latent.weight", "heads.weight"} <= told
+    assert not {"stem.weight", "place_stem", "to_latent.bias", "merge.weight"} & told
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -183,6 +222,8 @@ def test_it_learns_scans_and_its_latents_have_variance_one() -> None:
         {"codes": 40},
         {"channels": 5},
         {"depth": 1},
+        {"window": [2, 3]},
+        {"window": [7, 3]},
         {"normalisation": "metres"},
     ],
 )

@@ -52,6 +52,8 @@ SIGHT = CAMERA | {"encoder": "sight", "view_dropout": 0.0, "arguments": {
     "resolution": [16, 32], "channels": 5, "widths": [4, 8],
     "image_from_sensor": [[40.0, -30.0, 0.0, 0.0], [20.0, 0.0, -30.0, 0.0], [1.0, 0.0, 0.0, 0.0]],
 }}  # fmt: skip
+STILL = ("stem", "encode", "merge", "to_latent", "shift", "scale")
+"""Parts of names in an autoencoder that belong to its encoder, or to both sides."""
 SEMANTIC = {"kind": "semantic", "arguments": {"channels": 3, "method": "patches"}, "dropout": 0.2}
 
 
@@ -227,6 +229,35 @@ def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(scans: Pat
     assert np.array_equal(same[0].mask, same[2].mask) and not np.array_equal(same[0].mask, same[1].mask)
 
 
+@pytest.mark.parametrize("condition", [None, SEMANTIC | {"arguments": {"channels": 8, "method": "patches"}}])
+def test_a_decoder_goes_on_alone(condition: dict[str, Any] | None, scans: Path, tmp_path: Path) -> None:
+    network = {"architecture": "autoencoder", "arguments": {"widths": [8, 8], "depth": 2, "fine": 8, "window": [3, 3]}}
+    call("train", write_config(scans, tmp_path, "codec", network=network))
+    hdit = {"architecture": "hdit", "arguments": {"width": 16, "depths": [1], "heads": [2], "patch": [1, 1]}}
+    given = {"condition": condition} if condition else {}
+    codec = str(tmp_path / "codec" / "codec.safetensors")
+    call("train", write_config(scans, tmp_path, "teacher", codec=codec, network=hdit, **given))
+    start = tmp_path / "teacher" / "teacher.safetensors"
+    config = write_config(scans, tmp_path, "more", losses={"noise": 0.1}, samples={"every": 8, "count": 2})
+    values = yaml.safe_load(config.read_text())
+    for key in ("sensor", "channels"):
+        del values[key]  # they are the checkpoint's
+    config.write_text(yaml.safe_dump(values | {"init": str(start), "decoder": True}))
+    call("train", config)
+    before, after = load_checkpoint(start), load_checkpoint(tmp_path / "more" / "more.safetensors")
+    assert after.header.time_grid == before.header.time_grid
+    assert set(after.networks) == set(before.networks)
+    moved = set()
+    for part, held in before.networks.items():
+        new = after.networks[part].state_dict()
+        moved |= {f"{part}.{name}" for name, value in held.state_dict().items() if not torch.equal(value, new[name])}
+    assert moved and all(name.startswith(f"{CODEC}.") for name in moved)
+    assert not [name for name in moved if any(part in name for part in STILL)]
+    assert {f"{CODEC}.from_latent.weight", f"{CODEC}.planes.consensus.strict"} <= moved
+    cond = np.zeros((8, 32), np.uint8) if condition else None
+    assert len(load_generator(tmp_path / "more" / "more.safetensors").scans(0, [3], cond)[0])
+
+
 def test_fine_tuning_a_latent_model(scans: Path, teacher: Path, codec: Path, tmp_path: Path) -> None:
     config = write_config(scans, tmp_path, "more", network=UNET, recipe={"iterations": 1, "rate": 1e-9})
     values = yaml.safe_load(config.read_text())
@@ -352,6 +383,9 @@ def test_what_does_not_fit_together(scans: Path, codec: Path, teacher: Path, tmp
             call("train", write_config(scans, tmp_path, "bad", **({"network": UNET} | values)), *overrides)
 
     refuse("an autoencoder with a codec or a condition", network=CODEC_NETWORK, condition=SEMANTIC)
+    refuse("decoder without init", decoder=True)
+    refuse("expected a model whose autoencoder says", decoder=True, init=str(teacher))
+    refuse("expected a checkpoint of the same kind", decoder=True, init=str(codec))
     refuse("of a latent model", codec=str(codec), recipe={"weights": {"label": 0.5}})
     refuse(f"channels .*expected that of {codec}", codec=str(codec), channels=["range"])
     refuse("expected the checkpoint of an autoencoder", codec=str(pixel_checkpoint(tmp_path)))

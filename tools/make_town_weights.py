@@ -1,7 +1,7 @@
-"""The recipe of the weights that ship, on scans of the town only: autoencoder, teacher, timesteps, student.
+"""The recipe of the weights that ship, on scans of the town only: autoencoder, teacher, timesteps, student, decoder.
 
     python tools/make_town_weights.py WORK [--model town] [--codec 60] [--teacher 180] [--student 30]
-        [--set RUN.KEY=VALUE ...]
+        [--decoder 30] [--set RUN.KEY=VALUE ...]
     python tools/make_town_weights.py WORK --model town-semantic --teacher 60      # after the first, in the same folder
     python tools/make_town_weights.py WORK --model town-camera --teacher 60
 
@@ -40,6 +40,7 @@ RUNS: dict[str, type[TrainConfig] | type[DistillConfig]] = {
     "codec": TrainConfig,
     "teacher": TrainConfig,
     "student": DistillConfig,
+    "decoder": TrainConfig,
 }
 
 
@@ -47,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path, help="folder of the runs")
     parser.add_argument("--model", choices=("town", "town-semantic", "town-camera"), default="town")
-    for name, minutes in (("codec", 60), ("teacher", 180), ("student", 30)):
+    for name, minutes in (("codec", 60), ("teacher", 180), ("student", 30), ("decoder", 30)):
         parser.add_argument(f"--{name}", type=float, default=minutes, metavar="MINUTES")
     parser.add_argument("--set", nargs="*", default=[], metavar="RUN.KEY=VALUE")
     parser.add_argument("--out", type=Path, help="by default where the package has its weights")
@@ -66,7 +67,7 @@ def main() -> None:
         changes = [change.partition(".")[2] for change in given.set if change.startswith(f"{name}.")]
         folder = given.work / f"{given.model.replace('-', '_')}_{name}"
         path = train(RUNS[name], folder, getattr(given, name), [*data, *made, *changes])
-        made = [f"{name}={path}"]
+        made = [f"{'init' if name == 'student' else name}={path}"]
     ship(path, given.out or ROOT / "lidar_synth" / "weights" / f"{given.model}.safetensors")
 
 

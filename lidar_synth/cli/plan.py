@@ -1,7 +1,7 @@
 """What a training configuration asks for: the networks, what they are trained on, and what the checkpoint will say."""
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,18 +27,22 @@ from lidar_synth.config import DistillConfig, Run, TrainConfig
 from lidar_synth.errors import ConfigError
 from lidar_synth.files import write_file
 from lidar_synth.flow import METRICS, guided, velocity_loss
+from lidar_synth.nets.autoencoder import Autoencoder
 from lidar_synth.solvers import uniform_grid
 from lidar_synth.timesteps import Selection, select_timesteps
 from lidar_synth.train import (
     Autoencoding,
     Batches,
     Conditioning,
+    Decoding,
     Loss,
     Other,
     Task,
     autoencoder_loss,
     cache_latents,
     cache_scans,
+    decoding_loss,
+    decoding_task,
     reconstruction_task,
     student_task,
     teacher_task,
@@ -57,14 +61,19 @@ class Plan:
         task: on what.
         header: what the checkpoint will say.
         loss: what is lowered.
-        autoencoder: of a latent model, frozen.
+        held: parts of the checkpoint that stand still, such as the autoencoder of a latent model.
     """
 
     network: nn.Module
     task: Task
     header: Header
     loss: Loss = velocity_loss
-    autoencoder: nn.Module | None = None
+    held: Mapping[str, nn.Module] = field(default_factory=dict)
+
+    @property
+    def autoencoder(self) -> nn.Module | None:
+        """That makes the latents which are trained on."""
+        return self.held.get(CODEC)
 
     def codec(self) -> Codec:
         """Between tensors and states."""
@@ -72,9 +81,8 @@ class Plan:
 
     def parts(self, network: nn.Module) -> dict[str, nn.Module]:
         """The parts of the checkpoint, of the network or its averaged twin."""
-        if isinstance(network, Autoencoding):
-            return {CODEC: network.network}
-        return split(network) | ({CODEC: self.autoencoder} if self.autoencoder is not None else {})
+        trained = {CODEC: network.network} if isinstance(network, Autoencoding) else split(network)
+        return {**trained, **self.held}
 
 
 def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -> Plan:
@@ -85,6 +93,8 @@ def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -
     """
     if isinstance(config, DistillConfig):
         return plan_student(config, accelerator)
+    if config.decoder:
+        return plan_decoder(config, accelerator)
     return plan_autoencoder(config) if config.autoencodes else plan_teacher(config, accelerator)
 
 
@@ -97,7 +107,7 @@ def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> Plan:
     autoencoder = networks.get(CODEC)
     if autoencoder is not None:
         autoencoder.requires_grad_(False).to(accelerator.device)
-    return Plan(join(networks), task, header, autoencoder=autoencoder)
+    return Plan(join(networks), task, header, held=_codec_of(networks))
 
 
 def plan_autoencoder(config: TrainConfig) -> Plan:
@@ -109,6 +119,19 @@ def plan_autoencoder(config: TrainConfig) -> Plan:
         network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights
     )
     return Plan(trained, reconstruction_task, header, autoencoder_loss)
+
+
+def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> Plan:
+    """The decoder of a latent model, on what its flow leaves."""
+    networks, header = start_networks(config)
+    network = networks[CODEC]
+    if not isinstance(network, Autoencoder):
+        raise ConfigError(f"decoder with init {config.init}", "a model whose autoencoder says distributions")
+    held = {name: part.requires_grad_(False).to(accelerator.device) for name, part in networks.items() if name != CODEC}
+    recipe = config.recipe
+    trained = Decoding(network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights)
+    task = decoding_task(network, join(held), header.time_grid[-2], config.losses.noise)
+    return Plan(trained, task, header, decoding_loss, held)
 
 
 def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
@@ -124,7 +147,7 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
     provenance = provenance_of(config) | {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
     header = replace(teacher.header, time_grid=config.grid or uniform_grid(config.intervals), provenance=provenance)
     student = join(load_checkpoint(config.teacher).networks)
-    plan = Plan(student, teacher_task(), header, autoencoder=teacher.networks.get(CODEC))
+    plan = Plan(student, teacher_task(), header, held=_codec_of(teacher.networks))
     flow = velocity if config.guidance == 1 else _guided(config, teacher)
     if config.grid is None and config.strategy == "adaptive_piecewise":
         with accelerator.main_process_first():
@@ -132,6 +155,10 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
         provenance |= {"selection": {"cost": found.cost, "uniform_cost": found.uniform_cost}}
         header = replace(header, time_grid=found.grid, provenance=provenance)
     return replace(plan, task=student_task(config.strategy, flow, header.time_grid, config.steps), header=header)
+
+
+def _codec_of(networks: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
+    return {CODEC: networks[CODEC]} if CODEC in networks else {}
 
 
 def open_data(config: Run, plan: Plan, device: torch.device) -> Batches:

@@ -81,6 +81,8 @@ def check(config: Run) -> None:
 def _check_train(config: TrainConfig) -> None:
     if config.autoencodes and (config.codec or config.condition):
         raise ConfigError("an autoencoder with a codec or a condition", "neither: they belong to a flow")
+    if config.decoder and (config.init is None or config.condition):
+        raise ConfigError("decoder without init, or with a condition", "init: a latent model, with its own condition")
     if config.data.roll and config.condition and not CONDITIONS[config.condition.kind].turns:
         raise ConfigError(f"data.roll with the condition {config.condition.kind!r}", "data.roll=false")
     if config.codec is not None and config.recipe.weights:

@@ -25,6 +25,7 @@ class TrainConfig(Run):
         network: what to train.
         codec: checkpoint of an autoencoder, for a latent model; sensor, channels and normalisation are its own then.
         condition: what the model is conditioned on.
+        decoder: train the decoder of ``init``, a latent model, alone: on what its flow leaves.
         init: checkpoint to start from; its networks, sensor, channels and normalisation are those of the run then.
         timesteps: a name of ``TIMESTEPS``.
         steps: of the uniform time grid that the checkpoint names.
@@ -39,6 +40,7 @@ class TrainConfig(Run):
     codec: Path | None = None
     condition: Condition | None = None
     init: Path | None = None
+    decoder: bool = False
     timesteps: Literal["uniform", "u_shaped", "logit_normal", "logit_normal_shifted"] = "uniform"
     steps: Count = 50
     losses: Losses = Losses()

@@ -10,6 +10,7 @@ from lidar_synth.train.autoencoder import (
 )
 from lidar_synth.train.cache import ImageCache, Other, cache_latents, cache_scans
 from lidar_synth.train.data import Batch, Batches, Conditioning, micro_batches
+from lidar_synth.train.decoding import Decoding, decoding_loss, decoding_task
 from lidar_synth.train.loop import Loss, Record, Task, steps, student_task, teacher_task
 from lidar_synth.train.optimizers import OPTIMIZERS
 from lidar_synth.train.schedules import SCHEDULES
@@ -22,6 +23,7 @@ __all__ = [
     "Batch",
     "Batches",
     "Conditioning",
+    "Decoding",
     "ImageCache",
     "Loss",
     "Losses",
@@ -33,6 +35,8 @@ __all__ = [
     "autoencoder_loss",
     "cache_latents",
     "cache_scans",
+    "decoding_loss",
+    "decoding_task",
     "micro_batches",
     "reconstruct",
     "reconstruction_figures",

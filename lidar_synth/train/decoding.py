@@ -1,0 +1,76 @@
+"""Training of a decoder alone, on latents as a flow leaves them.
+
+An autoencoder learns with its own latents and a little noise. A student of few steps leaves more, and of another kind:
+walls whose pieces do not meet. So at the end the decoder goes on alone, while encoder and flow stand still. Every other
+latent is noised to the student's last timestep and goes through its last step, and the decoder shall find the scan
+again that it is of: what streets are like, it then knows better than the flow. The others have noise of any strength up
+to that of ``Losses``, so that latents which are exact are still trusted.
+"""
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from lidar_synth.flow import Example, Metric, Velocity, interpolate
+from lidar_synth.nets.autoencoder import Autoencoder
+from lidar_synth.normalize import TensorFormat
+from lidar_synth.sensor import Sensor
+from lidar_synth.train.autoencoder import Autoencoding, Losses
+from lidar_synth.train.data import Batch
+from lidar_synth.train.loop import Task
+
+
+class Decoding(Autoencoding):
+    """What is trained: a decoder. Arguments as ``Autoencoding`` has them."""
+
+    network: Autoencoder
+
+    def __init__(
+        self,
+        network: Autoencoder,
+        tensors: TensorFormat,
+        sensor: Sensor,
+        losses: Losses,
+        metric: Metric,
+        weights: Mapping[str, float],
+    ) -> None:
+        super().__init__(network, tensors, sensor, losses, metric, weights)
+        for parameter in network.encoder():
+            parameter.requires_grad_(False)
+
+    def forward(self, z: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]  # it does not make its latents
+        """The loss of images (B, C, H, W) under what latents (B, *latent_shape) say, a scalar."""
+        return self._told(self.network.expand(self.network.bounded(z), x), x)
+
+
+def decoding_loss(network: nn.Module, example: Example, metric: Metric) -> Tensor:
+    """The loss of ``Decoding``, which knows its metric itself."""
+    loss: Tensor = network(example.y, example.velocity)
+    return loss
+
+
+def decoding_task(autoencoder: Autoencoder, velocity: Velocity, time: float, noise: float) -> Task:
+    """Latents as a flow leaves them; the answer is the image.
+
+    Args:
+        autoencoder: of the latents, standing still.
+        velocity: of the flow.
+        time: where its last step begins.
+        noise: of ``Losses``.
+    """
+
+    @torch.no_grad()
+    def task(batch: Batch) -> Example:
+        shape = autoencoder.latent_shape
+        z = autoencoder.encode(batch.y0)
+        some = batch.y1.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
+        u = batch.u.view(-1, 1, 1, 1)
+        t = torch.full_like(batch.u, time)
+        y = interpolate(z, some, t)
+        left = y - time * velocity(y, t, batch.cond).float()
+        shaken = z + (2 * u - 1).clamp_min(0) * noise * some / autoencoder.scale.view(1, -1, 1, 1)
+        return Example(torch.where(u < 0.5, left, shaken), batch.u, batch.y0)
+
+    return task
