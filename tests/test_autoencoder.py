@@ -222,6 +222,8 @@ def test_a_decoder_meets_what_the_flow_leaves() -> None:
         {"codes": 40},
         {"channels": 5},
         {"depth": 1},
+        {"wide": [0]},
+        {"wide": [5]},
         {"window": [2, 3]},
         {"window": [7, 3]},
         {"normalisation": "metres"},

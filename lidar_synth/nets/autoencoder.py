@@ -110,6 +110,9 @@ class Autoencoder(nn.Module):
             )
         if normalisation not in NORMALISATIONS:
             raise ConfigError(f"normalisation {normalisation!r}", f"one of {', '.join(NORMALISATIONS)}")
+        columns = self.resolution[1] // DOWN[1]
+        if any(not 1 <= reach <= columns for reach in wide):
+            raise ConfigError(f"wide {list(wide)}", f"columns of a latent, from 1 to {columns}")
         outer, inner = widths
         self.channels, self.values, self.bits, self.fine = channels, channels - bits - 1, bits, fine
         self.draws = 2 + self.values
