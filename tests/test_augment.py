@@ -61,7 +61,7 @@ def freeze(scan: Scan) -> Scan:
 @given(seed=seeds)
 def test_the_generator_alone_decides_and_nothing_given_is_changed(name: str, seed: int) -> None:
     scan = freeze(scan_with_boxes(seed % 50))
-    first, again, other = (STEPS[name](scan, keyed_rng(s)) for s in (seed, seed, seed + 1))
+    first, again, *others = (STEPS[name](scan, keyed_rng(s)) for s in (seed, *range(seed, seed + 6)))
     assert first.points.dtype == np.float32 and first.fields().keys() == scan.fields().keys()
     assert np.array_equal(first.points, again.points)
     for key, values in first.fields().items():
@@ -73,8 +73,8 @@ def test_the_generator_alone_decides_and_nothing_given_is_changed(name: str, see
         "beam_drop",
         "range_drop",
     )
-    if not name.startswith("flip"):
-        assert first.points.shape != other.points.shape or not np.array_equal(first.points, other.points)
+    if not name.startswith("flip"):  # two may do the same by chance, such as nothing; six do not
+        assert not all(np.array_equal(first.points, other.points) for other in others)
     copied = pickle.loads(pickle.dumps(STEPS[name]))(scan, keyed_rng(seed))
     assert np.array_equal(copied.points, first.points)
 
