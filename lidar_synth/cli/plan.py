@@ -128,6 +128,8 @@ def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> Plan:
     if not isinstance(network, Autoencoder):
         raise ConfigError(f"decoder with init {config.init}", "a model whose autoencoder says distributions")
     held = {name: part.requires_grad_(False).to(accelerator.device) for name, part in networks.items() if name != CODEC}
+    for weight in network.encoder():
+        weight.requires_grad_(False)
     recipe = config.recipe
     trained = Decoding(network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights)
     task = decoding_task(network, join(held), header.time_grid[-2], config.losses.noise)

@@ -8,37 +8,21 @@ to that of ``Losses``, so that latents which are exact are still trusted.
 """
 
 import math
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
 
 from lidar_synth.flow import Example, Metric, Velocity, interpolate
 from lidar_synth.nets.autoencoder import Autoencoder
-from lidar_synth.normalize import TensorFormat
-from lidar_synth.sensor import Sensor
-from lidar_synth.train.autoencoder import Autoencoding, Losses
+from lidar_synth.train.autoencoder import Autoencoding
 from lidar_synth.train.data import Batch
 from lidar_synth.train.loop import Task
 
 
 class Decoding(Autoencoding):
-    """What is trained: a decoder. Arguments as ``Autoencoding`` has them."""
+    """What is trained: a decoder; the encoder's weights need no gradient. Arguments as ``Autoencoding`` has them."""
 
     network: Autoencoder
-
-    def __init__(
-        self,
-        network: Autoencoder,
-        tensors: TensorFormat,
-        sensor: Sensor,
-        losses: Losses,
-        metric: Metric,
-        weights: Mapping[str, float],
-    ) -> None:
-        super().__init__(network, tensors, sensor, losses, metric, weights)
-        for parameter in network.encoder():
-            parameter.requires_grad_(False)
 
     def forward(self, z: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]  # it does not make its latents
         """The loss of images (B, C, H, W) under what latents (B, *latent_shape) say, a scalar."""
