@@ -99,6 +99,22 @@ def guided(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
     return velocity if scale == 1 else toward
 
 
+def autoguided(velocity: Velocity, weaker: Velocity, scale: float) -> Velocity:
+    """Autoguidance (Karras et al., "Guiding a Diffusion Model with a Bad Version of Itself", NeurIPS 2024):
+    v_weaker + scale (v - v_weaker), away from the mistakes that both make, with a condition or without.
+
+    Args:
+        velocity: a flow.
+        weaker: one of the same data and conditions that makes the same mistakes more: smaller, trained for less.
+        scale: 1 = no guidance.
+    """
+
+    def away(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
+        return torch.lerp(weaker(y, t, cond), velocity(y, t, cond), scale)
+
+    return velocity if scale == 1 else away
+
+
 def squared_l2(a: Tensor, b: Tensor) -> Tensor:
     """(B,) mean of (a - b)^2; the paper's metric for latent models and 1-RF teachers."""
     return _error(a, b).square().mean(1)

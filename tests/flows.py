@@ -10,17 +10,17 @@ MEAN, STD = 0.5, 0.1
 """Of the data of the Gaussian flow."""
 
 
-def _moments(t: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+def _moments(t: Tensor, y: Tensor, spread: float = STD) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of y_t = (1 - t) y0 + t y1."""
     t = per_sample(t, y)
-    return (1 - t) * MEAN, ((1 - t) ** 2 * STD**2 + t**2).sqrt()
+    return (1 - t) * MEAN, ((1 - t) ** 2 * spread**2 + t**2).sqrt()
 
 
-def gaussian_velocity(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
-    """E[y1 - y0 | y_t = y] for data N(MEAN, STD^2), element by element."""
-    mean, std = _moments(t, y)
+def gaussian_velocity(y: Tensor, t: Tensor, cond: Any = None, spread: float = STD) -> Tensor:
+    """E[y1 - y0 | y_t = y] for data N(MEAN, spread^2), element by element."""
+    mean, std = _moments(t, y, spread)
     t = per_sample(t, y)
-    return -MEAN + (t - (1 - t) * STD**2) / std**2 * (y - mean)
+    return -MEAN + (t - (1 - t) * spread**2) / std**2 * (y - mean)
 
 
 def gaussian_flow(y: Tensor, start: Tensor, end: Tensor) -> Tensor:

@@ -3,11 +3,12 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from flows import gaussian_velocity
+from flows import MEAN, STD, gaussian_velocity
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.flow import (
     METRICS,
     TIMESTEPS,
+    autoguided,
     flow_matching,
     interpolate,
     logit_normal,
@@ -24,6 +26,7 @@ from lidar_synth.flow import (
     velocity_loss,
 )
 from lidar_synth.noise import gaussian, uniform
+from lidar_synth.solvers import solve, uniform_grid
 
 
 def test_the_path_runs_from_data_to_noise_at_its_velocity() -> None:
@@ -56,6 +59,28 @@ def test_the_loss_passes_the_condition_on() -> None:
     example = replace(flow_matching(torch.zeros(2, 3), torch.ones(2, 3), torch.tensor([0.2, 0.4])), cond=3.0)
     loss = velocity_loss(lambda y, t, c: c * torch.ones_like(y), example, METRICS["l1"])
     assert loss.item() == 2.0
+
+
+def test_autoguidance_leads_away_from_the_mistake_of_both() -> None:
+    """Data of deviation 0.1, a model that takes it for 0.15, a weaker one that takes it for 0.2."""
+    model, weaker = (partial(gaussian_velocity, spread=spread) for spread in (1.5 * STD, 2 * STD))
+    noise, grid = gaussian(0, range(4000), (1,), dtype=torch.float64), uniform_grid(50)
+
+    def spread(scale: float) -> float:
+        y = solve(autoguided(model, weaker, scale), noise, grid)
+        assert float(y.mean()) == pytest.approx(MEAN, abs=0.01)
+        return float(y.std())
+
+    assert autoguided(model, weaker, 1.0) is model
+    assert spread(0.0) == pytest.approx(2 * STD, rel=0.05)
+    assert spread(1.0) == pytest.approx(1.5 * STD, rel=0.05)
+    assert spread(2.0) == pytest.approx(STD, rel=0.15)
+
+
+def test_autoguidance_passes_the_condition_on() -> None:
+    y, t, cond = torch.randn(3, 2), torch.rand(3), torch.randn(3, 2)
+    out = autoguided(lambda y, t, c: y + c, lambda y, t, c: y - c, 3.0)(y, t, cond)
+    assert torch.allclose(out, y + 5 * cond)
 
 
 @pytest.mark.parametrize("name", METRICS)

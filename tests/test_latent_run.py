@@ -1,5 +1,6 @@
 """The latent path from configurations: autoencoder, conditioned teacher, student, scans; by the commands of pixels."""
 
+import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,9 +18,10 @@ from torch import nn
 from typer.testing import CliRunner
 
 from lidar_synth.bake.conditions import conditions_for
-from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint, read_header
+from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, join, load_checkpoint, read_header, save_checkpoint
 from lidar_synth.cli import app
 from lidar_synth.cli.plan import make_plan, open_data
+from lidar_synth.cli.teaching import taught_flow
 from lidar_synth.config import DistillConfig, load_config
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS
@@ -177,6 +179,61 @@ def test_it_is_distilled_on_timesteps_selected_with_its_conditions(
     assert len(scan) > 0
     call("distill", config, "--resume", "recipe.iterations=10")
     assert read_header(tmp_path / "student" / "student.safetensors")[0].provenance["iterations"] == 10
+
+
+def test_a_student_learns_what_leads_away_from_a_weaker_teacher(
+    scans: Path, codec: Path, teacher: Path, tmp_path: Path
+) -> None:
+    small = UNET | {"arguments": UNET["arguments"] | {"width": 8}}  # type: ignore[dict-item]
+    call("train", write_config(scans, tmp_path, "weak", codec=str(codec), network=small, condition=SEMANTIC))
+    weaker = tmp_path / "weak" / "weak.safetensors"
+    values = {"teacher": str(teacher), "weaker": str(weaker), "strategy": "uniform_piecewise", "steps": 2}
+    config = write_config(scans, tmp_path, "student", **values, guidance=2.5)
+    call("distill", config)
+    header, _ = read_header(tmp_path / "student" / "student.safetensors")
+    assert header.provenance["weaker"] == load_checkpoint(weaker).hash
+    assert str(tmp_path) not in json.dumps(header.provenance)
+
+    strong, weak = load_checkpoint(teacher), load_checkpoint(weaker)
+    flow, _ = taught_flow(load_config(DistillConfig, config), strong, torch.device("cpu"))
+    y, t = torch.randn(2, 4, 4, 8), torch.tensor([0.3, 0.8])
+    maps = torch.randint(0, 19, (2, *SENSOR.shape), dtype=torch.uint8)
+    a, b = (join(checkpoint.networks)(y, t, maps) for checkpoint in (strong, weak))
+    assert not torch.allclose(a, b, atol=1e-3)
+    assert torch.allclose(flow(y, t, maps), b + 2.5 * (a - b), atol=1e-5)
+
+    for changes, message in (
+        (["guidance=1"], "weak.safetensors with guidance 1; expected a scale"),
+        ([f"weaker={codec}"], "codec.safetensors, an autoencoder; expected a model that generates"),
+        ([f"teacher={without_condition(teacher, tmp_path)}"], "of another conditioning; expected those of"),
+        ([f"weaker={with_other_codec(weaker, tmp_path)}"], "of another autoencoder; expected those of"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            call("distill", config, f"output={tmp_path / 'other'}", *changes)
+
+
+def without_condition(path: Path, folder: Path) -> Path:
+    """A model whose header says nothing of the condition that it takes."""
+    header, networks, _ = load_checkpoint(path)
+    save_checkpoint(out := folder / "alone.safetensors", replace(header, conditioning={}), networks)
+    return out
+
+
+def with_other_codec(path: Path, folder: Path) -> Path:
+    """A model of other latents."""
+    header, networks, _ = load_checkpoint(path)
+    with torch.no_grad():
+        networks[CODEC].scale.mul_(1.5)  # type: ignore[union-attr, operator]
+    save_checkpoint(out := folder / "apart.safetensors", header, networks)
+    return out
+
+
+def test_guidance_of_an_unconditional_teacher_asks_for_a_weaker_one(scans: Path, codec: Path, tmp_path: Path) -> None:
+    call("train", write_config(scans, tmp_path, "plain", codec=str(codec), network=UNET))
+    plain = tmp_path / "plain" / "plain.safetensors"
+    config = write_config(scans, tmp_path, "student", teacher=str(plain), guidance=2.0)
+    with pytest.raises(ConfigError, match="unconditional teacher; expected 1, or weaker=CHECKPOINT"):
+        call("distill", config)
 
 
 def test_runs_go_on_as_if_nothing_had_happened(scans: Path, codec: Path, tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ def student(strategy: str, teacher: Path, work: Path, evaluations: int, override
     def configured(*more: str) -> DistillConfig:
         path = ROOT / "configs" / "town_student.yaml"
         own = (
+            "weaker=null",  # what guidance brings is another question
+            "guidance=1",
             f"output={work / strategy}",
             f"data.cache={work / 'cache'}",
             f"teacher={teacher}",

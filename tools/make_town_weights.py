@@ -1,6 +1,7 @@
-"""The recipe of the weights that ship, on scans of the town only: autoencoder, teacher, timesteps, student, decoder.
+"""The recipe of the weights that ship, on scans of the town only: autoencoder, teacher, a weaker teacher to lead away
+from, timesteps, student, decoder.
 
-    python tools/make_town_weights.py WORK [--model town] [--codec 60] [--teacher 180] [--student 30]
+    python tools/make_town_weights.py WORK [--model town] [--codec 60] [--teacher 180] [--weaker 10] [--student 30]
         [--decoder 30] [--set RUN.KEY=VALUE ...]
     python tools/make_town_weights.py WORK --model town-semantic --teacher 60      # after the first, in the same folder
     python tools/make_town_weights.py WORK --model town-camera --teacher 60
@@ -17,7 +18,9 @@ import argparse
 import json
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
@@ -36,11 +39,31 @@ LIMIT = 16e6
 CAMERA_SCANS, CAMERA_INTERVAL = 800, 2.0
 """Scans with images, and the seconds between them; an image takes a second and a half."""
 
-RUNS: dict[str, type[TrainConfig] | type[DistillConfig]] = {
-    "codec": TrainConfig,
-    "teacher": TrainConfig,
-    "student": DistillConfig,
-    "decoder": TrainConfig,
+
+class Stage(NamedTuple):
+    """A run of the recipe.
+
+    Args:
+        config: of its file in configs/.
+        minutes: by default.
+        needs: {key of the configuration: the stage whose checkpoint it names}.
+    """
+
+    config: type[TrainConfig] | type[DistillConfig]
+    minutes: float
+    needs: Mapping[str, str] = {}
+
+
+STAGES = {
+    "codec": Stage(TrainConfig, 60),
+    "teacher": Stage(TrainConfig, 180, {"codec": "codec"}),
+    "weaker": Stage(TrainConfig, 10, {"codec": "codec"}),
+    "student": Stage(DistillConfig, 30, {"teacher": "teacher", "weaker": "weaker"}),
+    "decoder": Stage(TrainConfig, 30, {"init": "student"}),
+}
+CONDITIONAL = {
+    "teacher": Stage(TrainConfig, 180, {"init": "unconditional"}),
+    "student": Stage(DistillConfig, 30, {"teacher": "teacher"}),
 }
 
 
@@ -48,8 +71,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path, help="folder of the runs")
     parser.add_argument("--model", choices=("town", "town-semantic", "town-camera"), default="town")
-    for name, minutes in (("codec", 60), ("teacher", 180), ("student", 30), ("decoder", 30)):
-        parser.add_argument(f"--{name}", type=float, default=minutes, metavar="MINUTES")
+    for name, stage in STAGES.items():
+        parser.add_argument(f"--{name}", type=float, default=stage.minutes, metavar="MINUTES")
     parser.add_argument("--set", nargs="*", default=[], metavar="RUN.KEY=VALUE")
     parser.add_argument("--out", type=Path, help="by default where the package has its weights")
     given = parser.parse_args()
@@ -59,15 +82,13 @@ def main() -> None:
         data = [f"data.cache={given.work / 'camera_cache'}", f"data.path={given.work / 'town_camera'}"]
         town = Town(0, scans=CAMERA_SCANS, interval=CAMERA_INTERVAL)
         export_town(town, given.work / "town_camera", "kitti360", jobs=os.cpu_count() or 1)
-    first = given.work / "town_teacher" / "town_teacher.safetensors"
-    runs, made = list(RUNS), []  # what the next run is given
-    if given.model != "town":
-        runs, made = ["teacher", "student"], [f"init={first}"]
-    for name in runs:
-        changes = [change.partition(".")[2] for change in given.set if change.startswith(f"{name}.")]
+    stages = STAGES if given.model == "town" else CONDITIONAL
+    made = {"unconditional": given.work / "town_teacher" / "town_teacher.safetensors"}
+    for name, stage in stages.items():
         folder = given.work / f"{given.model.replace('-', '_')}_{name}"
-        path = train(RUNS[name], folder, getattr(given, name), [*data, *made, *changes])
-        made = [f"{'init' if name == 'student' else name}={path}"]
+        needs = [f"{key}={made[other]}" for key, other in stage.needs.items()]
+        changes = [change.partition(".")[2] for change in given.set if change.startswith(f"{name}.")]
+        made[name] = path = train(stage.config, folder, getattr(given, name), [*data, *needs, *changes])
     ship(path, given.out or ROOT / "lidar_synth" / "weights" / f"{given.model}.safetensors")
 
 

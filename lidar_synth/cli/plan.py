@@ -13,7 +13,6 @@ from lidar_synth.checkpoint import (
     CODEC,
     ENCODER,
     VELOCITY,
-    Checkpoint,
     Header,
     join,
     load_checkpoint,
@@ -21,12 +20,13 @@ from lidar_synth.checkpoint import (
     weights_hash,
 )
 from lidar_synth.cli.start import fresh_networks, provenance_of, start_networks
+from lidar_synth.cli.teaching import taught_flow
 from lidar_synth.codec import Codec, make_codec
-from lidar_synth.conditions import CONDITIONS, Conditioned, blank
+from lidar_synth.conditions import CONDITIONS
 from lidar_synth.config import DistillConfig, Run, TrainConfig
 from lidar_synth.errors import ConfigError
 from lidar_synth.files import write_file
-from lidar_synth.flow import METRICS, guided, velocity_loss
+from lidar_synth.flow import METRICS, velocity_loss
 from lidar_synth.nets.autoencoder import Autoencoder
 from lidar_synth.solvers import uniform_grid
 from lidar_synth.timesteps import Selection, select_timesteps
@@ -143,14 +143,11 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
         raise ConfigError(f"teacher {config.teacher}, an autoencoder", "a model that generates")
     if CODEC in teacher.networks and config.recipe.weights:
         raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
-    velocity = join(teacher.networks).requires_grad_(False)
-    if config.compile:
-        velocity.compile()
-    provenance = provenance_of(config) | {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
+    flow, made = taught_flow(config, teacher, accelerator.device)
+    provenance = provenance_of(config) | made
     header = replace(teacher.header, time_grid=config.grid or uniform_grid(config.intervals), provenance=provenance)
     student = join(load_checkpoint(config.teacher).networks)
     plan = Plan(student, teacher_task(), header, held=_codec_of(teacher.networks))
-    flow = velocity if config.guidance == 1 else _guided(config, teacher)
     if config.grid is None and config.strategy == "adaptive_piecewise":
         with accelerator.main_process_first():
             found = _selection(config, flow, plan, accelerator)
@@ -189,18 +186,6 @@ def open_data(config: Run, plan: Plan, device: torch.device) -> Batches:
 
 def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, Any]) -> Callable[[Any], Any]:
     return lambda scan: CONDITIONS[name].read(scan, sensor, shape, options)
-
-
-def _guided(config: DistillConfig, teacher: Checkpoint) -> Any:
-    """The teacher with guidance, of conditions as they are stored."""
-    network = join(teacher.networks)
-    if not isinstance(network, Conditioned):
-        raise ConfigError(f"guidance {config.guidance} of an unconditional teacher", "1")
-    [(name, options)] = teacher.header.conditioning.items()
-    if not options.get("dropout"):
-        raise ConfigError(f"guidance {config.guidance} of a teacher that never met a blank condition", "1")
-    empty = torch.zeros(CONDITIONS[name].shape(network.encoder), dtype=torch.uint8)
-    return guided(network, config.guidance, blank(name, empty))
 
 
 def _selection(config: DistillConfig, velocity: Any, plan: Plan, accelerator: "Accelerator") -> Selection:

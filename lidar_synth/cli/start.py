@@ -127,7 +127,7 @@ def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path
 
 def provenance_of(config: Run) -> dict[str, Any]:
     """What a checkpoint says of its making; the checkpoints that it was made from stand beside, by their hash."""
-    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "init", "teacher", "codec"}
+    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "init", "teacher", "weaker", "codec"}
     return {
         "data": config.data.describe(),
         "data_licence": config.data.licence,

@@ -35,13 +35,15 @@ def train(config: ConfigFile, overrides: Overrides = None, resume: Resume = Fals
 def distill(config: ConfigFile, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
     """Distils a student that needs few steps from a teacher.
 
-    Where the configuration gives no time grid, the timesteps are selected first.
+    Where the configuration gives no time grid, the timesteps are selected first. With a weaker teacher the student
+    learns what leads away from it (autoguidance).
 
     \b
     Examples:
       lidar-synth distill configs/town_student.yaml
       lidar-synth distill configs/town_student.yaml strategy=uniform_piecewise output=runs/uniform
-      lidar-synth distill configs/town_student.yaml teacher=mine.safetensors grid=[1,0.86,0.58,0.22,0]
+      lidar-synth distill configs/town_student.yaml weaker=null guidance=1 output=runs/plain
+      lidar-synth distill configs/kitti360_student.yaml teacher=mine.safetensors grid=[1,0.86,0.58,0.22,0]
     """
     from lidar_synth.cli.run import run
     from lidar_synth.config import DistillConfig, load_config

@@ -107,7 +107,9 @@ class DistillConfig(Run):
         teacher: checkpoint; its network, sensor, channels and normalisation are the student's.
         strategy: a name of ``STRATEGIES``.
         steps: Euler steps of the teacher per piece.
-        guidance: scale of classifier-free guidance of the teacher, which the student learns; 1 = none.
+        guidance: scale of guidance of the teacher, which the student learns; 1 = none.
+        weaker: checkpoint of a smaller teacher, or one trained for less, which guidance leads away from (autoguidance);
+            without it, from the blank condition (classifier-free guidance).
         intervals: N, steps of the student.
         grid: N + 1 descending times from 1 to 0; without it, ``adaptive_piecewise`` selects them and the other
             strategies take uniform ones.
@@ -120,6 +122,7 @@ class DistillConfig(Run):
     ] = "adaptive_piecewise"
     steps: Count = 20
     guidance: float = 1.0
+    weaker: Path | None = None
     intervals: Count = 4
     grid: tuple[float, ...] | None = None
     selection: Selection = Selection()
