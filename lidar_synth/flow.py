@@ -99,7 +99,9 @@ def guided(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
     return velocity if scale == 1 else toward
 
 
-def autoguided(velocity: Velocity, weaker: Velocity, scale: float) -> Velocity:
+def autoguided(
+    velocity: Velocity, weaker: Velocity, scale: float, within: tuple[float, float] = (0.0, 1.0)
+) -> Velocity:
     """Autoguidance (Karras et al., "Guiding a Diffusion Model with a Bad Version of Itself", NeurIPS 2024):
     v_weaker + scale (v - v_weaker), away from the mistakes that both make, with a condition or without.
 
@@ -107,10 +109,14 @@ def autoguided(velocity: Velocity, weaker: Velocity, scale: float) -> Velocity:
         velocity: a flow.
         weaker: one of the same data and conditions that makes the same mistakes more: smaller, trained for less.
         scale: 1 = no guidance.
+        within: least and greatest time at which it leads; out of the noise it costs variety (Kynkaanniemi et al.,
+            "Applying Guidance in a Limited Interval", NeurIPS 2024).
     """
+    low, high = within
 
     def away(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
-        return torch.lerp(weaker(y, t, cond), velocity(y, t, cond), scale)
+        led = ((t >= low) & (t <= high)).to(y.dtype)
+        return torch.lerp(weaker(y, t, cond), velocity(y, t, cond), per_sample(1 + (scale - 1) * led, y))
 
     return velocity if scale == 1 else away
 

@@ -83,6 +83,12 @@ def test_autoguidance_passes_the_condition_on() -> None:
     assert torch.allclose(out, y + 5 * cond)
 
 
+def test_autoguidance_leads_within_its_times() -> None:
+    y, t = torch.ones(5, 2), torch.tensor([0.05, 0.1, 0.5, 0.9, 0.95])
+    out = autoguided(lambda y, t, c: 3 * y, lambda y, t, c: y, 2.0, within=(0.1, 0.9))(y, t, None)
+    assert out[:, 0].tolist() == [3, 5, 5, 5, 3] and torch.equal(out[:, 0], out[:, 1])
+
+
 @pytest.mark.parametrize("name", METRICS)
 def test_metrics_are_distances_per_sample(name: str) -> None:
     a, b = gaussian(0, range(3), (2, 4, 5)), gaussian(1, range(3), (2, 4, 5))

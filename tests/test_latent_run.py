@@ -188,7 +188,7 @@ def test_a_student_learns_what_leads_away_from_a_weaker_teacher(
     call("train", write_config(scans, tmp_path, "weak", codec=str(codec), network=small, condition=SEMANTIC))
     weaker = tmp_path / "weak" / "weak.safetensors"
     values = {"teacher": str(teacher), "weaker": str(weaker), "strategy": "uniform_piecewise", "steps": 2}
-    config = write_config(scans, tmp_path, "student", **values, guidance=2.5)
+    config = write_config(scans, tmp_path, "student", **values, guidance=2.5, within=[0.1, 0.5])
     call("distill", config)
     header, _ = read_header(tmp_path / "student" / "student.safetensors")
     assert header.provenance["weaker"] == load_checkpoint(weaker).hash
@@ -200,10 +200,12 @@ def test_a_student_learns_what_leads_away_from_a_weaker_teacher(
     maps = torch.randint(0, 19, (2, *SENSOR.shape), dtype=torch.uint8)
     a, b = (join(checkpoint.networks)(y, t, maps) for checkpoint in (strong, weak))
     assert not torch.allclose(a, b, atol=1e-3)
-    assert torch.allclose(flow(y, t, maps), b + 2.5 * (a - b), atol=1e-5)
+    assert torch.allclose(flow(y, t, maps)[0], (b + 2.5 * (a - b))[0], atol=1e-5)
+    assert torch.allclose(flow(y, t, maps)[1], a[1], atol=1e-5)  # t = 0.8
 
     for changes, message in (
         (["guidance=1"], "weak.safetensors with guidance 1; expected a scale"),
+        (["within=[0.9,0.1]"], r"within \(0.9, 0.1\); expected a lesser and a greater time"),
         ([f"weaker={codec}"], "codec.safetensors, an autoencoder; expected a model that generates"),
         ([f"teacher={without_condition(teacher, tmp_path)}"], "of another conditioning; expected those of"),
         ([f"weaker={with_other_codec(weaker, tmp_path)}"], "of another autoencoder; expected those of"),

@@ -1,13 +1,14 @@
 """The figures and the pictures of docs/models.md: how near generated scans come to scans of the town.
 
-    python tools/model_card.py NAME=MODEL[:STEPS] ... [--count 512] [--pictures OUT]
+    python tools/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ... [--count 512] [--pictures OUT]
 
     python tools/model_card.py "student, 4 steps=town" "teacher, 50 steps=RUN/town_teacher.safetensors:50" \\
         "teacher, 4 steps=RUN/town_teacher.safetensors:4" --pictures docs/models
 
 Every model makes scans from the same noise. They stand beside scans of a town that no model was trained on (seed 1);
 the first row is a third town (seed 2), which is as near as different streets of one kind come. STEPS of 0 stand for the
-third town's scans through the autoencoder of a latent model, which is as near as its flow can come.
+third town's scans through the autoencoder of a latent model, which is as near as its flow can come. With the checkpoint
+of a WEAKER model the flow is led away from it (autoguidance) from t = HIGH to LOW, as a student's teacher is.
 
 Models with a condition have a card of their own: tools/condition_card.py.
 """
@@ -16,15 +17,18 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from lidar_synth.checkpoint import CODEC, load_checkpoint
 from lidar_synth.classes import IGNORE, NAMES, TRAIN_ID
 from lidar_synth.codec import Latent
 from lidar_synth.errors import ConfigError
+from lidar_synth.flow import autoguided
 from lidar_synth.generator import find_model, load_generator
 from lidar_synth.metrics import Score, evaluate
 from lidar_synth.metrics.segmentation import Judge, class_ious, load_judge, mean_iou
@@ -47,9 +51,24 @@ NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)
 """Where cars and poles can be told from each other."""
 
 
-def generate(model: str, steps: int | None, count: int) -> list[Scan]:
+class Led(nn.Module):
+    """A flow that is led away from a weaker one."""
+
+    def __init__(self, network: nn.Module, weaker: nn.Module, scale: float, low: float, high: float) -> None:
+        super().__init__()
+        self.network, self.weaker, self.how = network, weaker, (scale, (low, high))
+
+    def forward(self, y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
+        """Velocities."""
+        return autoguided(self.network, self.weaker, *self.how)(y, t, cond)
+
+
+def generate(model: str, steps: int | None, count: int, weaker: str = "", *how: str) -> list[Scan]:
     """Scans of one model, which all models make from the same noise."""
     generator = load_generator(model)
+    if weaker:
+        led = Led(generator.network, load_generator(weaker).network, *map(float, how))
+        generator = replace(generator, network=led)
     indices = tqdm(range(count), desc=Path(model).stem, unit="scan")
     return [generator.scans(SEED, [i], steps=steps)[0] for i in indices]
 
@@ -156,7 +175,7 @@ def shrink(path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
+    parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]]")
     parser.add_argument("--count", type=int, default=512, help="scans of every row")
     parser.add_argument("--pictures", type=Path, help="folder for sheets of the first model and of the town")
     given = parser.parse_args()
@@ -166,10 +185,12 @@ def main() -> None:
     other = town(OTHER, given.count)
     lines = [rows("another town", reference, other, judge)]
     for i, text in enumerate(given.models):
-        name, model = text.split("=", 1)
-        model, _, steps = model.partition(":")
-        real = steps == "0"
-        scans = drawn_again(model, other) if real else generate(model, int(steps or 0) or None, given.count)
+        name, asked = text.split("=", 1)
+        model, steps, *led = asked.split(":") if ":" in asked else (asked, "")
+        if steps == "0":
+            scans = drawn_again(model, other)
+        else:
+            scans = generate(model, int(steps) if steps else None, given.count, *led)
         lines.append(rows(name, reference, scans, judge))
         if i == 0 and given.pictures:
             apart = np.linspace(0, given.count - 1, TILES).astype(int)

@@ -29,7 +29,7 @@ def taught_flow(config: DistillConfig, teacher: Checkpoint, device: torch.device
         weaker = load_checkpoint(config.weaker, device)
         _check_weaker(config, teacher, weaker)
         made |= {"weaker": weaker.hash, "weaker_provenance": weaker.header.provenance}
-        return autoguided(velocity, _standing(weaker, config.compile), config.guidance), made
+        return autoguided(velocity, _standing(weaker, config.compile), config.guidance, config.within), made
     return velocity if config.guidance == 1 else _from_blank(config, teacher, velocity), made
 
 
@@ -56,6 +56,8 @@ def _check_weaker(config: DistillConfig, teacher: Checkpoint, weaker: Checkpoint
     """Both have to speak of the same states and conditions."""
     if config.guidance == 1:
         raise ConfigError(f"weaker {config.weaker} with guidance 1", "a scale that leads away from it, such as 2")
+    if not 0 <= config.within[0] < config.within[1] <= 1:
+        raise ConfigError(f"within {config.within}", "a lesser and a greater time, both within [0, 1]")
     if VELOCITY not in weaker.networks:
         raise ConfigError(f"weaker {config.weaker}, an autoencoder", "a model that generates")
     differs = [k for k in ("sensor", "channels", "normalisation", "conditioning")

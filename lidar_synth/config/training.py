@@ -110,6 +110,7 @@ class DistillConfig(Run):
         guidance: scale of guidance of the teacher, which the student learns; 1 = none.
         weaker: checkpoint of a smaller teacher, or one trained for less, which guidance leads away from (autoguidance);
             without it, from the blank condition (classifier-free guidance).
+        within: least and greatest time at which ``weaker`` is led away from.
         intervals: N, steps of the student.
         grid: N + 1 descending times from 1 to 0; without it, ``adaptive_piecewise`` selects them and the other
             strategies take uniform ones.
@@ -123,6 +124,7 @@ class DistillConfig(Run):
     steps: Count = 20
     guidance: float = 1.0
     weaker: Path | None = None
+    within: tuple[float, float] = (0.0, 1.0)
     intervals: Count = 4
     grid: tuple[float, ...] | None = None
     selection: Selection = Selection()
