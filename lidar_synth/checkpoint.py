@@ -277,6 +277,11 @@ def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
         raise DataError(f"{what} has NaN or infinity in {bad}", "finite weights and ray angles")
 
 
+def network_hash(network: nn.Module) -> str:
+    """``weights_hash`` of a network's state, wherever it is."""
+    return weights_hash({key: value.cpu() for key, value in network.state_dict().items()})
+
+
 def weights_hash(tensors: Mapping[str, Tensor]) -> str:
     """sha256 of the names, types, shapes and bytes of tensors on the CPU, in hexadecimal."""
     digest = hashlib.sha256()

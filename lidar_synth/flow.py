@@ -115,8 +115,9 @@ def autoguided(
     low, high = within
 
     def away(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
-        led = ((t >= low) & (t <= high)).to(y.dtype)
-        return torch.lerp(weaker(y, t, cond), velocity(y, t, cond), per_sample(1 + (scale - 1) * led, y))
+        drawn = torch.where((t >= low) & (t <= high), scale, 1.0)
+        from_here = weaker(y, t, cond)
+        return from_here + per_sample(drawn, y) * (velocity(y, t, cond) - from_here)
 
     return velocity if scale == 1 else away
 

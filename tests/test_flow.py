@@ -81,6 +81,8 @@ def test_autoguidance_passes_the_condition_on() -> None:
     y, t, cond = torch.randn(3, 2), torch.rand(3), torch.randn(3, 2)
     out = autoguided(lambda y, t, c: y + c, lambda y, t, c: y - c, 3.0)(y, t, cond)
     assert torch.allclose(out, y + 5 * cond)
+    halves = (lambda y, t, c: (y + c).bfloat16(), lambda y, t, c: (y - c).bfloat16())  # as autocast leaves them
+    assert torch.allclose(autoguided(*halves, 3.0)(y, t, cond), y + 5 * cond, atol=0.2)
 
 
 def test_autoguidance_leads_within_its_times() -> None:

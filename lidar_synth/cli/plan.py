@@ -16,8 +16,8 @@ from lidar_synth.checkpoint import (
     Header,
     join,
     load_checkpoint,
+    network_hash,
     split,
-    weights_hash,
 )
 from lidar_synth.cli.start import fresh_networks, provenance_of, start_networks
 from lidar_synth.cli.teaching import taught_flow
@@ -180,8 +180,8 @@ def open_data(config: Run, plan: Plan, device: torch.device) -> Batches:
     data = Batches(cache, tensors, config.seed, config.data.flip, config.data.roll, device, codec, conditioning)
     if codec is None or not config.data.latents:
         return data
-    held = {key: value.cpu() for key, value in plan.parts(plan.network)[CODEC].state_dict().items()}
-    return replace(data, latents=cache_latents(cache, tensors, codec, device, folder, weights_hash(held)))
+    made_by = network_hash(plan.parts(plan.network)[CODEC])
+    return replace(data, latents=cache_latents(cache, tensors, codec, device, folder, made_by))
 
 
 def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, Any]) -> Callable[[Any], Any]:

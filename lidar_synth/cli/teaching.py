@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from lidar_synth.checkpoint import CODEC, VELOCITY, Checkpoint, join, load_checkpoint, weights_hash
+from lidar_synth.checkpoint import CODEC, VELOCITY, Checkpoint, join, load_checkpoint, network_hash
 from lidar_synth.conditions import CONDITIONS, Conditioned, blank
 from lidar_synth.config import DistillConfig
 from lidar_synth.errors import ConfigError
@@ -62,14 +62,12 @@ def _check_weaker(config: DistillConfig, teacher: Checkpoint, weaker: Checkpoint
         raise ConfigError(f"weaker {config.weaker}, an autoencoder", "a model that generates")
     differs = [k for k in ("sensor", "channels", "normalisation", "conditioning")
                if getattr(weaker.header, k) != getattr(teacher.header, k)]  # fmt: skip
-    if _codec_hash(weaker) != _codec_hash(teacher):
+    if _hash_of_latents(weaker) != _hash_of_latents(teacher):
         differs.append("autoencoder")
     if differs:
         raise ConfigError(f"weaker {config.weaker} of another {', '.join(differs)}", f"those of {config.teacher}")
 
 
-def _codec_hash(checkpoint: Checkpoint) -> str | None:
-    """Of the weights that make the latents; None for a model of range images."""
-    if CODEC not in checkpoint.networks:
-        return None
-    return weights_hash({key: value.cpu() for key, value in checkpoint.networks[CODEC].state_dict().items()})
+def _hash_of_latents(checkpoint: Checkpoint) -> str:
+    """Of the autoencoder that makes them; empty for a model of range images."""
+    return network_hash(checkpoint.networks[CODEC]) if CODEC in checkpoint.networks else ""
