@@ -8,12 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 
 from lidar_synth.scan import Scan
 from lidar_synth.sensor import Sensor, presets
 
 # A shell leaves SIGINT ignored in what it starts in the background, and so in every process that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of the code
+settings.load_profile("untimed")
 
 
 def _folder(variable: str) -> Path:

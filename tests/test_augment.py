@@ -57,7 +57,7 @@ def freeze(scan: Scan) -> Scan:
 
 
 @pytest.mark.parametrize("name", STEPS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=seeds)
 def test_the_generator_alone_decides_and_nothing_given_is_changed(name: str, seed: int) -> None:
     scan = freeze(scan_with_boxes(seed % 50))
@@ -80,7 +80,7 @@ def test_the_generator_alone_decides_and_nothing_given_is_changed(name: str, see
 
 
 @pytest.mark.parametrize("name", STEPS)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=seeds)
 def test_boxes_contain_the_same_points(name: str, seed: int) -> None:
     """The confidence, made unique, says which point is which."""
@@ -99,7 +99,7 @@ def test_boxes_contain_the_same_points(name: str, seed: int) -> None:
         assert np.array_equal(changed.fields()[key], scan.fields()[key][left])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=seeds, angle=st.floats(-7, 7), factor=st.floats(0.5, 2))
 def test_what_is_done_can_be_undone(seed: int, angle: float, factor: float) -> None:
     scan = scan_with_boxes(seed % 50, 300)

@@ -64,7 +64,7 @@ def test_an_image_comes_back_to_half_a_step(sensor: Sensor) -> None:
         assert np.abs(decoded.channels[name] - image.channels[name]).max() <= 0.5001 / levels
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 2**32 - 1), near=st.floats(0, 3), far=st.floats(20, 300))
 def test_encode_is_the_inverse_of_decode(seed: int, near: float, far: float) -> None:
     sensor = Sensor("any", 16, near, far, rows=4, fov_up=3.0, fov_down=-25.0)
@@ -164,7 +164,7 @@ def test_fletcher32_is_that_of_hdf5(size: int, fill: int | None) -> None:
     dtype=st.sampled_from([np.uint8, np.uint16, np.uint32]),
     most=st.sampled_from([1, 3, 256, 2**32 - 1]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_inflate_is_the_inverse_of_deflate(
     values: np.random.Generator, shape: tuple[int, int], dtype: type[np.unsignedinteger[Any]], most: int
 ) -> None:

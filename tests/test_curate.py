@@ -152,7 +152,7 @@ def test_signatures_are_unit_vectors_of_what_is_near() -> None:
     assert not features(far).signature[512 - 16 : 512 + 16].any()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 12), block=st.integers(1, 5))
 def test_the_most_alike_of_the_earlier_ones(seed: int, count: int, block: int) -> None:
     rng = np.random.default_rng(seed)
@@ -243,7 +243,7 @@ def test_what_is_no_rule(rule: str, message: str) -> None:
 # Curated banks
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(scans=st.integers(1, 40), data=st.data())
 def test_positions_of_what_is_kept(scans: int, data: st.DataObject) -> None:
     dropped = sorted(data.draw(st.sets(st.integers(0, scans - 1), max_size=scans - 1)))

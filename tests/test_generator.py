@@ -83,7 +83,7 @@ def test_images_are_the_flow_from_the_contracts_noise(generator: Generator) -> N
     assert not np.array_equal(images[0].range, images[1].range)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(indices=st.lists(st.integers(0, 2**62), min_size=1, max_size=5), batch=st.integers(1, 3))
 def test_what_is_sampled_along_with_a_scan_does_not_matter(
     generator: Generator, indices: list[int], batch: int

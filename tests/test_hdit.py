@@ -56,7 +56,7 @@ def by_definition(q: Tensor, k: Tensor, v: Tensor, grid: tuple[int, int], window
     return out
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     grid=st.tuples(st.integers(3, 9), st.integers(4, 24)),
     window=st.tuples(st.sampled_from([1, 3, 5]), st.sampled_from([1, 3, 9])),
@@ -83,7 +83,7 @@ def test_every_query_sees_its_whole_window() -> None:
     assert attend.tokens.flatten().sort().values.tolist() == list(range(48))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(rows=st.integers(1, 4), columns=st.integers(1, 4), patch=st.tuples(st.integers(1, 3), st.integers(1, 4)))
 def test_patches_come_back(rows: int, columns: int, patch: tuple[int, int]) -> None:
     resolution = (rows * patch[0], columns * patch[1])

@@ -60,7 +60,7 @@ def assert_nothing_shares_a_ray(scan: Scan, first: int) -> None:
             assert (distance[between] <= distance[mine].min() + 1e-3).all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @example((22.0, 0.0, 1.0), [(20.0, 1.0)])  # the foot of a wall in the cells where the car meets the ground
 @given(places, st.lists(st.tuples(st.floats(4, 40), st.floats(-180, 180)), max_size=3))
 def test_a_pasted_car_is_what_the_sensor_would_have_seen(

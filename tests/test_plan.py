@@ -41,7 +41,7 @@ def test_the_order_is_what_it_always_was() -> None:
     assert list(zip(made.source.tolist(), made.index.tolist(), strict=True)) == [(2, 2), (0, 0), (3, 1), (2, 3), (1, 0)]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     real=st.integers(1, 40), hundredths=st.integers(0, 100), seed=st.integers(0, 2**64 - 1),
     epoch=st.integers(0, 10**6), size=st.sampled_from(["add", "replace", 1, 7, 50]), balanced=st.booleans(),
@@ -59,7 +59,7 @@ def test_counts_are_exact(real: int, hundredths: int, seed: int, epoch: int, siz
         assert synthetic == floor(len(made) * share + Fraction(1, 2))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(1, 7), st.sampled_from([0.1, 0.25, 1 / 3, 0.5, 0.8]), st.sampled_from(["add", "replace", 23]))
 def test_running_indices(real: int, ratio: float, size: str | int) -> None:
     """Over the epochs, real scans are given equally often, up to one, and synthetic ones once each, in turn."""
@@ -96,7 +96,7 @@ def test_weights_are_kept_by_largest_remainders() -> None:
     assert quotas(unweighted, 0) == (8, 22, 10, 10)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(8, 200), st.fractions(0, 1, max_denominator=20), st.integers(1, 12))
 def test_a_balanced_plan_is_exact_in_every_batch(total: int, share: Fraction, batch: int) -> None:
     domain = plan(mixture(5, float(share), epoch_size=total, balanced=True), 4).domain

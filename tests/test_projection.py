@@ -41,7 +41,7 @@ def test_every_cell_returns_to_itself(sensor: Sensor, beams: bool) -> None:
     assert np.allclose(back.range, image.range, rtol=3e-7, atol=0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(kind=st.sampled_from(sorted(SMALL)), data=st.data())
 def test_every_cell_returns_to_itself_whatever_the_image(kind: str, data: st.DataObject) -> None:
     sensor = SMALL[kind]
@@ -112,7 +112,7 @@ def test_conventions() -> None:
     assert (straight_up // 32).tolist() == [0, 7]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(hnp.arrays(np.float32, (50, 2), elements=st.floats(-200, 200, width=32)))
 def test_angles_are_right_and_the_same_in_torch(xy: np.ndarray) -> None:
     xy = xy + np.float32(0)  # without negative zeros, whose side of the seam is a matter of taste

@@ -118,7 +118,7 @@ def make_in_thread(ledger: Ledger, size: int) -> None:
     threading.Thread(target=work, daemon=True).start()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     slots=st.integers(1, 6),
     size=st.integers(1, 4),
@@ -221,7 +221,7 @@ def test_last_words_fit() -> None:
 # --- the rolling bank -----------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(numbers=st.lists(st.integers(0, 20) | st.integers(0, 2**62), min_size=1, max_size=5))
 def test_a_rolling_bank_gives_the_generators_scans_in_every_order(
     bank: RollingBank, generator: Generator, numbers: list[int]

@@ -38,7 +38,7 @@ def outside_in(count: int, seed: int = 0, radius: float = 50.0) -> tuple[np.ndar
 
 
 @given(low=st.tuples(*[st.floats(-5, 5)] * 3), size=st.tuples(*[st.floats(0.1, 5)] * 3))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_box_is_hit_where_it_stands(low: tuple[float, ...], size: tuple[float, ...]) -> None:
     a, b = np.array(low), np.array(low) + np.array(size)
     mesh = boxes([a], [b])
@@ -72,7 +72,7 @@ def test_a_tube_has_its_radius() -> None:
 
 
 @given(yaw=st.floats(-3, 3), scale=st.floats(0.5, 2), x=st.floats(-10, 10))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_moving_is_a_similarity(yaw: float, scale: float, x: float) -> None:
     mesh = vehicles()["sedan"].mesh
     moved = mesh.moved((x, 1, 2), yaw, scale)

@@ -144,7 +144,7 @@ def test_arguments_that_do_not_fit(arguments: dict[str, Any], message: str) -> N
         build_network("unet", {**SMALL, **arguments})
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3), st.integers(1, 3))
 def test_unfold_is_the_inverse_of_fold(p: int, q: int, rows: int, columns: int, channels: int) -> None:
     x = torch.randn(2, channels, p * rows, q * columns)

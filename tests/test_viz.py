@@ -154,7 +154,7 @@ def test_from_above_ahead_is_up_and_left_is_left() -> None:
     assert (seen[far] == EMPTY).all()
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.floats(-180, 180), st.floats(-80, 80), st.floats(5, 100))
 def test_an_orbit_keeps_its_target_in_the_middle(azimuth: float, elevation: float, distance: float) -> None:
     camera = Orbit(azimuth, elevation, distance, target=(1.0, -2.0, 0.5)).camera()
