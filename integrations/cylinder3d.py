@@ -27,7 +27,7 @@ from lidar_synth.integrations.mixture import (
 )
 
 from lidar_synth.errors import LibraryError
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 NAME = "SemKITTI_mixed"
 _IDS = id_table(1, 0, np.uint8)

@@ -18,9 +18,9 @@ from lidar_synth.errors import DataError
 from lidar_synth.files import write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA
+from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.ground import GROUND
-from lidar_synth.scan import Boxes, Scan
 
 NEAR = 40.0
 """Metres within which the ground counts."""

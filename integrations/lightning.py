@@ -13,9 +13,9 @@ from typing import Any
 from torch.utils.data import DataLoader, Dataset
 
 from lidar_synth.errors import ConfigError, LibraryError
+from lidar_synth.geometry.scan import Source
 from lidar_synth.mixing import Collate, Generated, MixedBatches, MixedScans, to_item
 from lidar_synth.noise import keyed_rng
-from lidar_synth.scan import Source
 
 try:
     import lightning

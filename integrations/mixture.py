@@ -20,9 +20,9 @@ from lidar_synth.classes import IGNORE, NAMES, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files import read_text
 from lidar_synth.formats import open_scans
-from lidar_synth.generator import load_generator
+from lidar_synth.generate.generator import load_generator
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
-from lidar_synth.scan import Scan
 
 VARIABLE = "LIDAR_SYNTH_MIX"
 """Environment variable with the YAML file of settings, for trainers whose configuration takes no other keys."""

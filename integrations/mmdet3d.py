@@ -25,7 +25,7 @@ from lidar_synth.integrations.mmdet3d_infos import (
 )
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 try:
     import mmdet3d

@@ -28,10 +28,10 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.point_labels import encode_labels
+from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.mixing import Synthetic, make_synthetic
 from lidar_synth.mixing.schedules import settled
 from lidar_synth.mixing.state import place
-from lidar_synth.scan import Boxes, Scan
 
 PREFIX = "lsynth://"
 MIXTURE, INFOS, EPOCH = "mixture.json", "infos.json", "epoch"

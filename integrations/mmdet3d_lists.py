@@ -13,7 +13,7 @@ from lidar_synth.files import read_text, write_file
 from lidar_synth.formats import KITTIObject, SemanticKITTI
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_labels import boxes_to_camera
-from lidar_synth.scan import Boxes, Scan
+from lidar_synth.geometry.scan import Boxes, Scan
 
 CLASSES = ("Pedestrian", "Cyclist", "Car", "Van", "Truck", "Person_sitting", "Tram", "Misc")
 """``KittiDataset``'s, in its order."""

@@ -21,7 +21,7 @@ from lidar_synth.integrations.mmdet3d_lists import CLASSES
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats.calibration import Calibration, homogeneous
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 try:
     import pcdet.datasets

@@ -22,7 +22,7 @@ from lidar_synth.integrations.mixture import (
 )
 
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 try:
     from pointcept.datasets.builder import DATASETS

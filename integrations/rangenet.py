@@ -29,7 +29,7 @@ from lidar_synth.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.files import write_file
 from lidar_synth.formats.point_labels import encode_labels
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 STOCK = "tasks.semantic.dataset.kitti.parser"
 _TRAIN_IDS = id_table(0, 255, np.uint8)

@@ -10,9 +10,9 @@ __version__ = "0.1.0"
 
 _HOME = {
     "Bank": "bank",
-    "BatchMixer": "service",
-    "Boxes": "scan",
-    "Generator": "generator",
+    "BatchMixer": "mixing.service",
+    "Boxes": "geometry.scan",
+    "Generator": "generate.generator",
     "KITTI360": "formats",
     "KITTIObject": "formats",
     "KITTIRaw": "formats",
@@ -22,21 +22,21 @@ _HOME = {
     "MixedStream": "mixing",
     "NuScenes": "formats",
     "ObjectBank": "labels",
-    "RangeImage": "scan",
-    "RollingBank": "service",
-    "Scan": "scan",
+    "RangeImage": "geometry.scan",
+    "RollingBank": "mixing.service",
+    "Scan": "geometry.scan",
     "SemanticKITTI": "formats",
-    "Sensor": "sensor",
-    "Source": "scan",
+    "Sensor": "geometry.sensor",
+    "Source": "geometry.scan",
     "Sources": "mixing",
     "Town": "town",
-    "load_generator": "generator",
-    "load_sensor": "sensor",
+    "load_generator": "generate.generator",
+    "load_sensor": "geometry.sensor",
     "make_policy": "labels",
     "open_scans": "formats",
-    "project": "projection",
-    "unfold": "projection",
-    "unproject": "projection",
+    "project": "geometry.projection",
+    "unfold": "geometry.projection",
+    "unproject": "geometry.projection",
 }
 
 __all__ = ["__version__", *_HOME]
@@ -50,25 +50,25 @@ if TYPE_CHECKING:
     from lidar_synth.formats import NuScenes as NuScenes
     from lidar_synth.formats import SemanticKITTI as SemanticKITTI
     from lidar_synth.formats import open_scans as open_scans
-    from lidar_synth.generator import Generator as Generator
-    from lidar_synth.generator import load_generator as load_generator
+    from lidar_synth.generate.generator import Generator as Generator
+    from lidar_synth.generate.generator import load_generator as load_generator
+    from lidar_synth.geometry.projection import project as project
+    from lidar_synth.geometry.projection import unfold as unfold
+    from lidar_synth.geometry.projection import unproject as unproject
+    from lidar_synth.geometry.scan import Boxes as Boxes
+    from lidar_synth.geometry.scan import RangeImage as RangeImage
+    from lidar_synth.geometry.scan import Scan as Scan
+    from lidar_synth.geometry.scan import Source as Source
+    from lidar_synth.geometry.sensor import Sensor as Sensor
+    from lidar_synth.geometry.sensor import load_sensor as load_sensor
     from lidar_synth.labels import ObjectBank as ObjectBank
     from lidar_synth.labels import make_policy as make_policy
     from lidar_synth.mixing import Linear as Linear
     from lidar_synth.mixing import MixedScans as MixedScans
     from lidar_synth.mixing import MixedStream as MixedStream
     from lidar_synth.mixing import Sources as Sources
-    from lidar_synth.projection import project as project
-    from lidar_synth.projection import unfold as unfold
-    from lidar_synth.projection import unproject as unproject
-    from lidar_synth.scan import Boxes as Boxes
-    from lidar_synth.scan import RangeImage as RangeImage
-    from lidar_synth.scan import Scan as Scan
-    from lidar_synth.scan import Source as Source
-    from lidar_synth.sensor import Sensor as Sensor
-    from lidar_synth.sensor import load_sensor as load_sensor
-    from lidar_synth.service import BatchMixer as BatchMixer
-    from lidar_synth.service import RollingBank as RollingBank
+    from lidar_synth.mixing.service import BatchMixer as BatchMixer
+    from lidar_synth.mixing.service import RollingBank as RollingBank
     from lidar_synth.town import Town as Town
 
 

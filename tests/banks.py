@@ -12,9 +12,9 @@ from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.classes import IGNORE
 from lidar_synth.files import sha256
-from lidar_synth.projection import project
-from lidar_synth.scan import RangeImage
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 

@@ -59,7 +59,7 @@ def _anything(name: str) -> Any:
 
 def points_in_boxes(boxes: Any, points: Any, out: Any) -> None:
     """``roiaware_pool3d_cuda.points_in_boxes_cpu``: (M, N) which points each box holds."""
-    from lidar_synth.scan import Boxes
+    from lidar_synth.geometry.scan import Boxes
 
     held = Boxes(boxes.numpy(), ("",) * len(boxes)).contain(points.numpy())
     out.copy_(type(out)(held.astype(np.int32)))

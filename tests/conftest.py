@@ -10,8 +10,8 @@ import pytest
 import torch
 from hypothesis import settings
 
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor, presets
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor, presets
 
 # A shell leaves SIGINT ignored in what it starts in the background, and so in every process that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)

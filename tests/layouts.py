@@ -14,9 +14,9 @@ from lidar_synth.errors import LibraryError
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.calibration import AXES_CAMERA_FROM_SENSOR, Calibration
 from lidar_synth.formats.pcd import import_open3d
-from lidar_synth.projection import project
-from lidar_synth.scan import Boxes, Scan
-from lidar_synth.sensor import load_sensor
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.sensor import load_sensor
 
 
 def _open3d_is_missing() -> bool:

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from conftest import random_scan
 
-from lidar_synth.scan import REAL, SYNTHETIC, Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
+from lidar_synth.geometry.sensor import Sensor
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 

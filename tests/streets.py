@@ -9,8 +9,8 @@ from lidar_synth.integrations.folders import write_planes
 from worlds import car, cast, wall
 
 from lidar_synth.formats.calibration import AXES_CAMERA_FROM_SENSOR, Calibration
-from lidar_synth.scan import Boxes, Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.sensor import Sensor
 
 SENSOR = Sensor("small", 256, 2.0, 80.0, rows=32, fov_up=3.0, fov_down=-25.0)
 CAMERA = Calibration(

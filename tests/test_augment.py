@@ -12,12 +12,12 @@ from conftest import random_scan
 from hypothesis import given, settings
 from worlds import SENSOR, car, cast, wall
 
-from lidar_synth import augment
-from lidar_synth.augment import Augmentation, compose, mirrored, rotated, scaled
 from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.projection import locate
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.labels import augment
+from lidar_synth.labels.augment import Augmentation, compose, mirrored, rotated, scaled
 from lidar_synth.noise import keyed_rng
-from lidar_synth.projection import locate
-from lidar_synth.scan import Boxes, Scan
 
 STEPS: dict[str, Augmentation] = {
     "yaw": augment.yaw,

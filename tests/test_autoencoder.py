@@ -10,15 +10,15 @@ from torch import Tensor
 from torch.distributions import Laplace
 
 from lidar_synth.classes import IGNORE
-from lidar_synth.codec import make_codec
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow import METRICS
-from lidar_synth.nets import build_network
-from lidar_synth.nets.autoencoder import ROUGHNESS, Autoencoder
-from lidar_synth.nets.lattices import LATTICES, on
-from lidar_synth.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.projection import project
-from lidar_synth.sensor import Sensor
+from lidar_synth.flow.path import METRICS
+from lidar_synth.generate.codec import make_codec
+from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.models import build_network
+from lidar_synth.models.town_codec.autoencoder import ROUGHNESS, Autoencoder
+from lidar_synth.models.town_codec.multiscale import LATTICES, on
 from lidar_synth.train import (
     Autoencoding,
     Batch,

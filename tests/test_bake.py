@@ -22,14 +22,14 @@ from lidar_synth.bake.folder import SETTINGS, finish, prepare
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import regenerate
 from lidar_synth.bank import INDEX, Bank, Encoding
-from lidar_synth.checkpoint import ENCODER, VELOCITY, Header, Part, save_checkpoint
 from lidar_synth.cli import app
-from lidar_synth.config import read_values, validated
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.formats import open_scans
-from lidar_synth.generator import load_generator
-from lidar_synth.nets import build_network
-from lidar_synth.normalize import NORMALISATIONS
+from lidar_synth.generate.checkpoint import ENCODER, VELOCITY, Header, Part, save_checkpoint
+from lidar_synth.generate.generator import load_generator
+from lidar_synth.geometry.normalize import NORMALISATIONS
+from lidar_synth.models import build_network
+from lidar_synth.train.config import read_values, validated
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

@@ -25,13 +25,13 @@ from lidar_synth.bank import FORMAT, INDEX, Bank, Encoding, Entry, Index, ShardR
 from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
 from lidar_synth.bank.encoding import LEVELS, TYPES
 from lidar_synth.classes import IGNORE
-from lidar_synth.convert import convert
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.files import sha256
 from lidar_synth.formats import WRITERS, BankScans, open_scans
-from lidar_synth.projection import project, unproject
-from lidar_synth.scan import SYNTHETIC, RangeImage, Source
-from lidar_synth.sensor import Sensor
+from lidar_synth.formats.convert import convert
+from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Source
+from lidar_synth.geometry.sensor import Sensor
 
 ALL = ("reflectance", "label", "confidence")
 

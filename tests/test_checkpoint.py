@@ -12,11 +12,19 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from lidar_synth.checkpoint import FORMAT, VELOCITY, Header, Part, load_checkpoint, read_header, save_checkpoint
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
-from lidar_synth.nets import build_network
-from lidar_synth.normalize import NORMALISATIONS
-from lidar_synth.sensor import Sensor
+from lidar_synth.generate.checkpoint import (
+    FORMAT,
+    VELOCITY,
+    Header,
+    Part,
+    load_checkpoint,
+    read_header,
+    save_checkpoint,
+)
+from lidar_synth.geometry.normalize import NORMALISATIONS
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.models import build_network
 
 SENSOR = Sensor("small", columns=32, range_min=1.0, range_max=80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 ARGUMENTS: dict[str, Any] = {
@@ -66,7 +74,7 @@ def rewrite(path: Path, **changes: Any) -> None:
 
 def replace_weights(path: Path, change: Any) -> None:
     """Save other weights under a header that knows nothing of it but their sum, as a careless tool would."""
-    from lidar_synth.checkpoint import weights_hash
+    from lidar_synth.generate.checkpoint import weights_hash
 
     tensors = load_file(path)
     change(tensors)

@@ -9,14 +9,14 @@ from accelerate import Accelerator
 from conftest import random_scan
 from torch import Tensor
 
-from lidar_synth.codec import Identity, Latent, expected, make_codec
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow import METRICS
-from lidar_synth.nets import build_network
-from lidar_synth.nets.vqvae import VQVAE
-from lidar_synth.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.projection import project
-from lidar_synth.sensor import Sensor
+from lidar_synth.flow.path import METRICS
+from lidar_synth.generate.codec import Identity, Latent, expected, make_codec
+from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.models import build_network
+from lidar_synth.models.lidm.vqvae import VQVAE
 from lidar_synth.train import (
     Autoencoding,
     Batches,

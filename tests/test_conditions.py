@@ -15,16 +15,16 @@ from PIL import Image
 from torch import Tensor, nn
 
 from lidar_synth.classes import IGNORE, NAMES
-from lidar_synth.conditions import CONDITIONS, batch_of, blank, one_view
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
-from lidar_synth.flow import guided
-from lidar_synth.nets import NETWORKS, build_network
-from lidar_synth.nets.encoders import CLIP_VARIABLE, CLIP_WIDTH, cut, frozen_clip
-from lidar_synth.nets.sight import SightEncoder
-from lidar_synth.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.projection import project, unproject
-from lidar_synth.scan import RangeImage, Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.flow.path import guided
+from lidar_synth.generate.conditions import CONDITIONS, batch_of, blank, one_view
+from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.models import NETWORKS, build_network
+from lidar_synth.models.encoders.camera import SightEncoder
+from lidar_synth.models.encoders.maps import CLIP_VARIABLE, CLIP_WIDTH, cut, frozen_clip
 from lidar_synth.town.camera import CAMERA
 from lidar_synth.train import Batches, Conditioning, Other, cache_scans
 

@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 import yaml
 
-from lidar_synth.config import DistillConfig, Run, TrainConfig, load_config
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.sensor import load_sensor
+from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.town import Town
+from lidar_synth.train.config import DistillConfig, Run, TrainConfig, load_config
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 RUNS = sorted(p for p in CONFIGS.glob("*.yaml") if "recipe" in yaml.safe_load(p.read_text()))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from lidar_synth.nets.consensus import Consensus
+from lidar_synth.models.town_codec.plane_fit import Consensus
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 
 from lidar_synth.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.cli.convert import convert as command
-from lidar_synth.convert import SETTINGS, Report, convert, reproject
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import READERS, WRITERS, open_scans
+from lidar_synth.formats.convert import SETTINGS, Report, convert, reproject
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
-from lidar_synth.projection import project
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import load_sensor, presets
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import load_sensor, presets
 
 app = typer.Typer()
 app.command()(command)

@@ -15,19 +15,19 @@ from layouts import write_all
 from test_generator import write
 from test_verify import baked, call, flip, names_and_points, shards
 
-import lidar_synth.curate.duplicates as duplicates
+import lidar_synth.bake.curate.duplicates as duplicates
 from lidar_synth.bake import Job, bake, make_plan
+from lidar_synth.bake.curate import FILE, MEANINGS, matching, read_scores, score, write_scores
+from lidar_synth.bake.curate.features import MEASURES, features
+from lidar_synth.bake.curate.scores import FARTHEST
 from lidar_synth.bake.edit import drop, head, merge, split
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import verify
 from lidar_synth.bank import INDEX, Bank, Entry, Index
 from lidar_synth.classes import IGNORE, TRAIN_ID
-from lidar_synth.curate import FILE, MEANINGS, matching, read_scores, score, write_scores
-from lidar_synth.curate.features import MEASURES, features
-from lidar_synth.curate.scores import FARTHEST
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.projection import unproject
-from lidar_synth.scan import RangeImage
+from lidar_synth.geometry.projection import unproject
+from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.viz import histograms
 
 ALL = ("reflectance", "label", "confidence")

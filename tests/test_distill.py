@@ -12,11 +12,11 @@ from flows import MEAN, STD, gaussian_flow, gaussian_velocity
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lidar_synth.distill import STRATEGIES, adaptive_piecewise, interval_of
 from lidar_synth.errors import ConfigError
-from lidar_synth.flow import interpolate, per_sample
+from lidar_synth.flow.distill import STRATEGIES, adaptive_piecewise, interval_of
+from lidar_synth.flow.path import interpolate, per_sample
+from lidar_synth.flow.solvers import solve, uniform_grid
 from lidar_synth.noise import gaussian, uniform
-from lidar_synth.solvers import solve, uniform_grid
 
 COUNT = 64
 DATA = MEAN + STD * gaussian(0, range(COUNT), (2, 3), dtype=torch.float64)

@@ -14,9 +14,9 @@ import torch
 import typer
 from typer.testing import CliRunner
 
-from lidar_synth import doctor
+from lidar_synth.cli import diagnosis as doctor
+from lidar_synth.cli.diagnosis import DATA_ROOTS, SHARED_OBJECTS, Finding, examine, report, works
 from lidar_synth.cli.doctor import doctor as command
-from lidar_synth.doctor import DATA_ROOTS, SHARED_OBJECTS, Finding, examine, report, works
 
 app = typer.Typer(add_completion=False)
 app.command()(command)
@@ -111,12 +111,12 @@ def test_which_libraries_load_is_asked_of_the_system() -> None:
 
 
 def test_a_projection_that_goes_wrong_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    import lidar_synth.projection
+    import lidar_synth.geometry.projection
 
     def shifted(scan: Any) -> SimpleNamespace:
-        return SimpleNamespace(range=lidar_synth.projection.spherical.project(scan).range * 1.001)
+        return SimpleNamespace(range=lidar_synth.geometry.projection.spherical.project(scan).range * 1.001)
 
-    monkeypatch.setattr(lidar_synth.projection, "project", shifted)
+    monkeypatch.setattr(lidar_synth.geometry.projection, "project", shifted)
     assert doctor._geometry().state == "broken"
 
 

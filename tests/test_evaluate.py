@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from lidar_synth.cli import app
 from lidar_synth.cli.sample import NOTE
 from lidar_synth.errors import ConfigError
+from lidar_synth.evaluate import PROTOCOLS
 from lidar_synth.formats import WRITERS
-from lidar_synth.metrics import PROTOCOLS
-from lidar_synth.sensor import presets
+from lidar_synth.geometry.sensor import presets
 from lidar_synth.town.export import SETTINGS
 
 

@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lidar_synth.errors import DataError
-from lidar_synth.flow import (
+from lidar_synth.flow.path import (
     METRICS,
     TIMESTEPS,
     autoguided,
@@ -25,8 +25,8 @@ from lidar_synth.flow import (
     u_shaped,
     velocity_loss,
 )
+from lidar_synth.flow.solvers import solve, uniform_grid
 from lidar_synth.noise import gaussian, uniform
-from lidar_synth.solvers import solve, uniform_grid
 
 
 def test_the_path_runs_from_data_to_noise_at_its_velocity() -> None:

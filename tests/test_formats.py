@@ -20,9 +20,9 @@ from lidar_synth.formats.png import RangePNG
 from lidar_synth.formats.point_labels import decode_labels, encode_labels
 from lidar_synth.formats.range_images import RangeImages
 from lidar_synth.formats.source import ScanFiles
-from lidar_synth.projection import locate, project
-from lidar_synth.scan import Boxes, Scan, Source
-from lidar_synth.sensor import presets
+from lidar_synth.geometry.projection import locate, project
+from lidar_synth.geometry.scan import Boxes, Scan, Source
+from lidar_synth.geometry.sensor import presets
 
 POINT_LAYOUTS = [name for name in WRITERS if name not in ("range", "png")]
 KEEP_FIELDS = ["kitti", "semantic_kitti", "pcd", "ply", "npz", "webdataset"]

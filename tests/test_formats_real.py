@@ -14,8 +14,8 @@ from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, KITTIRaw, NuScen
 from lidar_synth.formats.kitti360 import SPLITS
 from lidar_synth.formats.kitti_labels import boxes_to_camera
 from lidar_synth.formats.range_images import RangeImages
-from lidar_synth.projection import project
-from lidar_synth.scan import Boxes, Scan
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import Boxes, Scan
 
 DRIVE = "2013_05_28_drive_0000_sync"
 

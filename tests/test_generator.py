@@ -14,19 +14,19 @@ from layouts import formats, write_all
 from PIL import Image
 from typer.testing import CliRunner
 
-import lidar_synth.generator as module
-from lidar_synth.checkpoint import ENCODER, VELOCITY, Header, Part, save_checkpoint
+import lidar_synth.generate.generator as module
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.flow.solvers import solve, uniform_grid
 from lidar_synth.formats import WRITERS, open_scans
-from lidar_synth.generator import Generator, load_generator, shipped_models
-from lidar_synth.nets import build_network
+from lidar_synth.generate.checkpoint import ENCODER, VELOCITY, Header, Part, save_checkpoint
+from lidar_synth.generate.generator import Generator, load_generator, shipped_models
+from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import SYNTHETIC
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.models import build_network
 from lidar_synth.noise import gaussian
-from lidar_synth.normalize import CHANNELS, NORMALISATIONS
-from lidar_synth.projection import project
-from lidar_synth.scan import SYNTHETIC
-from lidar_synth.sensor import Sensor
-from lidar_synth.solvers import solve, uniform_grid
 from lidar_synth.town import Town
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)

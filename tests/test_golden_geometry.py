@@ -8,10 +8,10 @@ import torch
 from safetensors.torch import load_file
 
 from lidar_synth.formats.points import read_points
-from lidar_synth.normalize import NORMALISATIONS, Normalisation
-from lidar_synth.projection import project, unfold, unproject, unproject_batch
-from lidar_synth.scan import RangeImage, Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.normalize import NORMALISATIONS, Normalisation
+from lidar_synth.geometry.projection import project, unfold, unproject, unproject_batch
+from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor
 
 HERE = Path(__file__).parent / "golden"
 R2FLOW = load_file(HERE / "r2flow_lidar_utility.safetensors")

@@ -9,11 +9,11 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lidar_synth.checkpoint import Part
-from lidar_synth.importers.r2flow import POSITIONS as PEER_POSITIONS
-from lidar_synth.importers.r2flow import convert
-from lidar_synth.nets.hdit import HDiT
-from lidar_synth.nets.positions import BASES, AnglePosition
+from lidar_synth.generate.checkpoint import Part
+from lidar_synth.generate.importers.r2flow import POSITIONS as PEER_POSITIONS
+from lidar_synth.generate.importers.r2flow import convert
+from lidar_synth.models.hdit.hdit import HDiT
+from lidar_synth.models.positions import BASES, AnglePosition
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -9,12 +9,12 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, Part
 from lidar_synth.classes import IGNORE
-from lidar_synth.importers.lidm import codec_part, convert, unet_part
-from lidar_synth.importers.lidm_names import COND_STAGE, UNET
-from lidar_synth.nets.diffusion import DiffusionUNet
-from lidar_synth.nets.vqvae import VQVAE
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Part
+from lidar_synth.generate.importers.lidm import codec_part, convert, unet_part
+from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET
+from lidar_synth.models.lidm.diffusion import DiffusionUNet
+from lidar_synth.models.lidm.vqvae import VQVAE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -14,11 +14,11 @@ from safetensors.torch import load_file
 from torch import Tensor
 from typer.testing import CliRunner
 
-from lidar_synth.checkpoint import VELOCITY, load_checkpoint
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.importers.r2flow import HARMONICS, block_names, convert, peer_names, read_r2flow
-from lidar_synth.nets import build_network
-from lidar_synth.nets.hdit import HDiT
+from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint
+from lidar_synth.generate.importers.r2flow import HARMONICS, block_names, convert, peer_names, read_r2flow
+from lidar_synth.models import build_network
+from lidar_synth.models.hdit.hdit import HDiT
 
 DEPTHS = (1, 1, 1, 1)
 CFG: dict[str, Any] = {
@@ -238,7 +238,7 @@ def test_configurations_that_do_not_fit(tmp_path: Path, cfg: dict[str, Any], mes
 
 
 def test_fourier_features_have_to_be_octaves() -> None:
-    from lidar_synth.checkpoint import Part
+    from lidar_synth.generate.checkpoint import Part
 
     weights = peer_weights("fourier_features")
     octaves = torch.tensor([[2.0**i, 0.0] for i in range(6)] + [[0.0, 2.0**i] for i in range(4)])

@@ -46,9 +46,9 @@ from torch.utils.data import DataLoader, Dataset
 from lidar_synth.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.formats import KITTIObject, open_scans
+from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import ObjectBank
 from lidar_synth.mixing import MixedScans
-from lidar_synth.scan import Boxes, Scan
 
 
 def as_is(scan: Scan, rng: np.random.Generator) -> Scan:

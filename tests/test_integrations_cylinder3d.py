@@ -108,7 +108,7 @@ def test_labels_arrive_in_the_trainers_ids(made: Path, points: Any) -> None:
 
 def test_turning_in_place_does_not_reach_the_source(made: Path, points: Any) -> None:
     """Trap: Cylinder3D turns and flips the array that it is handed."""
-    from lidar_synth.scan import Scan
+    from lidar_synth.geometry.scan import Scan
 
     kept = {i: points.mixed[i] for i in range(len(points)) if points.mixed.domain(i)}
     before = {i: scan.points.copy() for i, scan in kept.items()}

@@ -38,8 +38,8 @@ from torch.utils.data import DataLoader
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats import open_scans
+from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import ObjectBank
-from lidar_synth.scan import Boxes, Scan
 
 REAL, EXTRA, SYNTHETIC = 6, 4, 11
 """Real scans, synthetic samples of an epoch, synthetic scans that there are."""

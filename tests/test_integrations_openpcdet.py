@@ -34,8 +34,8 @@ from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats import open_scans
+from lidar_synth.geometry.scan import Boxes
 from lidar_synth.labels import ObjectBank
-from lidar_synth.scan import Boxes
 
 REAL, EXTRA, CLASSES = 6, 4, ["Car"]
 

@@ -18,15 +18,23 @@ from torch import nn
 from typer.testing import CliRunner
 
 from lidar_synth.bake.conditions import conditions_for
-from lidar_synth.checkpoint import CODEC, ENCODER, VELOCITY, join, load_checkpoint, read_header, save_checkpoint
 from lidar_synth.cli import app
-from lidar_synth.cli.plan import make_plan, open_data
-from lidar_synth.cli.teaching import taught_flow
-from lidar_synth.config import DistillConfig, load_config
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS
-from lidar_synth.generator import load_generator
-from lidar_synth.sensor import Sensor
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    ENCODER,
+    VELOCITY,
+    join,
+    load_checkpoint,
+    read_header,
+    save_checkpoint,
+)
+from lidar_synth.generate.generator import load_generator
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.train.config import DistillConfig, load_config
+from lidar_synth.train.plan import make_plan, open_data
+from lidar_synth.train.teaching import taught_flow
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 RECIPE = {"iterations": 8, "batch": 4, "warmup": 2, "rate": 1e-3, "ema_every": 1}
@@ -463,7 +471,7 @@ def test_what_does_not_fit_together(scans: Path, codec: Path, teacher: Path, tmp
 def pixel_checkpoint(folder: Path) -> Path:
     from test_checkpoint import HEADER, network
 
-    from lidar_synth.checkpoint import save_checkpoint
+    from lidar_synth.generate.checkpoint import save_checkpoint
 
     path = folder / "pixel.safetensors"
     save_checkpoint(path, HEADER, {VELOCITY: network()})

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidar_synth.nets.autoencoder import Autoencoder
-from lidar_synth.nets.lattices import LATTICES, on
+from lidar_synth.models.town_codec.autoencoder import Autoencoder
+from lidar_synth.models.town_codec.multiscale import LATTICES, on
 
 SHAPE = 8, 32
 pytestmark = pytest.mark.usefixtures("one_thread")

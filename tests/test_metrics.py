@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import jensenshannon
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.metrics import (
+from lidar_synth.evaluate import (
     PROTOCOLS,
     Score,
     evaluate,
@@ -24,9 +24,9 @@ from lidar_synth.metrics import (
     r2flow,
     squared_mmd,
 )
-from lidar_synth.metrics import protocols as protocols_module
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor, presets
+from lidar_synth.evaluate import protocols as protocols_module
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor, presets
 
 SENSOR = presets()["hdl64e_kitti360"]
 PAIRS = [("real", "fake", ""), ("real", "real", "_self"), ("dense_real", "dense_fake", "_dense")]

@@ -20,11 +20,11 @@ from torch.utils.data import DataLoader
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import KITTI360, SemanticKITTI
-from lidar_synth.generator import Generator, load_generator
+from lidar_synth.generate.generator import Generator, load_generator
+from lidar_synth.geometry.scan import SYNTHETIC, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.mixing import Generated, MixedScans, Sources, make_synthetic
 from lidar_synth.noise import keyed_rng
-from lidar_synth.scan import SYNTHETIC, Scan
-from lidar_synth.sensor import Sensor, load_sensor
 
 WORKERS = [0, 1, 2, 4]
 

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.normalize import (
+from lidar_synth.geometry.normalize import (
     CHANNELS,
     NORMALISATIONS,
     Normalisation,
@@ -20,8 +20,8 @@ from lidar_synth.normalize import (
     encode_labels,
     encode_reflectance,
 )
-from lidar_synth.projection import project
-from lidar_synth.sensor import presets
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.sensor import presets
 
 
 @pytest.mark.parametrize("name", sorted(NORMALISATIONS))

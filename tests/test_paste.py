@@ -12,13 +12,13 @@ from worlds import CAR, HEIGHT, SENSOR, WALL, car, cast, wall
 from lidar_synth.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.formats import KITTIObject, SemanticKITTI
+from lidar_synth.geometry.projection import locate, project
+from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
+from lidar_synth.geometry.sensor import presets
 from lidar_synth.labels import Object, ObjectBank, instances_of, objects_of, paste
 from lidar_synth.labels.boxes import box_frame, grown, joined, overlapping, turned
 from lidar_synth.labels.ground import FLOOR, ground_under
 from lidar_synth.labels.pasting import LIFT
-from lidar_synth.projection import locate, project
-from lidar_synth.scan import SYNTHETIC, Boxes, Scan
-from lidar_synth.sensor import presets
 from lidar_synth.town import Town
 
 places = st.tuples(st.floats(5, 30), st.floats(-180, 180), st.floats(-3.1, 3.1))

@@ -10,11 +10,19 @@ from hypothesis.extra import numpy as hnp
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.projection import fill_points, locate, project, project_batch, unfold, unproject, unproject_batch
-from lidar_synth.projection.batch import torch_asin, torch_atan2
-from lidar_synth.projection.kernels import asin, atan2
-from lidar_synth.scan import RangeImage, Scan
-from lidar_synth.sensor import Sensor, presets
+from lidar_synth.geometry.projection import (
+    fill_points,
+    locate,
+    project,
+    project_batch,
+    unfold,
+    unproject,
+    unproject_batch,
+)
+from lidar_synth.geometry.projection.batch import torch_asin, torch_atan2
+from lidar_synth.geometry.projection.kernels import asin, atan2
+from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor, presets
 
 SMALL = {
     "linear": Sensor("linear", 32, 1.0, 80.0, rows=8, fov_up=10.0, fov_down=-20.0),

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lidar_synth.formats.points import read_points
-from lidar_synth.projection import fill_points, locate, project, ring_numbers, unfold, unproject
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.projection import fill_points, locate, project, ring_numbers, unfold, unproject
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 FULL_TURN = 100_000  # points; fewer is a scan cut off or cropped to a camera's view
 ROOTS = ("kitti360", "semantic_kitti", "kitti_object", "kitti_raw")

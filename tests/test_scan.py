@@ -10,8 +10,8 @@ from hypothesis import given
 
 from lidar_synth.classes import COLOURS, IGNORE, KITTI360, NAMES, NUSCENES, SEMANTIC_KITTI, Taxonomy
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError, LidarSynthError
-from lidar_synth.scan import Boxes, Scan
-from lidar_synth.sensor import presets
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.sensor import presets
 
 TAXONOMIES = (SEMANTIC_KITTI, KITTI360, NUSCENES)
 

@@ -11,10 +11,10 @@ from conftest import random_scan
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.metrics.segmentation import Images, Judge, class_ious, confusion, load_judge, mean_iou
-from lidar_synth.nets.segmenter import RangeSegmenter, segmenter_input
-from lidar_synth.projection import project
-from lidar_synth.sensor import presets
+from lidar_synth.evaluate.segmentation import Images, Judge, class_ious, confusion, load_judge, mean_iou
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.sensor import presets
+from lidar_synth.models.segmenter import RangeSegmenter, segmenter_input
 from lidar_synth.train.segmentation import train_segmenter
 
 HEIGHT = torch.linspace(0.05, -0.4, 16)[:, None].expand(16, 32)

@@ -2,7 +2,7 @@
 
 import torch
 
-from lidar_synth.nets.segmenter import ROW_BANDS, RangeSegmenter, segmenter_input
+from lidar_synth.models.segmenter import ROW_BANDS, RangeSegmenter, segmenter_input
 
 
 def test_shapes_and_that_columns_wrap() -> None:

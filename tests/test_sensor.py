@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.sensor import Sensor, load_sensor, presets
+from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
 
 DESIGN = {"hdl64e_kitti360", "hdl64e_kitti", "hdl32e_nuscenes", "os1_128", "town"}
 

@@ -17,14 +17,14 @@ from torch.utils.data import DataLoader, Dataset
 
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import ConfigError, DataError, FileError, ProcessError
-from lidar_synth.generator import Generator, load_generator
+from lidar_synth.generate.generator import Generator, load_generator
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.mixing import MixedScans, Sources
-from lidar_synth.projection import project
-from lidar_synth.scan import SYNTHETIC, RangeImage, Scan
-from lidar_synth.service import BatchMixer, RollingBank
-from lidar_synth.service.ledger import COUNTERS, Ledger
-from lidar_synth.service.outlook import NEVER, Counting, Pool, Told
-from lidar_synth.service.slots import Slots
+from lidar_synth.mixing.service import BatchMixer, RollingBank
+from lidar_synth.mixing.service.ledger import COUNTERS, Ledger
+from lidar_synth.mixing.service.outlook import NEVER, Counting, Pool, Told
+from lidar_synth.mixing.service.slots import Slots
 
 SEED = 3
 FIELDS = ("reflectance", "label", "confidence")

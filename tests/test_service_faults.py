@@ -15,9 +15,9 @@ import torch
 from test_generator import write
 from torch.utils.data import DataLoader
 
-from lidar_synth.checkpoint import VELOCITY, load_checkpoint, save_checkpoint
 from lidar_synth.errors import ProcessError
-from lidar_synth.service import RollingBank
+from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, save_checkpoint
+from lidar_synth.mixing.service import RollingBank
 
 ROOT = Path(__file__).parent.parent
 
@@ -132,7 +132,7 @@ def test_banks_do_not_meet_and_end_when_nobody_holds_them(path: Path) -> None:
 
 TRAINER = """
 import os, sys, time
-from lidar_synth.service import RollingBank
+from lidar_synth.mixing.service import RollingBank
 
 def main():
     bank = RollingBank(sys.argv[1], slots=2, threads=1, timeout=60)

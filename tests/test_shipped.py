@@ -15,14 +15,14 @@ from torch.utils.data import DataLoader
 from lidar_synth import MixedScans, RollingBank, SemanticKITTI, Source, Town, load_generator
 from lidar_synth.bank import Bank
 from lidar_synth.bank.encoding import Encoding
-from lidar_synth.checkpoint import read_header
 from lidar_synth.classes import IGNORE
 from lidar_synth.cli.bake import bake
-from lidar_synth.generator import Generator, shipped_models
+from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.generate.generator import Generator, shipped_models
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.labels import POLICIES
 from lidar_synth.mixing import Generated
-from lidar_synth.projection import project
-from lidar_synth.scan import SYNTHETIC, Scan
 
 SCANS = 3
 FIELDS = ("reflectance", "label", "confidence")

@@ -12,8 +12,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.flow.solvers import SOLVERS, solve, trajectory, uniform_grid
 from lidar_synth.noise import gaussian
-from lidar_synth.solvers import SOLVERS, solve, trajectory, uniform_grid
 
 NOISE = gaussian(0, range(4), (2, 5), dtype=torch.float64)
 DATA = gaussian_flow(NOISE, torch.ones(4), torch.zeros(4))

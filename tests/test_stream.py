@@ -13,8 +13,8 @@ from torch.utils.data import DataLoader
 
 import lidar_synth.mixing.stream as module
 from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans, MixedStream
-from lidar_synth.scan import Scan
 
 WORKERS = [0, 1, 2, 4]
 

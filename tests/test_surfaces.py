@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from lidar_synth.nets.surfaces import SLOPES, Planes, Surfaces, laplace
-from lidar_synth.normalize import NORMALISATIONS
+from lidar_synth.geometry.normalize import NORMALISATIONS
+from lidar_synth.models.town_codec.planes import SLOPES, Planes, Surfaces, laplace
 
 PATCH = (2, 4)
 

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow import METRICS, per_sample
+from lidar_synth.flow.path import METRICS, per_sample
+from lidar_synth.flow.solvers import uniform_grid
+from lidar_synth.flow.timesteps import best_path, cost_matrix, path_cost, select_timesteps
 from lidar_synth.noise import gaussian
-from lidar_synth.solvers import uniform_grid
-from lidar_synth.timesteps import best_path, cost_matrix, path_cost, select_timesteps
 
 SHAPE = (2, 3, 8)
 

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from lidar_synth.classes import IGNORE, NAMES, SEMANTIC_KITTI, TRAIN_ID
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.projection import project, ring_numbers
-from lidar_synth.scan import SYNTHETIC, Scan
-from lidar_synth.sensor import Sensor, load_sensor, presets
+from lidar_synth.geometry.projection import project, ring_numbers
+from lidar_synth.geometry.scan import SYNTHETIC, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
 from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.town.boxes import boxes_of
 from lidar_synth.town.camera import CAMERA, pixel_rays

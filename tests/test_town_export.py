@@ -9,8 +9,8 @@ import pytest
 from lidar_synth.cli.town import town as command
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.formats import KITTI360, KITTIObject, SemanticKITTI, open_scans
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import load_sensor
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.town import LAYOUTS, Town, export_town
 from lidar_synth.town.export import _parts
 

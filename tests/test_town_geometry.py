@@ -252,7 +252,7 @@ def test_patches_are_uniform_and_coarse() -> None:
 
 
 def test_gains_belong_to_the_sensor() -> None:
-    from lidar_synth.sensor import load_sensor
+    from lidar_synth.geometry.sensor import load_sensor
 
     sensor = load_sensor("town")
     gains = laser_gains(sensor, Noise())

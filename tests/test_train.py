@@ -14,15 +14,15 @@ from conftest import random_scan
 from hypothesis import given
 from torch import Tensor, nn
 
-from lidar_synth.distill import STRATEGIES
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
-from lidar_synth.flow import METRICS, Example
-from lidar_synth.nets import build_network
-from lidar_synth.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.projection import project
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor
-from lidar_synth.solvers import uniform_grid
+from lidar_synth.flow.distill import STRATEGIES
+from lidar_synth.flow.path import METRICS, Example
+from lidar_synth.flow.solvers import uniform_grid
+from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.models import build_network
 from lidar_synth.train import (
     OPTIMIZERS,
     SCHEDULES,

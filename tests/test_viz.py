@@ -24,9 +24,9 @@ from typer.testing import CliRunner
 from lidar_synth.classes import COLOURS, IGNORE, NAMES, TRAIN_ID
 from lidar_synth.cli.view import view as command
 from lidar_synth.errors import ConfigError, FileError, LibraryError
-from lidar_synth.projection import project, unproject
-from lidar_synth.scan import REAL, SYNTHETIC, Boxes, RangeImage, Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.viz import (
     Camera,
     Orbit,

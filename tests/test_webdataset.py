@@ -11,11 +11,11 @@ from banks import some_image, write_bank
 from layouts import some_scan, write_tars
 
 from lidar_synth.classes import IGNORE
-from lidar_synth.convert import SETTINGS, Report, convert
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WebDataset, open_scans
+from lidar_synth.formats.convert import SETTINGS, Report, convert
 from lidar_synth.formats.webdataset import WebDatasetWriter
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 
 def samples(path: Path) -> dict[str, dict[str, bytes]]:

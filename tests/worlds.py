@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE, TRAIN_ID
-from lidar_synth.projection import unproject
-from lidar_synth.scan import SYNTHETIC, Boxes, RangeImage, Scan
-from lidar_synth.sensor import Sensor, presets
+from lidar_synth.geometry.projection import unproject
+from lidar_synth.geometry.scan import SYNTHETIC, Boxes, RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor, presets
 
 SENSOR = presets()["town"]
 HEIGHT = 1.73

@@ -13,11 +13,11 @@ from pathlib import Path
 
 from model_card import REFERENCE, generate, header, rows, town
 
-from lidar_synth.checkpoint import read_header
-from lidar_synth.cli.run import checkpoint_path, run
-from lidar_synth.config import DistillConfig, load_config
-from lidar_synth.distill import STRATEGIES
-from lidar_synth.metrics.segmentation import load_judge
+from lidar_synth.evaluate.segmentation import load_judge
+from lidar_synth.flow.distill import STRATEGIES
+from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.train.config import DistillConfig, load_config
+from lidar_synth.train.run import checkpoint_path, run
 
 ROOT = Path(__file__).parents[1]
 WHOLE = ("reflow", "timestep_distillation")

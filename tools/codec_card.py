@@ -17,8 +17,8 @@ from model_card import open_codec, town
 from tqdm import tqdm
 
 from lidar_synth.classes import IGNORE, TRAIN_ID
-from lidar_synth.projection import project
-from lidar_synth.scan import RangeImage
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.train import reconstruct
 
 SEED = 7

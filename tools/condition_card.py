@@ -28,9 +28,9 @@ from PIL import Image
 from tqdm import tqdm
 
 from lidar_synth import Scan, load_generator, open_scans
-from lidar_synth.metrics.segmentation import Judge, load_judge, mean_iou
-from lidar_synth.projection import project
-from lidar_synth.sensor import Sensor
+from lidar_synth.evaluate.segmentation import Judge, load_judge, mean_iou
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.viz import picture, render
 
 FIELD, REACH = np.radians(50.0), 40

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from lidar_synth import Bank, MixedScans, Scan, Source, load_generator, open_scans
-from lidar_synth.nets.segmenter import RangeSegmenter
+from lidar_synth.models.segmenter import RangeSegmenter
 from lidar_synth.train.segmentation import endless_batches, train_segmenter
 from lidar_synth.viz import write_view
 

@@ -24,11 +24,11 @@ from typing import NamedTuple
 
 import torch
 
-from lidar_synth.checkpoint import load_checkpoint, read_header, save_checkpoint
-from lidar_synth.cli.run import run
-from lidar_synth.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.files import write_file
+from lidar_synth.generate.checkpoint import load_checkpoint, read_header, save_checkpoint
 from lidar_synth.town import Town, export_town
+from lidar_synth.train.config import DistillConfig, TrainConfig, load_config
+from lidar_synth.train.run import run
 
 ROOT = Path(__file__).parents[1]
 PLATEAU = 0.75

@@ -24,17 +24,17 @@ from PIL import Image
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lidar_synth.checkpoint import CODEC, load_checkpoint
 from lidar_synth.classes import IGNORE, NAMES, TRAIN_ID
-from lidar_synth.codec import Latent
 from lidar_synth.errors import ConfigError
-from lidar_synth.flow import autoguided
-from lidar_synth.generator import find_model, load_generator
-from lidar_synth.metrics import Score, evaluate
-from lidar_synth.metrics.segmentation import Judge, class_ious, load_judge, mean_iou
+from lidar_synth.evaluate import Score, evaluate
+from lidar_synth.evaluate.segmentation import Judge, class_ious, load_judge, mean_iou
+from lidar_synth.flow.path import autoguided
+from lidar_synth.generate.checkpoint import CODEC, load_checkpoint
+from lidar_synth.generate.codec import Latent
+from lidar_synth.generate.generator import find_model, load_generator
+from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.noise import uniform
-from lidar_synth.projection import project, unproject
-from lidar_synth.scan import SYNTHETIC, Scan
 from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.viz import Orbit, render, write_view
 

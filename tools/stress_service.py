@@ -28,9 +28,9 @@ from tqdm import tqdm
 
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import LidarSynthError
-from lidar_synth.generator import load_generator
-from lidar_synth.scan import RangeImage
-from lidar_synth.service import RollingBank
+from lidar_synth.generate.generator import load_generator
+from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.mixing.service import RollingBank
 
 SCANS = 40
 """Different scans; their checksums are known beforehand."""

@@ -16,9 +16,9 @@ import numpy as np
 from tqdm import tqdm
 
 from lidar_synth.formats import open_scans
-from lidar_synth.projection import project, ring_numbers
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import load_sensor
+from lidar_synth.geometry.projection import project, ring_numbers
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.town import STRETCH_FRAMES, Town
 
 GROUPS = [(0, 4), (4, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 40), (40, 48), (48, 56), (56, 64)]

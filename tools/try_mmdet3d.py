@@ -22,8 +22,8 @@ from mmengine.hooks import Hook
 from mmengine.registry import HOOKS, init_default_scope
 from mmengine.runner import Runner
 
-from lidar_synth.convert import convert
 from lidar_synth.formats import WRITERS, open_scans
+from lidar_synth.formats.convert import convert
 from lidar_synth.labels import ObjectBank
 from lidar_synth.town import Town, export_town
 

@@ -6,8 +6,8 @@ from functools import lru_cache
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import ScanFiles, open_scans
-from lidar_synth.generator import Generator
-from lidar_synth.scan import Scan
+from lidar_synth.generate.generator import Generator
+from lidar_synth.geometry.scan import Scan
 
 FOCAL_TOLERANCE = 0.02
 """By which share a camera's focal length may differ from that of the training."""

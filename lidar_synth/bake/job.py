@@ -22,9 +22,9 @@ from lidar_synth.bake.conditions import conditions_for
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
 from lidar_synth.errors import ConfigError
+from lidar_synth.flow.solvers import SOLVERS
 from lidar_synth.formats.source import choose
-from lidar_synth.generator import BATCH, load_generator
-from lidar_synth.solvers import SOLVERS
+from lidar_synth.generate.generator import BATCH, load_generator
 
 Count = Annotated[int, Field(ge=1)]
 

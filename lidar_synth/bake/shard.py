@@ -16,8 +16,8 @@ from lidar_synth.bake.job import DTYPES, Job, Plan
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.formats import ScanFiles
-from lidar_synth.generator import BATCH, Generator, load_generator
-from lidar_synth.scan import RangeImage
+from lidar_synth.generate.generator import BATCH, Generator, load_generator
+from lidar_synth.geometry.scan import RangeImage
 
 _PACKED = 0.6  # size of a compressed scan over that of a plain one, at most, for what models make
 

@@ -12,8 +12,8 @@ from lidar_synth.bake.shard import generate, load_checked, one_computer
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files import read_file, sha256
+from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.noise import keyed_rng
-from lidar_synth.scan import RangeImage
 
 AGREE = 0.9
 """Share of cells in which a scan that is generated again has to agree. On the machine that made it all do; elsewhere

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.scan import RangeImage
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry.sensor import Sensor
 
 RANGE_STEPS = 65535
 """Steps of the range from 0 to the sensor's farthest."""

@@ -40,7 +40,7 @@ import numpy as np
 
 from lidar_synth.bank.encoding import RANGE_STEPS, Encoding
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.sensor import Sensor
 
 FORMAT = "lidar-synth-bank/1"
 INDEX = "index.json"

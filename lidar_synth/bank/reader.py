@@ -11,9 +11,9 @@ from typing import Any, BinaryIO, cast, overload
 from lidar_synth.bank.index import INDEX, REPAIR, Facts, Index
 from lidar_synth.bank.shard import ShardReader
 from lidar_synth.errors import DataError, FileError, LibraryError
-from lidar_synth.projection import unproject
-from lidar_synth.scan import SYNTHETIC, RangeImage, Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.projection import unproject
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor
 
 _OPEN = 64  # shards kept open at a time
 

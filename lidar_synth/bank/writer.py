@@ -15,7 +15,7 @@ import numpy as np
 from lidar_synth.bank.chunks import checksum, deflate, filters
 from lidar_synth.bank.index import Entry, Facts
 from lidar_synth.errors import DataError, FileError, LibraryError
-from lidar_synth.scan import RangeImage
+from lidar_synth.geometry.scan import RangeImage
 
 _VERSION = "v110"
 _PAGE = 4 << 20  # bytes: a paged file keeps its metadata together, for fewer requests over a network

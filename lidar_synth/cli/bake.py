@@ -56,7 +56,7 @@ def bake(
     """
     from lidar_synth.bake import Job, Share, make_plan
     from lidar_synth.bake import bake as run
-    from lidar_synth.config import read_values, validated
+    from lidar_synth.train.config import read_values, validated
 
     chosen = {
         "model": model, "count": count, "seed": seed, "first": first, "shard_size": shard_size, "steps": steps,

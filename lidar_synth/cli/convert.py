@@ -35,10 +35,10 @@ def convert(
 
       lidar-synth convert bank out --to webdataset --jobs 4
     """
-    from lidar_synth.convert import convert as run
     from lidar_synth.formats import WRITERS, open_scans
+    from lidar_synth.formats.convert import convert as run
     from lidar_synth.formats.source import choose
-    from lidar_synth.sensor import load_sensor
+    from lidar_synth.geometry.sensor import load_sensor
 
     writer = choose("format", to, WRITERS)(out)
     scans = open_scans(source, sensor=sensor, layout=layout, split=split, on_bad=on_bad)  # type: ignore[arg-type]

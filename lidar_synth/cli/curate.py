@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from lidar_synth.bake.curate import Scores
     from lidar_synth.bank import Bank
-    from lidar_synth.curate import Scores
 
 
 def curate(
@@ -53,9 +53,9 @@ def curate(
     """
     import numpy as np
 
+    from lidar_synth.bake.curate import matching
     from lidar_synth.bake.edit import drop as write
     from lidar_synth.bank import Bank
-    from lidar_synth.curate import matching
 
     opened, rules = Bank(bank), drop or []
     _check(plot, out, rules)
@@ -93,7 +93,7 @@ def _scores(
     opened: "Bank", bank: Path, reference: str | None, split: str | None, jobs: int, progress: bool
 ) -> "Scores":
     """From the file where it belongs to this bank and this reference; else made, and kept."""
-    from lidar_synth.curate import FILE, read_scores, score, write_scores
+    from lidar_synth.bake.curate import FILE, read_scores, score, write_scores
     from lidar_synth.errors import ConfigError
     from lidar_synth.formats import open_scans
 
@@ -144,7 +144,7 @@ def _table(bank: "Bank", scores: "Scores", shown: "NDArray[np.int64]", dropped: 
 
 
 def _plot(path: Path, scores: "Scores", dropped: "NDArray[np.bool_]", bank: Path) -> None:
-    from lidar_synth.curate import MEANINGS
+    from lidar_synth.bake.curate import MEANINGS
     from lidar_synth.files import write_file
     from lidar_synth.viz import histograms
 

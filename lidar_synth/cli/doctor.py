@@ -18,7 +18,7 @@ def doctor(
       lidar-synth doctor
       lidar-synth doctor --json
     """
-    from lidar_synth.doctor import as_dict, examine, report, works
+    from lidar_synth.cli.diagnosis import as_dict, examine, report, works
 
     findings = examine()
     typer.echo(json.dumps(as_dict(findings), indent=2) if as_json else report(findings))

@@ -29,10 +29,10 @@ def evaluate(
       lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test
       lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
     """
+    from lidar_synth.evaluate import PROTOCOLS
+    from lidar_synth.evaluate import evaluate as compare
+    from lidar_synth.evaluate.segmentation import load_judge
     from lidar_synth.formats import open_scans
-    from lidar_synth.metrics import PROTOCOLS
-    from lidar_synth.metrics import evaluate as compare
-    from lidar_synth.metrics.segmentation import load_judge
 
     if protocol not in PROTOCOLS:
         raise typer.BadParameter(f"{protocol!r} is none of {', '.join(PROTOCOLS)}", param_hint="--protocol")

@@ -26,8 +26,8 @@ def import_(
 
       lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm     (config.yaml beside model.ckpt)
     """
-    from lidar_synth.checkpoint import save_checkpoint
-    from lidar_synth.importers import IMPORTERS
+    from lidar_synth.generate.checkpoint import save_checkpoint
+    from lidar_synth.generate.importers import IMPORTERS
 
     if peer not in IMPORTERS:
         raise ConfigError(f"--peer {peer}", f"one of {', '.join(IMPORTERS)}")

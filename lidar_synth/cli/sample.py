@@ -45,7 +45,7 @@ def sample(
     from lidar_synth.formats import WRITERS
     from lidar_synth.formats.source import choose
     from lidar_synth.formats.writer import claim
-    from lidar_synth.generator import load_generator
+    from lidar_synth.generate.generator import load_generator
 
     writer = choose("format", to, WRITERS)(out)
     precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})

@@ -26,8 +26,8 @@ def train(config: ConfigFile, overrides: Overrides = None, resume: Resume = Fals
       lidar-synth train mine.yaml init=runs/town_teacher/town_teacher.safetensors data.path=scans
       torchrun --nproc-per-node 8 -m lidar_synth train configs/kitti360_teacher.yaml precision=bf16
     """
-    from lidar_synth.cli.run import run
-    from lidar_synth.config import TrainConfig, load_config
+    from lidar_synth.train.config import TrainConfig, load_config
+    from lidar_synth.train.run import run
 
     _say(run(load_config(TrainConfig, config, overrides or ()), resume, minutes))
 
@@ -45,8 +45,8 @@ def distill(config: ConfigFile, overrides: Overrides = None, resume: Resume = Fa
       lidar-synth distill configs/town_student.yaml weaker=null guidance=1 output=runs/plain
       lidar-synth distill configs/kitti360_student.yaml teacher=mine.safetensors grid=[1,0.86,0.58,0.22,0]
     """
-    from lidar_synth.cli.run import run
-    from lidar_synth.config import DistillConfig, load_config
+    from lidar_synth.train.config import DistillConfig, load_config
+    from lidar_synth.train.run import run
 
     _say(run(load_config(DistillConfig, config, overrides or ()), resume, minutes))
 

@@ -8,7 +8,7 @@ import typer
 from lidar_synth.errors import ConfigError
 
 if TYPE_CHECKING:
-    from lidar_synth.scan import Scan
+    from lidar_synth.geometry.scan import Scan
 
 
 def view(

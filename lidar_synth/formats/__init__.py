@@ -25,7 +25,7 @@ from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.webdataset import SUFFIX as TAR
 from lidar_synth.formats.webdataset import WebDataset, WebDatasetWriter
 from lidar_synth.formats.writer import Writer
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.sensor import Sensor
 
 __all__ = [
     "KITTI360",

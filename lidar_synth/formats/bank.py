@@ -5,8 +5,8 @@ from pathlib import Path
 from lidar_synth.bank import Bank
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 
 class BankScans(ScanFiles):

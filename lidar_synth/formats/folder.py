@@ -22,8 +22,8 @@ from lidar_synth.formats.point_labels import encode_labels, read_labels, write_l
 from lidar_synth.formats.points import check_scan, read_points, write_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import FileWriter, Picture
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 

@@ -40,8 +40,8 @@ from lidar_synth.formats.point_labels import decode_labels, encode_labels, misma
 from lidar_synth.formats.points import read_points, write_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
-from lidar_synth.scan import Boxes, Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.sensor import Sensor
 
 
 def _drives(*drives: int) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files import numbers, unreadable, write_file
-from lidar_synth.scan import Boxes
+from lidar_synth.geometry.scan import Boxes
 
 MARGIN = 100
 """Frames (about 80 m) that the window of an object may be away for it to be listed."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.scan import Boxes
+from lidar_synth.geometry.scan import Boxes
 
 
 def read_label_2(path: Path, camera: Calibration) -> Boxes:

@@ -31,8 +31,8 @@ from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
 from lidar_synth.formats.points import read_points, write_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import Picture, Writer, write_image
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 
 Part = Literal["training", "testing"]
 

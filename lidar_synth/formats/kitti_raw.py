@@ -22,8 +22,8 @@ from lidar_synth.files import list_files, png_size, read_file, read_named_matric
 from lidar_synth.formats.calibration import Calibration, homogeneous
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.scan import Boxes, Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.sensor import Sensor
 
 DRIVES = "*_drive_*/velodyne_points/data"
 """Where a drive keeps its scans, seen from the folder of its date."""

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files import SKIP_HINT, read_file, write_file
-from lidar_synth.scan import POINT_FIELDS, Boxes, RangeImage, Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor
 
 FACTS = ("sensor", "id", "domain", "pose")
 """Names in a file that are no channels of a range image; so are those that begin with ``BOX``."""

@@ -26,8 +26,8 @@ from lidar_synth.files import SKIP_HINT, list_files, read_text, read_values
 from lidar_synth.formats.point_labels import mismatch
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 
 SUFFIX = ".pcd.bin"
 INTENSITY_MAX = 255.0

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError, FileError, LibraryError
 from lidar_synth.files import SKIP_HINT, read_file, write_file
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 STORED = {"label": "u1", "raw_label": "i4", "instance": "i4", "ring": "i4", "confidence": "f4"}
 """Type on disk of each field of a scan beside reflectance."""

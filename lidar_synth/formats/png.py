@@ -26,9 +26,9 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import Picture, Writer
-from lidar_synth.projection import project, unproject
-from lidar_synth.scan import RangeImage, Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor
 
 STEPS = 65535
 """The largest 16-bit value: ``range_max`` in range, 1 in reflectance."""

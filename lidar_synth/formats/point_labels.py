@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lidar_synth.classes import IGNORE, Taxonomy
 from lidar_synth.errors import DataError
 from lidar_synth.files import read_values, write_file
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 
 def read_labels(path: Path, points: Path, count: int, taxonomy: Taxonomy) -> dict[str, Any]:

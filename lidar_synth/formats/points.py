@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.files import SKIP_HINT, unreadable, write_file
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 FARTHEST = 1e5
 """Metres: a coordinate beyond this is not a LiDAR's."""

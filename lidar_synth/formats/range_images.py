@@ -24,9 +24,9 @@ from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import FileWriter, Picture
-from lidar_synth.projection import project, unproject
-from lidar_synth.scan import RangeImage, Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 SUFFIXES = (".npz", ".npy")
 

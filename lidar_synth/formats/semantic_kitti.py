@@ -34,8 +34,8 @@ from lidar_synth.formats.point_labels import encode_labels, read_labels, write_l
 from lidar_synth.formats.points import read_points, write_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 
 SPLITS: dict[str, tuple[str, ...] | None] = {
     "train": tuple(f"{i:02d}" for i in (0, 1, 2, 3, 4, 5, 6, 7, 9, 10)),

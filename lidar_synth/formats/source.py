@@ -8,8 +8,8 @@ from typing import Literal, TypeVar, get_args
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 OnBad = Literal["error", "skip"]
 """What a source does with a scan that cannot be read: raise, or count and name it and go on."""

@@ -34,8 +34,8 @@ from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import NOTES, Picture, Writer, clear_notes
-from lidar_synth.scan import Boxes, Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 SUFFIX = ".tar"
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files import list_files, read_file, read_text, write_file
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 Image = NDArray[np.uint8]
 Picture = Image | Path

@@ -27,10 +27,10 @@ from tqdm import tqdm
 
 from lidar_synth.errors import DataError
 from lidar_synth.files import read_file, write_file
+from lidar_synth.geometry.scan import Boxes, Scan, Source
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import joined
 from lidar_synth.labels.objects import Object, objects_of
-from lidar_synth.scan import Boxes, Scan, Source
-from lidar_synth.sensor import Sensor
 
 FORMAT = "lidar-synth-objects/1"
 

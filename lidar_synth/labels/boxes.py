@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.scan import Boxes
+from lidar_synth.geometry.scan import Boxes
 
 _CORNERS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
 

@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry.projection import locate
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import overlapping
 from lidar_synth.labels.ground import standing
 from lidar_synth.labels.merge import merged
 from lidar_synth.labels.view import refuse_coarser
-from lidar_synth.projection import locate
-from lidar_synth.scan import Boxes, Scan
-from lidar_synth.sensor import Sensor
 
 
 def thinned(scan: Scan, sensor: Sensor) -> Scan:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import box_frame
-from lidar_synth.scan import Boxes, Scan
 
 GROUND = np.isin(np.arange(256), [TRAIN_ID[n] for n in ("road", "parking", "sidewalk", "other-ground", "terrain")])
 """(256,) which labels are ground."""

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE
+from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
 from lidar_synth.labels.boxes import joined
-from lidar_synth.scan import SYNTHETIC, Boxes, Scan
 
 
 def merged(scan: Scan, others: Sequence[Scan]) -> Scan:

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.exchange import swap_bands, swap_sector, thinned
 from lidar_synth.labels.objects import Object, instances_of, objects_of
 from lidar_synth.labels.own import Ignored, Own, generated
 from lidar_synth.labels.pasting import paste
-from lidar_synth.scan import Scan, Source
 
 TRIES = 5
 """Objects tried for each that is wanted."""

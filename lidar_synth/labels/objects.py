@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grown, turned, turned_points
 from lidar_synth.labels.ground import GROUND, ground_under
-from lidar_synth.scan import Boxes, Scan
 
 LABELS = {
     "Car": TRAIN_ID["car"], "Van": TRAIN_ID["car"], "Truck": TRAIN_ID["truck"], "Pedestrian": TRAIN_ID["person"],

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.scan import Scan, Source
+from lidar_synth.geometry.scan import Scan, Source
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import overlapping, unseen, widened
 from lidar_synth.labels.ground import CLEARANCE, ground_under, standing
 from lidar_synth.labels.merge import merged
 from lidar_synth.labels.objects import Object
 from lidar_synth.labels.view import Part, View, refuse_coarser
-from lidar_synth.scan import Boxes, Scan
 
 LIFT = 1.0
 """Metres by which an object is raised or lowered at most: farther, the sensor would see another side of it."""

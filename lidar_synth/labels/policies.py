@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.mix import laser, objects, polar
 from lidar_synth.labels.own import condition, generated, ignored, unlabelled
 from lidar_synth.labels.pseudo import pseudo
-from lidar_synth.scan import Scan, Source
 
 LabelPolicy = Callable[[Scan, np.random.Generator], Scan]
 """What decides on the labels of a synthetic scan; it never changes the scan that it is given."""

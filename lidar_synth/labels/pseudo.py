@@ -8,8 +8,8 @@ import numpy as np
 
 from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.own import checked_share, trusted
-from lidar_synth.scan import Scan, Source
 
 Teacher = Callable[[Scan], Any]
 """``scan -> (labels (N,) train ids, confidence (N,) in [0, 1])`` or ``scan -> scan`` with labels."""

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.projection import locate
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.ground import FLOOR, GROUND
 from lidar_synth.labels.objects import Object
-from lidar_synth.projection import locate
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor
 
 
 @dataclass

@@ -11,10 +11,10 @@ from torch.nn.utils.rnn import pad_sequence
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing.items import Item
-from lidar_synth.projection import project
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor
 
 Form = Literal["offsets", "padded", "range"]
 """How a batch holds its scans, see ``Collate``."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 
 class Item(TypedDict):

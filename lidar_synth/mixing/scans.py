@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.labels import LabelPolicy, make_policy
 from lidar_synth.mixing.batches import MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
@@ -18,7 +19,6 @@ from lidar_synth.mixing.sources import check_together, each, identity_of
 from lidar_synth.mixing.state import shared_integers
 from lidar_synth.mixing.synthetic import make_synthetic
 from lidar_synth.noise import keyed_rng
-from lidar_synth.scan import REAL, SYNTHETIC, Scan
 
 log = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from lidar_synth.classes import NAMES
 from lidar_synth.errors import ConfigError
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 
 
 class Sources:

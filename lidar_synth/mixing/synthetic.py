@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generator import Generator
+from lidar_synth.generate.generator import Generator
+from lidar_synth.geometry.scan import SYNTHETIC, Scan, Source
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing.sources import identity_of
-from lidar_synth.scan import SYNTHETIC, Scan, Source
-from lidar_synth.sensor import Sensor
 
 
 @runtime_checkable

@@ -7,7 +7,7 @@ the tilt between the ground under the object and under the sensor: a box has a y
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.scan import Boxes
+from lidar_synth.geometry.scan import Boxes
 from lidar_synth.town.camera import CAMERA, pixel_rays
 from lidar_synth.town.cast import Stage, trace
 from lidar_synth.town.scene import Placed, Pose

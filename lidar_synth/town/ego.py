@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.town.meshes import Mesh, boxes, fan, merge, tube
 from lidar_synth.town.solid import Solid
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lidar_synth.convert import in_processes
 from lidar_synth.errors import ConfigError
 from lidar_synth.files import write_file
+from lidar_synth.formats.convert import in_processes
 from lidar_synth.formats.kitti360 import KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter

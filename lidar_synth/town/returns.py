@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.sensor import Sensor
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.town.cast import MISS, Hits, Stage
 from lidar_synth.town.materials import SurfaceTable, column
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lidar_synth.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.scan import SYNTHETIC, Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.scan import SYNTHETIC, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.town.boxes import boxes_of
 from lidar_synth.town.camera import CAMERA
 from lidar_synth.town.cast import Stage

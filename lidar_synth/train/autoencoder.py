@@ -24,16 +24,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidar_synth.codec import Latent, expected
 from lidar_synth.errors import ConfigError
-from lidar_synth.flow import Example, Metric
-from lidar_synth.nets.autoencoder import Autoencoder
-from lidar_synth.nets.convolution import Norm, WrapConv
-from lidar_synth.nets.heads import Heads
-from lidar_synth.nets.vqvae import VQVAE, Encoding
-from lidar_synth.normalize import CHANNELS, TensorFormat
-from lidar_synth.scan import RangeImage
-from lidar_synth.sensor import Sensor
+from lidar_synth.flow.path import Example, Metric
+from lidar_synth.generate.codec import Latent, expected
+from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
+from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.models.convolution import Norm, WrapConv
+from lidar_synth.models.lidm.vqvae import VQVAE, Encoding
+from lidar_synth.models.town_codec.autoencoder import Autoencoder
+from lidar_synth.models.town_codec.heads import Heads
 from lidar_synth.train.data import Batch
 
 CURVE_LENGTH = 4

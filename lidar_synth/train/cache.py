@@ -14,13 +14,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lidar_synth.bank.encoding import LEVELS, TYPES, Encoding
-from lidar_synth.codec import Codec
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
-from lidar_synth.normalize import TensorFormat
-from lidar_synth.projection import project
-from lidar_synth.scan import RangeImage, Scan, Source
-from lidar_synth.sensor import Sensor
+from lidar_synth.generate.codec import Codec
+from lidar_synth.geometry.normalize import TensorFormat
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import RangeImage, Scan, Source
+from lidar_synth.geometry.sensor import Sensor
 
 DTYPES: dict[str, type[np.generic]] = {name: TYPES[name] for name in ("range", "reflectance", "label")}
 """How a cache holds each channel: as a bank does."""

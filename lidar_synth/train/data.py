@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lidar_synth.codec import Codec
-from lidar_synth.conditions import CONDITIONS, blank, one_view
 from lidar_synth.errors import ConfigError
+from lidar_synth.generate.codec import Codec
+from lidar_synth.generate.conditions import CONDITIONS, blank, one_view
+from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.noise import gaussian, uniform
-from lidar_synth.normalize import TensorFormat
 from lidar_synth.train.cache import ImageCache
 
 _TRAINING = 1 << 62

@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from lidar_synth.flow import Example, Metric, Velocity, interpolate
-from lidar_synth.nets.autoencoder import Autoencoder
+from lidar_synth.flow.path import Example, Metric, Velocity, interpolate
+from lidar_synth.models.town_codec.autoencoder import Autoencoder
 from lidar_synth.train.autoencoder import Autoencoding
 from lidar_synth.train.data import Batch
 from lidar_synth.train.loop import Task

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from torch import Tensor, nn
 
-from lidar_synth.distill import STRATEGIES
 from lidar_synth.errors import DataError
-from lidar_synth.flow import METRICS, TIMESTEPS, Example, Metric, Velocity, flow_matching, velocity_loss
-from lidar_synth.normalize import CHANNELS, TensorFormat
+from lidar_synth.flow.distill import STRATEGIES
+from lidar_synth.flow.path import METRICS, TIMESTEPS, Example, Metric, Velocity, flow_matching, velocity_loss
+from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
 from lidar_synth.train.data import Batch, Batches, micro_batches
 from lidar_synth.train.schedules import SCHEDULES
 from lidar_synth.train.state import Training

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.nets.layers import GatedFeedForward
-from lidar_synth.nets.transformer import ContextAttention, SelfAttention
+from lidar_synth.models.hdit.transformer import ContextAttention, SelfAttention
+from lidar_synth.models.layers import GatedFeedForward
 
 BLOCKS = (SelfAttention, ContextAttention, GatedFeedForward)
 """Modules whose linear layers Muon moves."""

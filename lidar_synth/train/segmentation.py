@@ -16,9 +16,9 @@ from tqdm import tqdm
 
 from lidar_synth.classes import IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.metrics.segmentation import Images
+from lidar_synth.evaluate.segmentation import Images
 from lidar_synth.mixing import MixedScans
-from lidar_synth.nets.segmenter import segmenter_input
+from lidar_synth.models.segmenter import segmenter_input
 
 
 def endless_batches(mixed: MixedScans, batch: int, workers: int = 0) -> Iterator[Images]:

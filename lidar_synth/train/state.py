@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
-from lidar_synth.flow import METRICS
-from lidar_synth.normalize import CHANNELS
+from lidar_synth.flow.path import METRICS
+from lidar_synth.geometry.normalize import CHANNELS
 from lidar_synth.train.optimizers import OPTIMIZERS
 from lidar_synth.train.schedules import SCHEDULES
 

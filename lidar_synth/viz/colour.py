@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lidar_synth.classes import COLOURS
 from lidar_synth.errors import ConfigError
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 
 Rgb = NDArray[np.uint8]
 """(..., 3) red, green, blue."""

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError
-from lidar_synth.projection import project, unproject
-from lidar_synth.scan import RangeImage, Scan
+from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.viz.colour import EMPTY, Rgb, Scale, scales
 
 CHANNELS = ("range", "reflectance", "label")

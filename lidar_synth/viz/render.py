@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.scan import Boxes, Scan
+from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.viz.colour import EMPTY, Rgb, Scale, point_values, scales
 
 SAMPLES = 2

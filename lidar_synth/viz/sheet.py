@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from lidar_synth.classes import NAMES
 from lidar_synth.errors import ConfigError
-from lidar_synth.scan import RangeImage, Scan
+from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, scales
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Camera, bird, render

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidar_synth.errors import LibraryError
 from lidar_synth.formats.pcd import import_open3d
-from lidar_synth.scan import Scan
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.viz.colour import EMPTY, Scale, point_values, scales
 from lidar_synth.viz.render import Orbit, box_segments
 

@@ -31,10 +31,10 @@ from lidar_synth.bank import Bank, Encoding, Entry, Facts, Index, ShardWriter
 from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
 from lidar_synth.files import sha256
 from lidar_synth.formats.points import read_points
-from lidar_synth.generator import load_generator
-from lidar_synth.projection import project, unproject
-from lidar_synth.scan import RangeImage, Scan
-from lidar_synth.sensor import load_sensor
+from lidar_synth.generate.generator import load_generator
+from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.town import Town
 
 SHARD = 64

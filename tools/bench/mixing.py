@@ -23,10 +23,10 @@ from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.files import sha256
 from lidar_synth.formats import WRITERS, SemanticKITTI
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.mixing import MixedScans, to_item
 from lidar_synth.noise import keyed_rng
-from lidar_synth.projection import project
-from lidar_synth.scan import Scan, Source
 from lidar_synth.town import Town
 
 BATCH = 4

@@ -14,9 +14,9 @@ import torch
 from timing import print_table, time_in_turns
 
 from lidar_synth.formats.points import read_points
-from lidar_synth.projection import locate, project, project_batch, unfold, unproject
-from lidar_synth.scan import Scan
-from lidar_synth.sensor import Sensor, load_sensor
+from lidar_synth.geometry.projection import locate, project, project_batch, unfold, unproject
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 
 def random_points(sensor: Sensor, count: int = 120_000) -> np.ndarray:

@@ -15,8 +15,8 @@ import torch
 from timing import print_table, time_in_turns
 from untrained import write_untrained
 
-from lidar_synth.projection import unproject
-from lidar_synth.service import RollingBank
+from lidar_synth.geometry.projection import unproject
+from lidar_synth.mixing.service import RollingBank
 
 
 def main() -> None:

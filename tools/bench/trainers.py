@@ -41,8 +41,8 @@ def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
     from mmengine.config import Config
     from mmengine.registry import init_default_scope
 
-    from lidar_synth.convert import convert
     from lidar_synth.formats import WRITERS
+    from lidar_synth.formats.convert import convert
     from lidar_synth.town import Town, export_town
 
     export_town(Town(seed=1, scans=SCANS), root / "real", "semantic_kitti", camera=False, progress=False)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import torch
 
-from lidar_synth.checkpoint import VELOCITY, Header, Part, save_checkpoint
-from lidar_synth.nets import build_network
-from lidar_synth.normalize import CHANNELS, NORMALISATIONS
-from lidar_synth.sensor import load_sensor
+from lidar_synth.generate.checkpoint import VELOCITY, Header, Part, save_checkpoint
+from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
+from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.models import build_network
 
 
 def write_untrained(path: Path) -> Path:

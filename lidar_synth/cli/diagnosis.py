@@ -1,0 +1,266 @@
+"""What this machine has, what it lacks, and the line that mends it."""
+
+import ctypes
+import importlib
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, requires
+from importlib.metadata import version as installed_version
+from pathlib import Path
+from typing import Literal
+
+from lidar_synth import __version__
+
+State = Literal["ok", "absent", "check", "broken"]
+"""``absent``: an optional part that is not there; ``check``: one that is there and wrong; ``broken``: the package
+does not work without it."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Args:
+        group: ``libraries``, ``devices`` or ``data``.
+        name: of what was looked at.
+        state: how it is.
+        found: version or description, or what is wrong.
+        buys: what an optional part that is not there would add.
+        fix: the line to type.
+    """
+
+    group: str
+    name: str
+    state: State
+    found: str
+    buys: str = ""
+    fix: str = ""
+
+
+OPTIONAL = {
+    "embreex": "the town and whatever else casts rays",
+    "open3d": "PCD and PLY files and the 3-D window of lidar-synth view",
+}
+"""What the parts that a machine can do without are for; every other dependency is required."""
+
+MODULES = {"pyyaml": "yaml", "pillow": "PIL"}
+"""The import name of a distribution, where it is another."""
+
+SHARED_OBJECTS = {
+    "libusb-1.0.so.0": "libusb-1.0-0",
+    "libGL.so.1": "libgl1",
+    "libEGL.so.1": "libegl1",
+    "libX11.so.6": "libx11-6",
+    "libgomp.so.1": "libgomp1",
+    "libudev.so.1": "libudev1",
+}
+"""The system libraries that open3d loads, and the Debian and Ubuntu packages that hold them."""
+
+DATA_ROOTS = {
+    "KITTI360_ROOT": ("data_3d_raw/*/velodyne_points/data/*.bin", ("data_poses", "calibration", "data_2d_raw")),
+    "SEMANTICKITTI_ROOT": ("sequences/*/velodyne/*.bin", ()),
+    "KITTI_ROOT": ("training/velodyne/*.bin", ("training/label_2", "training/calib")),
+    "NUSCENES_ROOT": ("samples/LIDAR_TOP/*.pcd.bin", ()),
+    "LIDAR_SYNTH_REAL_SCANS": ("manifest.csv", ()),
+    "LIDAR_SYNTH_GOLDEN": ("*.npz", ()),
+}
+"""Environment variables that name data: what has to be there, and the folders that more can be done with."""
+
+
+def examine() -> list[Finding]:
+    """Everything there is to say about this machine, in the order of the report."""
+    return [*_libraries(), *_devices(), *_data()]
+
+
+def works(findings: list[Finding]) -> bool:
+    """Whether nothing that the package needs is broken."""
+    return all(finding.state != "broken" for finding in findings)
+
+
+def missing_packages() -> list[str]:
+    """The Debian packages whose libraries open3d needs and this Linux does not have."""
+    if not sys.platform.startswith("linux"):
+        return []
+    return [package for library, package in SHARED_OBJECTS.items() if not _loads(library)]
+
+
+def report(findings: list[Finding]) -> str:
+    """The findings as a table for people."""
+    width = max(len(finding.name) for finding in findings)
+    lines = [
+        f"lidar_synth {__version__} on Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    ]
+    group = ""
+    for finding in findings:
+        if finding.group != group:
+            group = finding.group
+            lines += ["", group]
+        buys = f" (for {finding.buys})" if finding.buys else ""
+        lines.append(f"  {finding.state:<7} {finding.name:<{width}}  {finding.found}{buys}")
+        if finding.fix:
+            lines.append(f"  {'':<7} {'':<{width}}  -> {finding.fix}")
+    lines += [
+        "",
+        "The package works." if works(findings) else "The package does not work: see the lines marked broken.",
+    ]
+    return "\n".join(lines)
+
+
+def as_dict(findings: list[Finding]) -> dict[str, object]:
+    """The findings as plain values for ``--json``."""
+    return {
+        "version": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "works": works(findings),
+        "findings": [asdict(finding) for finding in findings],
+    }
+
+
+def _libraries() -> Iterator[Finding]:
+    enough = sys.version_info >= (3, 11)
+    yield Finding("libraries", "python", "ok" if enough else "broken", platform.python_version(),
+                  fix="" if enough else "install Python 3.11 or later")  # fmt: skip
+    try:
+        wanted = requires("lidar_synth") or []
+    except PackageNotFoundError:
+        yield Finding("libraries", "lidar_synth", "broken", "not installed", fix="pip install -e .")
+        return
+    for line in wanted:
+        requirement, _, marker = line.partition(";")
+        extra = re.search(r"extra == ['\"]([\w-]+)['\"]", marker)
+        parts = re.match(r"([\w.-]+?)\s*(?:>=\s*([\d.]+))?\s*$", requirement.strip())
+        if parts and not (extra and extra[1] == "dev"):
+            yield _library(parts[1], parts[2] or "0", extra[1] if extra else None)
+    yield _geometry()
+
+
+def _library(name: str, minimum: str, extra: str | None) -> Finding:
+    """How one dependency is; those of an extra are optional."""
+    buys = f"the extra {extra!r}" if extra else OPTIONAL.get(name, "")
+    worst: State = "check" if buys else "broken"
+    wheel = f"pip install 'lidar_synth[{extra}]'" if extra else f"pip install '{name}>={minimum}'"
+    try:
+        module = importlib.import_module(MODULES.get(name, name.replace("-", "_")))
+    except ModuleNotFoundError:
+        return Finding("libraries", name, "absent" if buys else "broken", "not installed", buys, wheel)
+    except Exception as error:  # a broken installation may raise anything: the report is where it is told
+        if name == "open3d" and (packages := missing_packages()):
+            line = "apt-get install -y --no-install-recommends " + " ".join(packages)
+            return Finding("libraries", name, "absent", "lacks system libraries", buys, _as_root(line))
+        return Finding("libraries", name, worst, f"{type(error).__name__}: {error}", buys, f"{wheel} --force-reinstall")
+    version = str(getattr(module, "__version__", None) or installed_version(name))
+    if _numbers(version) < _numbers(minimum):
+        return Finding("libraries", name, worst, f"{version}, older than {minimum}", buys, wheel)
+    return Finding("libraries", name, "ok", version)
+
+
+def _geometry() -> Finding:
+    """Whether a range image survives the way to points and back, which needs numpy and numba to agree."""
+    try:
+        import numpy as np
+
+        from lidar_synth.geometry.projection import project, unproject
+        from lidar_synth.geometry.scan import RangeImage
+        from lidar_synth.geometry.sensor import load_sensor
+
+        sensor = load_sensor("hdl64e_kitti360")
+        image = RangeImage(np.full(sensor.shape, 10, np.float32), sensor)
+        back = project(unproject(image))
+        same = np.allclose(back.range, image.range, rtol=3e-7)
+    except Exception as error:  # whatever it is, it belongs in the report
+        return Finding("libraries", "projection", "broken", f"{type(error).__name__}: {error}")
+    if not same:
+        return Finding("libraries", "projection", "broken", "a range image comes back changed",
+                       fix="pip install --force-reinstall numba numpy")  # fmt: skip
+    return Finding("libraries", "projection", "ok", "range image -> points -> range image returns every cell")
+
+
+def _devices() -> Iterator[Finding]:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    yield Finding("devices", "CPU", "ok", f"{_cpu_name()}, {cores} cores{_instructions()}")
+    if hasattr(os, "sysconf"):
+        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
+        yield Finding("devices", "memory", "ok", f"{total:.1f} GiB")
+    yield from _cuda()
+
+
+def _cuda() -> Iterator[Finding]:
+    try:
+        import torch
+
+        cards = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
+    except Exception as error:  # a driver that does not fit raises many things
+        yield Finding("devices", "CUDA", "check", f"{type(error).__name__}: {error}")
+        return
+    for number, card in enumerate(cards):
+        memory = card.total_memory / 2**30
+        found = f"{card.name}, {memory:.0f} GiB, compute {card.major}.{card.minor}, CUDA {torch.version.cuda}"
+        yield Finding("devices", f"cuda:{number}", "ok", found)
+    if cards:
+        return
+    if shutil.which("nvidia-smi") is None:
+        yield Finding("devices", "CUDA", "absent", "no NVIDIA driver: everything runs on the CPU")
+    elif torch.version.cuda is None:
+        yield Finding("devices", "CUDA", "check", "a driver, but torch is built for the CPU",
+                      fix="the line for this machine's CUDA on https://pytorch.org/get-started/locally")  # fmt: skip
+    else:
+        yield Finding("devices", "CUDA", "check", f"a driver, but torch (CUDA {torch.version.cuda}) finds no card",
+                      fix="nvidia-smi")  # fmt: skip
+
+
+def _data() -> Iterator[Finding]:
+    for variable, (pattern, companions) in DATA_ROOTS.items():
+        value = os.environ.get(variable)
+        if not value:
+            yield Finding("data", variable, "absent", "not set")
+            continue
+        root = Path(value)
+        first = next(iter(root.glob(pattern)), None)
+        if not root.is_dir():
+            yield Finding("data", variable, "check", f"{root} is not a folder", fix=f"export {variable}=/the/folder")
+        elif first is None:
+            yield Finding("data", variable, "check", f"{root} holds no {pattern}", fix=f"export {variable}=/the/folder")
+        else:
+            lacking = [name for name in companions if not (root / name).is_dir()]
+            yield Finding("data", variable, "ok", f"{root}" + (f", without {', '.join(lacking)}" if lacking else ""))
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+def _as_root(line: str) -> str:
+    return line if hasattr(os, "geteuid") and os.geteuid() == 0 else f"sudo {line}"
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", version.partition("+")[0])[:3])
+
+
+def _cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _instructions() -> str:
+    """The vector instructions that torch will use."""
+    try:
+        import torch
+
+        return f", {torch.backends.cpu.get_cpu_capability()}"
+    except Exception:  # without torch there is nothing to use them
+        return ""

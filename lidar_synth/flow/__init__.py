@@ -1,0 +1,1 @@
+"""Rectified flow: path and losses, solvers, timestep selection, distillation. Takes any callable ``v(y, t, c)``."""

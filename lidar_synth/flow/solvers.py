@@ -1,0 +1,125 @@
+"""Solvers of dy/dt = v(y, t, c) downwards from noise at t = 1 to data at t = 0 (Eq. 4).
+
+The time grid is any descending sequence of times, evenly spaced or not; a distilled student has its own.
+
+To add a solver: write its step, enter it in ``SOLVERS`` with its order; the tests measure the order.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.flow.path import Velocity, per_sample
+
+Grid = Sequence[float] | Tensor
+"""S + 1 descending times for S steps, the same for all samples; or a tensor (S + 1, B), one grid per sample."""
+
+
+class State(NamedTuple):
+    """A point of a trajectory.
+
+    Args:
+        t: (B,) time, in the precision of the state and at least in float32.
+        y: (B, ...) state.
+        velocity: (B, ...) the velocity of the step that leaves here, (y_next - y) / (t_next - t); None at the end.
+    """
+
+    t: Tensor
+    y: Tensor
+    velocity: Tensor | None
+
+
+def euler(velocity: Velocity, y: Tensor, t: Tensor, t_next: Tensor, cond: Any) -> Tensor:
+    """v(y, t): one evaluation, first order."""
+    return velocity(y, t, cond).to(y.dtype)
+
+
+def heun(velocity: Velocity, y: Tensor, t: Tensor, t_next: Tensor, cond: Any) -> Tensor:
+    """The mean of v at both ends of Euler's step: two evaluations, second order."""
+    start = velocity(y, t, cond).to(y.dtype)
+    end = velocity(y + per_sample(t_next - t, y) * start, t_next, cond).to(y.dtype)
+    return (start + end) / 2
+
+
+class Solver(NamedTuple):
+    """One solver: ``slope(velocity, y, t, t_next, cond)`` is the mean velocity over a step; ``order`` of its
+    global error; ``evaluations`` of the network per step."""
+
+    slope: Callable[[Velocity, Tensor, Tensor, Tensor, Any], Tensor]
+    order: int
+    evaluations: int
+
+
+SOLVERS = {"euler": Solver(euler, 1, 1), "heun": Solver(heun, 2, 2)}
+"""Solvers by name."""
+
+
+def uniform_grid(steps: int, start: float = 1.0, end: float = 0.0) -> tuple[float, ...]:
+    """``steps`` + 1 evenly spaced times from ``start`` down to ``end``.
+
+    Raises:
+        ConfigError: on less than one step.
+    """
+    if steps < 1:
+        raise ConfigError(f"{steps} steps", "at least 1")
+    return tuple((start * (steps - i) + end * i) / steps for i in range(steps + 1))
+
+
+def trajectory(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None) -> Iterator[State]:
+    """The states on the grid, one at a time; only the current one is held.
+
+    The state keeps its own dtype (float32 is advised) whatever the network computes in.
+
+    Args:
+        velocity: the flow.
+        y: (B, ...) state at the first time of the grid.
+        grid: descending times within [0, 1].
+        solver: a name of ``SOLVERS``.
+        cond: passed on to ``velocity``.
+
+    Yields:
+        S + 1 states.
+
+    Raises:
+        ConfigError: on an unknown solver or a grid that does not descend within [0, 1].
+    """
+    if solver not in SOLVERS:
+        raise ConfigError(f"solver {solver!r}", f"one of {', '.join(SOLVERS)}")
+    times = _times(grid, y)
+    for t, t_next in pairwise(times):
+        slope = SOLVERS[solver].slope(velocity, y, t, t_next, cond)
+        yield State(t, y, slope)
+        y = y + per_sample(t_next - t, y) * slope
+    yield State(times[-1], y, None)
+
+
+def solve(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None) -> Tensor:
+    """(B, ...) the state at the last time of the grid; see ``trajectory``."""
+    for state in trajectory(velocity, y, grid, solver, cond):
+        y = state.y
+    return y
+
+
+def checked_grid(grid: Sequence[float] | Tensor) -> Tensor:
+    """(S + 1,) float64 times on the CPU.
+
+    Raises:
+        ConfigError: on a grid that does not descend within [0, 1].
+    """
+    times = torch.as_tensor(grid, dtype=torch.float64, device="cpu")
+    inside = times.ndim == 1 and len(times) >= 2 and times[0] <= 1 and times[-1] >= 0
+    if not inside or not (times.diff() < 0).all():
+        raise ConfigError(f"time grid {times.tolist()}", "at least two descending times within [0, 1], noise first")
+    return times
+
+
+def _times(grid: Grid, y: Tensor) -> Tensor:
+    """(S + 1, B) times beside y."""
+    if isinstance(grid, Tensor) and grid.ndim == 2:  # made by distillation, on the device: not worth a wait
+        return grid
+    times = checked_grid(grid).to(y.device, torch.promote_types(y.dtype, torch.float32))
+    return times[:, None].expand(-1, len(y))

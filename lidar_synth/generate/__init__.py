@@ -1,0 +1,1 @@
+"""From a checkpoint to scans: the one place where geometry, networks and flow meet."""

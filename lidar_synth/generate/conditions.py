@@ -1,0 +1,220 @@
+"""What a scan can be generated from: a map of labels, or a camera image.
+
+A condition is given as it is stored, whole numbers in an array, or as the real ``Scan`` that has it::
+
+    semantic   (H, W) uint8 train ids 0..18, 255 = unknown, on the model's sensor (``RangeImage.label``)
+    camera     (3, h, w) uint8 red, green, blue, of the size that the model's encoder takes, or the image's path in
+               ``Scan.image_path``, which is resized
+
+An encoder (``nets.encoders``), trained together with the velocity network, makes of it what that network takes as
+``cond``. A model that met a blank condition now and then in training (``dropout``) can be guided: see ``flow.guided``.
+
+To add a condition: write its class, enter it in ``CONDITIONS``, and its encoder in ``nets.NETWORKS``.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
+
+
+class Condition(Protocol):
+    """One kind of condition.
+
+    Attributes:
+        name: in ``CONDITIONS``, in a checkpoint's header and in a user's dictionary.
+        field: of ``train.ImageCache`` that holds it.
+        encoders: architectures that take it, the default first.
+        turns: whether it turns with the scan about the vertical.
+        blank: its value where nothing is known.
+    """
+
+    name: str
+    field: str
+    encoders: tuple[str, ...]
+    turns: bool
+    blank: int
+
+    def shape(self, encoder: nn.Module) -> tuple[int, ...]:
+        """Of one condition."""
+        ...
+
+    def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
+        """The condition that a real scan has, of that shape."""
+        ...
+
+    def check(self, values: Tensor) -> None:
+        """Refuse values that are none."""
+        ...
+
+
+class SemanticMap:
+    """The classes of a scan on the model's grid."""
+
+    name = "semantic"
+    field = "label"
+    encoders: tuple[str, ...] = ("semantic_map",)
+    turns = True
+    blank = IGNORE
+
+    def shape(self, encoder: nn.Module) -> tuple[int, ...]:
+        """(H, W)."""
+        return tuple(encoder.resolution)  # type: ignore[arg-type]  # every encoder has one
+
+    def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
+        """The scan's labels, projected onto ``sensor``, whichever sensor took it.
+
+        Raises:
+            DataError: on a scan without labels.
+        """
+        if scan.label is None:
+            raise DataError(f"scan {scan.id!r} has no labels", "a labelled scan, to condition on")
+        labels: NDArray[np.uint8] = project(scan, sensor, ["label"]).channels["label"]
+        return labels
+
+    def check(self, values: Tensor) -> None:
+        """Train ids only.
+
+        Raises:
+            DataError: naming the others.
+        """
+        wrong = values[(values >= len(NAMES)) & (values != IGNORE)]
+        if len(wrong):
+            raise DataError(
+                f"a label map with ids {sorted(set(wrong.tolist()))[:8]}",
+                "train ids 0..18, or 255 = unknown",
+                "SemanticKITTI's file ids become train ids by lidar_synth.classes.SEMANTIC_KITTI.decode.",
+            )
+
+
+class CameraImage:
+    """The image of a camera ahead, cut into views side by side."""
+
+    name = "camera"
+    field = "camera"
+    encoders: tuple[str, ...] = ("views", "clip_views", "sight")
+    turns = False
+    blank = 0
+
+    def shape(self, encoder: nn.Module) -> tuple[int, ...]:
+        """(3, h, w)."""
+        return (3, *encoder.resolution)  # type: ignore[misc]  # every encoder has one
+
+    def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
+        """The image taken with the scan, resized; ``options["image"]`` are the rows and columns that it has to have,
+        which stand for the camera: one that sees more or less than that of the training would mislead.
+
+        Raises:
+            DataError: on a scan without an image, one that cannot be read, or of another size.
+        """
+        from PIL import Image, UnidentifiedImageError
+
+        if scan.image_path is None:
+            raise DataError(f"scan {scan.id!r} has no camera image", "a scan with an image_path, to condition on")
+        try:
+            with Image.open(scan.image_path) as image:
+                size = (image.height, image.width)
+                small = image.convert("RGB").resize((shape[2], shape[1]), Image.Resampling.BICUBIC)
+        except (OSError, UnidentifiedImageError) as error:
+            raise DataError(f"the image {scan.image_path} cannot be read ({error})", "a PNG or JPEG") from error
+        wanted = tuple(options.get("image") or size)
+        if size != wanted:
+            raise DataError(
+                f"the image {scan.image_path} of {size} rows and columns",
+                f"{wanted}, those of the camera that the model was trained on",
+                "Crop or pad it, by its calibration, to what that camera sees.",
+            )
+        return np.asarray(small, np.uint8).transpose(2, 0, 1).copy()
+
+    def check(self, values: Tensor) -> None:
+        """All bytes are colours."""
+
+
+CONDITIONS: dict[str, Condition] = {"semantic": SemanticMap(), "camera": CameraImage()}
+"""Conditions by name."""
+
+
+class Conditioned(nn.Module):
+    """A velocity network together with the encoder of its condition: v(y, t, c) of conditions as they are stored.
+
+    Args:
+        velocity: takes what ``encoder`` gives.
+        encoder: of the condition.
+    """
+
+    def __init__(self, velocity: nn.Module, encoder: nn.Module) -> None:
+        super().__init__()
+        self.velocity, self.encoder = velocity, encoder
+
+    def forward(self, y: Tensor, t: Tensor, cond: Tensor) -> Tensor:
+        """(B, ...) states, times and conditions to velocities (B, ...)."""
+        out: Tensor = self.velocity(y, t, self.encoder(cond))
+        return out
+
+
+def blank(name: str, values: Tensor) -> Tensor:
+    """A condition that says nothing, like ``values``."""
+    return torch.full_like(values, CONDITIONS[name].blank)
+
+
+def one_view(image: Tensor, views: int) -> Tensor:
+    """Images (B, 3, h, w) with all views but that right of the middle blank, as LiDM drops views in training."""
+    width, kept = image.shape[3] // views, views // 2
+    out = torch.zeros_like(image)
+    out[..., kept * width : (kept + 1) * width] = image[..., kept * width : (kept + 1) * width]
+    return out
+
+
+def batch_of(
+    name: str, given: Any, count: int, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+) -> Tensor:
+    """What a user gives as the conditions of several scans.
+
+    Args:
+        name: of the model's condition.
+        given: a condition for all, or one for each: an array or tensor, a ``Scan`` or a sequence of them, or a
+            dictionary with one of these under ``name``, as a bank holds it.
+        count: B.
+        sensor: the model's.
+        shape: of one condition.
+        options: of the condition, from the checkpoint's header.
+
+    Returns:
+        (B, *shape) uint8.
+
+    Raises:
+        ConfigError: on another type, or a dictionary without ``name``.
+        DataError: on another shape, values that are none, or a scan that lacks what is needed.
+    """
+    condition = CONDITIONS[name]
+    if isinstance(given, Mapping):
+        if name not in given:
+            raise ConfigError(f"conditions {sorted(given)}", f"{name!r} among them")
+        given = given[name]
+    if isinstance(given, Scan):
+        given = condition.read(given, sensor, shape, options)
+    elif isinstance(given, Sequence) and given and all(isinstance(scan, Scan) for scan in given):
+        given = np.stack([condition.read(scan, sensor, shape, options) for scan in given])
+    if not isinstance(given, Tensor | np.ndarray):
+        raise ConfigError(f"a condition of type {type(given).__name__}", "an array, a Scan, or a list of Scans")
+    values = torch.as_tensor(given)
+    if values.is_floating_point() or values.is_complex() or values.dtype == torch.bool:
+        raise DataError(f"a {name} condition of {values.dtype}", "whole numbers, uint8")
+    if values.shape not in (shape, (count, *shape)):
+        raise DataError(
+            f"a {name} condition of shape {tuple(values.shape)}", f"{shape} for all scans, or {(count, *shape)}"
+        )
+    if values.numel() and not 0 <= int(values.min()) <= int(values.max()) <= 255:
+        raise DataError(f"a {name} condition from {int(values.min())} to {int(values.max())}", "0..255")
+    values = values.to(torch.uint8)
+    condition.check(values)
+    return values.expand(count, *shape)

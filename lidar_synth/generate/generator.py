@@ -1,0 +1,282 @@
+"""From a checkpoint to scans: where geometry, network and flow meet.
+
+A scan is a function of (checkpoint, condition, time grid and solver, seed, index). What else is scanned along with
+it, in which order and on which device changes float rounding only.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import get_worker_info
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.flow.path import Velocity, guided
+from lidar_synth.flow.solvers import solve, uniform_grid
+from lidar_synth.generate.checkpoint import CODEC, VELOCITY, Header, join, load_checkpoint
+from lidar_synth.generate.codec import Codec, make_codec
+from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, blank
+from lidar_synth.geometry.normalize import TensorFormat
+from lidar_synth.geometry.projection import unproject
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.noise import gaussian, uniform
+
+BATCH = {"cpu": 1, "cuda": 16}
+"""Scans at a time, by device: what fits a CPU's cache, what fills a GPU."""
+
+
+@dataclass(frozen=True)
+class Generator:
+    """Scans by (seed, index).
+
+    Args:
+        name: of the checkpoint; stands in the scans' ids.
+        network: the flow, ``checkpoint.join`` of the checkpoint's networks, in evaluation mode.
+        header: what the checkpoint says about it.
+        hash: of the checkpoint; "" for weights that are in none.
+        batch: scans at a time; bounds the memory and changes nothing else.
+        autoencoder: of a latent model; None for a pixel model.
+    """
+
+    name: str
+    network: nn.Module
+    header: Header
+    hash: str = ""
+    batch: int = 1
+    autoencoder: nn.Module | None = None
+
+    @property
+    def sensor(self) -> Sensor:
+        """Whose grid the images have."""
+        return self.header.sensor
+
+    @property
+    def tensors(self) -> TensorFormat:
+        """The layout of the network's tensors."""
+        return TensorFormat(self.header.channels, self.header.normalisation)
+
+    @property
+    def codec(self) -> Codec:
+        """Between tensors and the states of the flow."""
+        return make_codec(self.autoencoder, self.tensors, self.sensor.shape)
+
+    @property
+    def condition(self) -> str | None:
+        """The name of what the model is conditioned on (``conditions.CONDITIONS``); None = nothing."""
+        return next(iter(self.header.conditioning), None)
+
+    @property
+    def fields(self) -> frozenset[str]:
+        """What its scans carry per point: some of "reflectance", "label", "confidence"."""
+        labelled = "label" in self.header.channels or self.condition == "semantic"
+        fields = set(self.header.channels) - {"range"}
+        return frozenset(fields | {"label", "confidence"} if labelled else fields)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network is."""
+        return next(self.network.parameters()).device
+
+    def range_images(
+        self,
+        seed: int,
+        indices: Sequence[int],
+        condition: Any = None,
+        steps: int | None = None,
+        solver: str = "euler",
+        guidance: float = 1.0,
+    ) -> list[RangeImage]:
+        """Generated range images.
+
+        Args:
+            seed: of the noise, 0 <= seed < 2^64.
+            indices: B numbers of scans, 0 <= index < 2^63, in any order.
+            condition: what the model is conditioned on, one for all scans or B of them; None for an unconditional
+                model. A semantic map is a (H, W) uint8 array of train ids, 255 = unknown, such as the ``label`` of a
+                range image on the model's sensor; a camera image is (3, h, w) uint8. A real ``Scan``, or a list of B,
+                stands for what it has of that: its labels, projected, or the image at its ``image_path``. A
+                dictionary of conditions by name is looked into. See ``conditions``.
+            steps: of a uniform time grid; by default the checkpoint's own grid.
+            solver: a name of ``SOLVERS``.
+            guidance: scale of classifier-free guidance, 1 = none; more follows the condition more closely. Twice the
+                work.
+
+        Returns:
+            B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its ``confidence`` in
+            [0, 1] where the checkpoint has them, empty (0, 255 = ignore, 0) where there is no return. A model of
+            semantic maps that makes no labels of its own gives the map's where there is a return, confidence 1 where
+            they are known.
+
+        Raises:
+            ConfigError: on a seed, index, number of steps or solver that cannot be served, a condition for a model
+                that takes none, guidance of a model that never met a blank condition, or CUDA in a DataLoader worker.
+            DataError: on a condition of another shape, with values that are none, or none where one is needed.
+        """
+        given = self._condition(condition, len(indices))
+        images = []
+        for tensor in self._solve(seed, indices, given, steps, solver, guidance):
+            images += self.tensors.to_images(tensor, self.sensor)
+        if self.condition == "semantic" and "label" in self.fields - set(self.header.channels) and given is not None:
+            for image, labels in zip(images, given.cpu().numpy(), strict=True):
+                image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(np.uint8)
+                image.channels["confidence"] = (image.channels["label"] != IGNORE).astype(np.float32)
+        return images
+
+    def scans(
+        self,
+        seed: int,
+        indices: Sequence[int],
+        condition: Any = None,
+        steps: int | None = None,
+        solver: str = "euler",
+        guidance: float = 1.0,
+    ) -> list[Scan]:
+        """Generated scans: the returns of ``range_images`` through the centres of their cells.
+
+        Their ``id`` is ``<checkpoint>/<seed>/<index>``, their ``domain`` ``SYNTHETIC``.
+        """
+        images = self.range_images(seed, indices, condition, steps, solver, guidance)
+        return [
+            replace(unproject(image), id=f"{self.name}/{seed}/{index}", domain=SYNTHETIC)
+            for index, image in zip(indices, images, strict=True)
+        ]
+
+    def samples(
+        self,
+        seed: int,
+        indices: Sequence[int],
+        condition: Any = None,
+        steps: int | None = None,
+        solver: str = "euler",
+        guidance: float = 1.0,
+    ) -> Iterator[Tensor]:
+        """The normalised tensors behind ``range_images``, at most ``batch`` at a time: (b, C, H, W) each."""
+        return self._solve(seed, indices, self._condition(condition, len(indices)), steps, solver, guidance)
+
+    def _solve(
+        self,
+        seed: int,
+        indices: Sequence[int],
+        condition: Tensor | None,
+        steps: int | None,
+        solver: str,
+        guidance: float,
+    ) -> Iterator[Tensor]:
+        _refuse_worker(self.device)
+        codec = self.codec
+        drawn = (codec.draws, *self.sensor.shape)
+        grid = self.header.time_grid if steps is None else uniform_grid(steps)
+        for first in range(0, len(indices), self.batch):
+            part = slice(first, first + self.batch)
+            noise = gaussian(seed, indices[part], codec.shape, self.device)
+            chance = uniform(seed, indices[part], drawn, self.device) if codec.draws else None
+            with torch.inference_mode():
+                velocity, cond = self._flow(None if condition is None else condition[part], guidance)
+                yield codec.decode(solve(velocity, noise, grid, solver, cond), chance)
+
+    def _flow(self, condition: Tensor | None, guidance: float) -> tuple[Velocity, Tensor | None]:
+        """The flow to solve and what to give it: a condition is encoded once, not at every step."""
+        options = self.header.conditioning.get(str(self.condition), {})
+        if guidance != 1 and (condition is None or not options.get("dropout")):
+            raise ConfigError(
+                f"guidance {guidance} for {self.name!r}",
+                "1: its training never met a blank condition, which guidance starts from",
+                "Train it with condition.dropout=0.1.",
+            )
+        if condition is None or not isinstance(self.network, Conditioned):
+            return self.network, condition
+        encode: Callable[[Tensor], Tensor] = self.network.encoder
+        nothing = encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
+        return guided(self.network.velocity, guidance, nothing), encode(condition)
+
+    def _condition(self, given: Any, count: int) -> Tensor | None:
+        """(B, ...) on the device, as the network takes it."""
+        if given is None and self.condition is None:
+            return None
+        if self.condition is None:
+            raise ConfigError(f"a condition for {self.name!r}", "none: the model is unconditional")
+        if given is None:
+            raise DataError(f"no condition for {self.name!r}", f"condition=... ({self.condition}), or real scans")
+        if not isinstance(self.network, Conditioned):
+            raise ConfigError(f"{self.name!r} without the encoder of its condition", "a whole checkpoint")
+        options = self.header.conditioning[self.condition]
+        shape = CONDITIONS[self.condition].shape(self.network.encoder)
+        return batch_of(self.condition, given, count, self.sensor, shape, options).to(self.device)
+
+
+def load_generator(
+    model: str | Path,
+    *,
+    device: str | torch.device = "cpu",
+    dtype: torch.dtype = torch.float32,
+    compile: bool = False,
+    batch: int | None = None,
+) -> Generator:
+    """A generator from a shipped model or a checkpoint file.
+
+    Args:
+        model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
+        device: "cpu" or "cuda".
+        dtype: what the network computes in; states stay float32.
+        compile: by ``torch.compile``; the first scan takes long.
+        batch: scans at a time; by default what suits the device.
+
+    Raises:
+        ConfigError: on an unknown name, a device that is not there, or CUDA in a DataLoader worker.
+        FileError, DataError: where the checkpoint cannot be read.
+    """
+    device = torch.device(device)
+    _refuse_worker(device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(f"device {str(device)!r}, but torch sees no GPU", "device='cpu', or a CUDA build of torch")
+    path = find_model(model)
+    checkpoint = load_checkpoint(path, device)
+    if VELOCITY not in checkpoint.networks:
+        raise DataError(f"{path} is an autoencoder", "a model that generates", f"Train one with codec={path}.")
+    for network in checkpoint.networks.values():
+        network.to(dtype).requires_grad_(False)
+    if compile:
+        checkpoint.networks[VELOCITY].compile()
+    flow, autoencoder = join(checkpoint.networks), checkpoint.networks.get(CODEC)
+    size = batch or BATCH.get(device.type, 1)
+    return Generator(path.stem, flow, checkpoint.header, checkpoint.hash, size, autoencoder)
+
+
+def shipped_models() -> dict[str, Path]:
+    """The checkpoints that come with the package, by name."""
+    folder = Path(str(files("lidar_synth"))) / "weights"
+    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+
+
+def find_model(model: str | Path) -> Path:
+    """The checkpoint file of a shipped model's name, or a path as it is.
+
+    Raises:
+        ConfigError: on an unknown name.
+    """
+    shipped = shipped_models()
+    if str(model) in shipped:
+        return shipped[str(model)]
+    path = Path(model)
+    if path.suffix != ".safetensors":
+        names = ", ".join(shipped) or "none in this installation"
+        raise ConfigError(f"model {str(model)!r}", f"a shipped one ({names}) or a .safetensors file")
+    return path
+
+
+def _refuse_worker(device: torch.device) -> None:
+    """No CUDA in DataLoader workers: a forked process cannot use it, a spawned one pays for a context each."""
+    if device.type == "cuda" and get_worker_info() is not None:
+        raise ConfigError(
+            "a generator on the GPU inside a DataLoader worker",
+            "one of three ways: (A) bake a bank first and read it in the workers, (B) a rolling bank that one spawned "
+            "process fills, (C) mix in the main process, on the training device",
+            "On the CPU, load_generator(..., device='cpu') works in workers too.",
+        )

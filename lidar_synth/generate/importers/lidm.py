@@ -1,0 +1,275 @@
+"""LiDM's released weights (https://github.com/hancyran/LiDAR-Diffusion) as checkpoints of this package.
+
+A release is a folder with ``model.ckpt`` and the ``config.yaml`` that the file does not repeat; both kinds are read:
+
+    first stage     an autoencoder: one part, the codec; what lies under ``loss.`` trained it and is left out
+    diffusion       ``model.diffusion_model.`` the U-Net, ``first_stage_model.`` the autoencoder, ``cond_stage_model.``
+                    the condition's encoder, ``model_ema.`` the U-Net's averaged weights (by names without dots), which
+                    are taken where they are there; the tensors of the schedule are checked and computed anew
+
+The peer's U-Net tells the noise of a diffusion's step; ``nets.diffusion`` makes of it the velocity of a rectified flow,
+so that it can be sampled from and distilled without training. Frozen CLIP, which a camera model repeats in its file,
+is left out: see ``nets.encoders``. Its label maps count "unlabelled" as 0 and the classes from 1; ours are moved.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor, nn
+
+from lidar_synth.classes import NAMES
+from lidar_synth.errors import DataError
+from lidar_synth.files import read_text, sha256
+from lidar_synth.flow.solvers import uniform_grid
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, Part
+from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
+from lidar_synth.generate.importers.pickled import load_pickle, state_of
+from lidar_synth.geometry.normalize import Normalisation
+from lidar_synth.geometry.sensor import Sensor, presets
+from lidar_synth.models import assemble
+from lidar_synth.models.lidm.diffusion import schedule_times
+
+STEPS = 50
+"""Of the uniform time grid that the checkpoint names: the peer samples in 50."""
+CAMERA_SIZE = (376, 1408)
+"""Rows and columns of KITTI-360's rectified images, which the peer cuts into views."""
+OFFSET = 1.0001
+"""The peer's logarithmic scale is log2(d + 0.0001 + 1)."""
+
+
+def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
+    """A released ``model.ckpt``, with ``config.yaml`` beside it, as header and networks for ``save_checkpoint``.
+
+    Raises:
+        FileError: where one of the two cannot be read.
+        DataError: on a file that is no such checkpoint, is cut, holds code, or whose keys or configuration do not fit.
+    """
+    config = _config(path.with_name("config.yaml"))
+    content = load_pickle(path, "LiDM")
+    if not isinstance(content, dict) or "state_dict" not in content:
+        given = sorted(map(str, content))[:8] if isinstance(content, dict) else type(content).__name__
+        raise DataError(f"{path} holds {given}", "LiDM's dictionary with state_dict among its keys")
+    weights = {k: v for k, v in state_of(content, "state_dict", path).items() if not k.startswith("loss.")}
+    try:
+        model, data = config["model"]["params"], config["data"]["params"]
+        parts, conditioning = _parts(model, data["dataset"], data.get("aug") or {}, path)
+        header = Header(
+            networks=parts,
+            sensor=_sensor(data),
+            normalisation=_normalisation(data["dataset"]),
+            channels=("range",),
+            time_grid=uniform_grid(STEPS if VELOCITY in parts else 1),
+            provenance=_provenance(config, path),
+            conditioning=conditioning,
+        )
+    except DataError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(f"{path}: a configuration that does not fit ({error!r})", "LiDM's own config.yaml") from error
+    return header, convert(weights, parts, str(path))
+
+
+def _config(path: Path) -> dict[str, Any]:
+    try:
+        config = yaml.safe_load(read_text(path))
+    except yaml.YAMLError as error:
+        raise DataError(
+            f"{path} is not YAML ({error})", "the config.yaml that LiDM releases with its weights"
+        ) from error
+    if not isinstance(config, dict):
+        raise DataError(f"{path} holds {type(config).__name__}", "the config.yaml that LiDM releases with its weights")
+    return config
+
+
+def _parts(
+    model: Mapping[str, Any], dataset: Mapping[str, Any], augment: Mapping[str, Any], path: Path
+) -> tuple[dict[str, Part], dict[str, Any]]:
+    """The networks of a configuration, and the options of its condition."""
+    if "ddconfig" in model:
+        return {CODEC: codec_part(model, dataset["size"], path)}, {}
+    codec = codec_part(model["first_stage_config"]["params"], dataset["size"], path)
+    unet = unet_part(model["unet_config"]["params"], path)
+    unet.arguments.update(
+        beta_start=model["linear_start"], beta_end=model["linear_end"], steps=model.get("timesteps", 1000)
+    )
+    parts, condition = {VELOCITY: unet, CODEC: codec}, model.get("cond_stage_config") or {}
+    if not isinstance(condition, dict):  # a word that says that there is none
+        condition = {}
+    kind = condition.get("target", "").rpartition(".")[2]
+    if kind == "SpatialRescaler":
+        channels = condition["params"]["out_channels"]
+        unet.arguments.update(channels=unet.arguments["channels"] - channels, condition_channels=channels)
+        sizes = {"resolution": list(dataset["size"]), "target": unet.arguments["resolution"]}
+        return parts | {ENCODER: Part("semantic_map", sizes | {"channels": channels})}, {"semantic": {"dropout": 0.0}}
+    if kind == "FrozenClipMultiImageEmbedder":
+        given = condition["params"]
+        arguments = {"views": given["split_per_view"], "channels": given.get("out_dim", 512)}
+        options = {"dropout": 0.0, "view_dropout": augment.get("camera_drop", 0.0), "image": list(CAMERA_SIZE)}
+        return parts | {ENCODER: Part("clip_views", arguments)}, {"camera": options}
+    if kind:
+        raise DataError(f"{path}: a condition by {kind}", "label maps (SpatialRescaler) or camera images, or none")
+    return parts, {}
+
+
+def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> Part:
+    """The autoencoder of the peer's configuration, for images of ``size`` rows and columns."""
+    inner = params["ddconfig"]
+    wanted = {"double_z": False, "attn_levels": [], "z_channels": params["embed_dim"], "out_ch": inner["in_channels"]}
+    odd = {key: inner.get(key) for key, value in wanted.items() if inner.get(key) != value}
+    if odd or params.get("use_mask") or params.get("lib_name") != "lidm":
+        raise DataError(f"{path}: an autoencoder with {odd or dict(params)}", "one of LiDM's published configurations")
+    return Part("vqvae", {
+        "resolution": list(size), "channels": inner["in_channels"], "latent_channels": params["embed_dim"],
+        "codes": params["n_embed"], "width": inner["ch"], "multipliers": list(inner["ch_mult"]),
+        "strides": [list(s) for s in inner["strides"]], "blocks": inner["num_res_blocks"],
+    })  # fmt: skip
+
+
+def unet_part(params: Mapping[str, Any], path: Path | str) -> Part:
+    """The U-Net of the peer's configuration; ``channels`` counts those of a condition beside the state."""
+    levels = [1 << i for i in range(len(params["channel_mult"]))]
+    if params.get("lib_name") != "lidm" or not set(params["attention_resolutions"]) <= set(levels):
+        raise DataError(f"{path}: a U-Net with {dict(params)}", "one of LiDM's published configurations")
+    return Part("diffusion_unet", {
+        "resolution": list(params["image_size"]), "channels": params["in_channels"],
+        "context_channels": params.get("context_dim") or 0, "width": params["model_channels"],
+        "multipliers": list(params["channel_mult"]), "blocks": params["num_res_blocks"],
+        "attention": [i for i, d in enumerate(levels) if d in params["attention_resolutions"]],
+        "head_channels": params["num_head_channels"], "position": False,
+    })  # fmt: skip
+
+
+def _normalisation(dataset: Mapping[str, Any]) -> Normalisation:
+    low, high = dataset["depth_range"]
+    scale = float(dataset["depth_scale"])
+    if dataset["log_scale"]:
+        return Normalisation("log", low, high, scale, OFFSET)
+    return Normalisation("linear", low, high, scale)
+
+
+def _sensor(data: Mapping[str, Any]) -> Sensor:
+    """The HDL-64E of the data set, within the range limits of the training."""
+    dataset = data["dataset"]
+    sensor = presets()["hdl64e_kitti" if _semantic_kitti(data) else "hdl64e_kitti360"]
+    low, high = dataset["depth_range"]
+    sensor = replace(sensor, range_min=float(low), range_max=float(high))
+    (rows, columns), (up, down) = dataset["size"], dataset["fov"]
+    if (rows, columns, up, down) == (*sensor.shape, sensor.up, sensor.down):
+        return sensor
+    return Sensor("lidm", columns, float(low), float(high), rows=rows, fov_up=float(up), fov_down=float(down))
+
+
+def _semantic_kitti(data: Mapping[str, Any]) -> bool:
+    return "SemanticKITTI" in data["train"]["target"]
+
+
+def _provenance(config: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    data = config["data"]["params"]
+    return {
+        "data": "SemanticKITTI" if _semantic_kitti(data) else "KITTI-360",
+        "data_licence": "CC BY-NC-SA 3.0",
+        "split": "lidm/train",
+        "licence": "as LiDM's repository: MIT",
+        "source": "https://github.com/hancyran/LiDAR-Diffusion",
+        "file": path.name,
+        "file_sha256": sha256(path),
+        "recipe": config["model"],
+    }
+
+
+def convert(
+    weights: Mapping[str, Tensor], parts: Mapping[str, Part], what: str = "LiDM's weights"
+) -> dict[str, nn.Module]:
+    """LiDM's state dict as networks of ours.
+
+    Args:
+        weights: by the peer's names, with the prefixes of a diffusion model where there is one.
+        parts: the networks that they belong to.
+        what: to name in an error.
+
+    Raises:
+        DataError: on missing or unexpected keys, other shapes, or another schedule than the part's.
+    """
+    weights, nested = dict(weights), set(parts) != {CODEC}
+    if VELOCITY in parts:
+        _check_schedule(weights, parts[VELOCITY].arguments, what)
+        weights = _averaged(weights)
+    sources = {name: peer_names(name, part, nested) for name, part in parts.items()}
+    known = {theirs for names in sources.values() for some in names.values() for theirs in some}
+    missing, unexpected = sorted(known - set(weights)), sorted(k for k in set(weights) - known if not _frozen(k))
+    if missing or unexpected:
+        raise DataError(f"{what}: missing keys {missing}, unexpected keys {unexpected}", "the keys of LiDM's networks")
+    networks = {}
+    for name, part in parts.items():
+        state = _statistics(part) if name == CODEC else {}
+        for ours, theirs in sources[name].items():
+            tensor = torch.cat([weights[t] for t in theirs]) if len(theirs) > 1 else weights[theirs[0]]
+            state[ours] = _arranged(ours, tensor, part)
+        networks[name] = assemble(*part, state, f"{what}: {name}")
+    return networks
+
+
+def _statistics(part: Part) -> dict[str, Tensor]:
+    """Of latents that are taken as they are."""
+    size = part.arguments["latent_channels"]
+    return {
+        "shift": torch.zeros(size),
+        "scale": torch.ones(size),
+        "codebook.counts": torch.zeros(0),
+        "codebook.sums": torch.zeros(0, size),
+    }
+
+
+def _frozen(key: str) -> bool:
+    return key.startswith(f"{COND_STAGE}model.")
+
+
+def _averaged(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The weights without schedule, with the averaged U-Net in the place of the last one."""
+    plain = {k: v for k, v in weights.items() if k not in _SCHEDULE and not k.startswith(UNET_EMA)}
+    average = {k: v for k, v in weights.items() if k.startswith(UNET_EMA) and k not in _COUNTERS}
+    if not average:
+        return plain
+    names = {k: UNET_EMA + k.removeprefix("model.").replace(".", "") for k in plain if k.startswith(UNET)}
+    taken = {k: average.pop(name) for k, name in names.items() if name in average}
+    return {k: v for k, v in plain.items() if k not in names} | taken | average
+
+
+_COUNTERS = (f"{UNET_EMA}decay", f"{UNET_EMA}num_updates")
+_SCHEDULE = (
+    "logvar betas alphas_cumprod alphas_cumprod_prev sqrt_alphas_cumprod sqrt_one_minus_alphas_cumprod "
+    "log_one_minus_alphas_cumprod sqrt_recip_alphas_cumprod sqrt_recipm1_alphas_cumprod posterior_variance "
+    "posterior_log_variance_clipped posterior_mean_coef1 posterior_mean_coef2 scale_factor"
+).split()
+
+
+def _check_schedule(weights: Mapping[str, Tensor], arguments: Mapping[str, Any], what: str) -> None:
+    if "scale_factor" in weights and float(weights["scale_factor"]) != 1:
+        raise DataError(f"{what}: latents scaled by {float(weights['scale_factor'])}", "1, as LiDM has them")
+    if (signal := weights.get("alphas_cumprod")) is None:
+        return
+    times = schedule_times(arguments["beta_start"], arguments["beta_end"], arguments["steps"])
+    signal = signal.double()
+    held = (1 - signal).sqrt() / (signal.sqrt() + (1 - signal).sqrt())
+    if held.shape != times.shape or not torch.allclose(held, times, atol=1e-4):
+        raise DataError(
+            f"{what}: another schedule of noise than its config.yaml", "linear_start, linear_end, timesteps"
+        )
+
+
+def _arranged(ours: str, tensor: Tensor, part: Part) -> Tensor:
+    """A peer's tensor in our order of dimensions."""
+    if part.architecture == "semantic_map":  # their unlabelled 0, 1..19 are our 0..18 and then unlabelled
+        return tensor[:, [*range(1, len(NAMES) + 1), 0]]
+    if ours == "view_embedding":
+        return tensor[0]
+    if part.architecture == "diffusion_unet" and ".attention.qkv." in ours and not part.arguments["context_channels"]:
+        # Heads stand outside there: query, key and value of the first head, then of the next.
+        width = part.arguments["head_channels"]
+        tensor = tensor.reshape(-1, 3, width, *tensor.shape[1:]).transpose(0, 1).reshape(tensor.shape)
+    linear = (".qkv.", ".out.", ".enter.", ".leave.")
+    return tensor.flatten(1) if tensor.ndim > 2 and any(name in ours for name in linear) else tensor

@@ -1,0 +1,237 @@
+"""Range images to tensors in [-1, 1] and back, in the scales that the peers' networks were trained on.
+
+encode and decode are exact inverses up to float32 rounding for every range inside the open interval
+(range_min, range_max); everything outside decodes to 0 = no return.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry.sensor import Sensor
+
+LABEL_BITS = 5
+NO_LABEL = len(NAMES)
+"""Code of a cell without a label, after the 19 classes."""
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """How a range in metres becomes a value in [-1, 1].
+
+    Args:
+        kind: "log": 2 log2(d + offset) / scale - 1; "linear": 2 d / scale - 1;
+            "inverse": 2 range_min / d - 1.
+        range_min: metres, exclusive.
+        range_max: metres, exclusive.
+        scale: the divisor; by default the one that takes range_max to 1.
+        offset: added before the logarithm.
+
+    Raises:
+        ConfigError: on an unknown kind or limits that are not 0 <= range_min < range_max.
+    """
+
+    kind: Literal["log", "linear", "inverse"]
+    range_min: float
+    range_max: float
+    scale: float | None = None
+    offset: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("log", "linear", "inverse"):
+            raise ConfigError(f"normalisation {self.kind!r}", "log, linear or inverse")
+        if not 0 <= self.range_min < self.range_max:
+            raise ConfigError(f"range limits {self.range_min}, {self.range_max} m", "0 <= range_min < range_max")
+
+    @property
+    def divisor(self) -> float:
+        """The ``scale`` in force."""
+        if self.scale is not None:
+            return self.scale
+        return float(np.log2(self.range_max + self.offset)) if self.kind == "log" else self.range_max
+
+    def inside(self, distance: torch.Tensor) -> torch.Tensor:
+        """Where a range (any shape, metres) counts as a return."""
+        return (distance > self.range_min) & (distance < self.range_max)
+
+    def encode(self, distance: torch.Tensor) -> torch.Tensor:
+        """Ranges (any shape, metres, 0 = no return) to [-1, 1]; no return lies at -1."""
+        inside = self.inside(distance)
+        if self.kind == "inverse":
+            unit = torch.where(inside, self.range_min / torch.where(inside, distance, 1.0), 0.0)
+        else:
+            distance = torch.where(inside, distance, 0.0)
+            unit = (torch.log2(distance + self.offset) if self.kind == "log" else distance) / self.divisor
+        return (2 * unit - 1).clamp(-1, 1)
+
+    def decode(self, x: torch.Tensor) -> torch.Tensor:
+        """Values (any shape) to ranges in metres, 0 = no return; values beyond [-1, 1] are clamped."""
+        unit = ((x + 1) / 2).clamp(0, 1)
+        if self.kind == "log":
+            distance = torch.exp2(unit * self.divisor) - self.offset
+        else:
+            distance = unit * self.divisor if self.kind == "linear" else self.range_min / unit
+        return torch.where(self.inside(distance), distance, 0.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as a checkpoint's header holds them; ``Normalisation(**values)`` is the inverse."""
+        return asdict(self)
+
+
+NORMALISATIONS = {
+    "r2flow": Normalisation("log", 1.45, 80.0),
+    "r2flow_inverse": Normalisation("inverse", 1.45, 80.0),
+    "r2flow_metric": Normalisation("linear", 1.45, 80.0),
+    "lidm_log": Normalisation("log", 1.0, 56.0, scale=5.84, offset=1.0001),
+    "lidm_linear": Normalisation("linear", 1.0, 56.0),
+}
+"""The peers' scales by name."""
+
+
+def encode_reflectance(reflectance: torch.Tensor) -> torch.Tensor:
+    """Reflectance in [0, 1] (any shape) to [-1, 1]."""
+    return 2 * reflectance - 1
+
+
+def decode_reflectance(x: torch.Tensor) -> torch.Tensor:
+    """Values (any shape) to reflectance in [0, 1]; values beyond [-1, 1] are clamped."""
+    return ((x + 1) / 2).clamp(0, 1)
+
+
+def encode_labels(label: torch.Tensor) -> torch.Tensor:
+    """Labels as analog bits (Chen et al. 2023, "Analog Bits"): 5 channels of -1 and 1, highest bit first.
+
+    Args:
+        label: (B, H, W) uint8 train ids 0..18, 255 = ignore, which becomes code 19.
+
+    Returns:
+        (B, 5, H, W) float32.
+
+    Raises:
+        DataError: on another id.
+    """
+    code = torch.where(label == IGNORE, NO_LABEL, label.long())
+    if bool((code > NO_LABEL).any()):
+        raise DataError(f"train ids {sorted(set(label[code > NO_LABEL].tolist()))[:8]}", "0..18, or 255 = ignore")
+    return torch.stack([(code >> b & 1) * 2.0 - 1.0 for b in reversed(range(LABEL_BITS))], 1)
+
+
+def decode_labels(bits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The label whose code is nearest to the bits, and how near.
+
+    Args:
+        bits: (B, 5, H, W) float.
+
+    Returns:
+        (B, H, W) uint8 train ids, 255 = ignore, and (B, H, W) float32 confidence: 1 on the code, falling
+        with the distance (in the maximum norm) to 0 where a bit is no nearer to its value than to the other.
+    """
+    codes = torch.arange(NO_LABEL + 1, device=bits.device, dtype=torch.uint8)
+    codes = torch.where(codes == NO_LABEL, IGNORE, codes)
+    corners = encode_labels(codes[None, None].to(torch.uint8))[0, :, 0].to(bits.dtype)  # (5, 20)
+    # |bits - corner|^2 without its constant part: the nearest corner is the one with the largest product.
+    nearest = torch.einsum("bchw,ck->bkhw", bits, corners).argmax(1)
+    gap = (bits - corners[:, nearest].movedim(0, 1)).abs().amax(1)
+    return codes[nearest].to(torch.uint8), (1 - gap).clamp(0, 1).float()
+
+
+CHANNELS = {"range": 1, "reflectance": 1, "label": LABEL_BITS}
+"""What a network's tensor can hold: {channel of a range image: channels of the tensor}."""
+
+
+@dataclass(frozen=True)
+class TensorFormat:
+    """Which channels of a range image stand, one after the other, in a network's tensor, and in which scale.
+
+    Args:
+        channels: names of ``CHANNELS``, in the tensor's order; "range" is one of them.
+        normalisation: of the range.
+
+    Raises:
+        ConfigError: on an unknown or repeated channel, or where "range" is missing.
+    """
+
+    channels: tuple[str, ...]
+    normalisation: Normalisation
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "channels", tuple(self.channels))
+        unknown = [name for name in self.channels if name not in CHANNELS]
+        if unknown or "range" not in self.channels or len(set(self.channels)) < len(self.channels):
+            raise ConfigError(f"channels {self.channels}", f"range and some of {tuple(CHANNELS)}, each once")
+
+    @property
+    def size(self) -> int:
+        """C, channels of the tensor."""
+        return sum(CHANNELS[name] for name in self.channels)
+
+    def encode(self, fields: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Fields of range images to a tensor.
+
+        Args:
+            fields: (B, H, W) each: "range" float32 metres, 0 = no return; "reflectance" float32 in [0, 1];
+                "label" uint8 train ids, 255 = ignore; more than ``channels`` do no harm.
+
+        Returns:
+            (B, C, H, W) float32 in [-1, 1].
+
+        Raises:
+            ConfigError: where a channel is missing.
+            DataError: on a label that is no train id.
+        """
+        if missing := [name for name in self.channels if name not in fields]:
+            raise ConfigError(f"range images without {missing}", f"all of {self.channels}")
+        encoders = {
+            "range": lambda d: self.normalisation.encode(d)[:, None],
+            "reflectance": lambda r: encode_reflectance(r)[:, None],
+            "label": encode_labels,
+        }
+        return torch.cat([encoders[name](fields[name]) for name in self.channels], 1)
+
+    def decode(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        """A tensor to the fields of range images; without a return, a cell has no reflectance, label or confidence.
+
+        Args:
+            x: (B, C, H, W) floating.
+
+        Returns:
+            (B, H, W) each, as for ``encode``; with "label" also "confidence" float32 in [0, 1].
+
+        Raises:
+            DataError: on another number of channels, NaN or infinity.
+        """
+        if x.ndim != 4 or x.shape[1] != self.size:
+            raise DataError(f"a tensor of shape {tuple(x.shape)}", f"(B, {self.size}, H, W) for {self.channels}")
+        if not bool(x.isfinite().all()):
+            raise DataError(f"a tensor for {self.channels} with NaN or infinity", "finite values")
+        part = dict(
+            zip(self.channels, torch.split(x.float(), [CHANNELS[name] for name in self.channels], 1), strict=True)
+        )
+        fields = {"range": self.normalisation.decode(part["range"][:, 0])}
+        empty = fields["range"] == 0
+        if "reflectance" in part:
+            fields["reflectance"] = decode_reflectance(part["reflectance"][:, 0]).masked_fill_(empty, 0)
+        if "label" in part:
+            label, confidence = decode_labels(part["label"])
+            fields["label"] = label.masked_fill_(empty, IGNORE)
+            fields["confidence"] = confidence.masked_fill_(empty, 0)
+        return fields
+
+    def from_images(self, images: Sequence[RangeImage]) -> torch.Tensor:
+        """(B, C, H, W) of B range images of one shape; see ``encode``."""
+        values: list[dict[str, Any]] = [{**image.channels, "range": image.range} for image in images]
+        if missing := [name for name in self.channels if any(name not in v for v in values)]:
+            raise ConfigError(f"range images without {missing}", f"all of {self.channels}")
+        return self.encode({n: torch.from_numpy(np.stack([v[n] for v in values])) for n in self.channels})
+
+    def to_images(self, x: torch.Tensor, sensor: Sensor) -> list[RangeImage]:
+        """B range images of a tensor (B, C, H, W) on the sensor's grid; see ``decode``."""
+        fields = {name: values.cpu().numpy() for name, values in self.decode(x).items()}
+        distance = fields.pop("range")
+        return [RangeImage(d, sensor, {n: v[i] for n, v in fields.items()}) for i, d in enumerate(distance)]

@@ -1,0 +1,20 @@
+"""Points to range image and back (geometry only: no networks, no files)."""
+
+from lidar_synth.geometry.projection.batch import BatchImage, project_batch, unproject_batch
+from lidar_synth.geometry.projection.fill import fill_points
+from lidar_synth.geometry.projection.spherical import Cells, carry, locate, project, unproject
+from lidar_synth.geometry.projection.unfold import ring_numbers, unfold
+
+__all__ = [
+    "BatchImage",
+    "Cells",
+    "carry",
+    "fill_points",
+    "locate",
+    "project",
+    "project_batch",
+    "ring_numbers",
+    "unfold",
+    "unproject",
+    "unproject_batch",
+]

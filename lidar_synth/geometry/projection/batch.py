@@ -1,0 +1,130 @@
+"""The same projection for batches of torch tensors on any device, cell for cell and bit for bit."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.projection.kernels import ASIN, ATAN, PI, PI_2, PI_4, TAN_PI_8, Grid, grid_of
+from lidar_synth.geometry.sensor import Rays, Sensor
+
+_NONE = torch.iinfo(torch.int64).max
+
+
+class BatchImage(NamedTuple):
+    """A batch of range images.
+
+    Args:
+        range: (B, H, W) float32 metres, 0 = no return.
+        channels: (B, C, H, W) what was carried, 0 where there is no return.
+        point: (B, H, W) int64 row of ``points`` that a cell shows, -1 = none.
+    """
+
+    range: torch.Tensor
+    channels: torch.Tensor
+    point: torch.Tensor
+
+
+def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor]:
+    """Cell (N,) int64 and range (N,) float32 (inf outside the limits) of points (N, 3)."""
+    x, y, z = points.unbind(-1)
+    r = torch_sqrt(x * x + y * y + z * z)
+    seen = (r >= float(grid.range_min)) & (r <= float(grid.range_max)) & (r > 0)
+    elevation = torch_asin(z / torch.where(r > 0, r, 1.0))
+    if len(grid.edges):
+        inner = torch.from_numpy(grid.edges[1:-1].copy()).to(points.device)
+        row = torch.searchsorted(-inner, -elevation.contiguous(), right=True)
+    else:
+        up, down = torch.tensor([grid.up, grid.down], device=points.device).unbind()
+        row = ((1 - (elevation - down) / (up - down)) * grid.rows).clamp(0, grid.rows - 1).long()
+    azimuth = -torch_atan2(y, x)
+    column = ((azimuth / torch.pi + 1) * 0.5 * grid.columns).long() % grid.columns
+    return torch.where(seen, row * grid.columns + column, 0), torch.where(seen, r, torch.inf)
+
+
+def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -> BatchImage:
+    """Spherical projection of a batch of clouds; equal to ``project`` of each.
+
+    Args:
+        points: (N, 3 + C) float32 x, y, z in metres, then C values to carry, all clouds one after another.
+        offsets: (B + 1,) int64, cloud b is ``points[offsets[b]:offsets[b + 1]]``.
+        sensor: whose grid.
+
+    Raises:
+        DataError: on another dtype or shape, or offsets that do not cover the points.
+    """
+    if points.dtype != torch.float32 or points.ndim != 2 or points.shape[1] < 3:
+        raise DataError(f"points {tuple(points.shape)} {points.dtype}", "(N, 3 + C) float32: x, y, z in metres, ...")
+    if int(offsets[0]) != 0 or int(offsets[-1]) != len(points) or bool((offsets.diff() < 0).any()):
+        raise DataError(f"offsets {offsets.tolist()} for {len(points)} points", "rising from 0 to the number of points")
+    (height, width), batch = sensor.shape, len(offsets) - 1
+    cell, distance = _cells(points[:, :3], grid_of(sensor))
+    cloud = torch.repeat_interleave(torch.arange(batch, device=points.device), offsets.diff().to(points.device))
+    # Positive floats order like their bits: one integer minimum finds range and point, the first of equals.
+    key = distance.view(torch.int32).long() << 32 | torch.arange(len(points), device=points.device)
+    best = torch.full((batch * height * width,), _NONE, device=points.device)
+    seen = distance < torch.inf
+    best.scatter_reduce_(0, (cloud * (height * width) + cell)[seen], key[seen], "amin")
+    hit = best < _NONE
+    point = torch.where(hit, best & 0xFFFFFFFF, -1).view(batch, height, width)
+    shown = torch.where(hit.view_as(point)[..., None], points[point.clamp(min=0)][..., 3:], 0.0)
+    distances = torch.where(hit.view_as(point), distance[point.clamp(min=0)], 0.0)
+    return BatchImage(distances, shown.movedim(-1, 1), point)
+
+
+def unproject_batch(image: torch.Tensor, sensor: Sensor, rays: Rays = "centre") -> torch.Tensor:
+    """Points of every cell of a batch of range images.
+
+    Args:
+        image: (B, H, W) float32 metres, 0 = no return.
+        sensor: whose grid.
+        rays: through the cells' centres or corners.
+
+    Returns:
+        (B, 3, H, W) float32 metres; the origin where there is no return.
+
+    Raises:
+        DataError: on a shape that is not the sensor's.
+    """
+    if tuple(image.shape[1:]) != sensor.shape:
+        raise DataError(f"range images {tuple(image.shape)}", f"(B, {sensor.shape[0]}, {sensor.shape[1]})")
+    directions = torch.tensor(sensor.ray_directions(rays), device=image.device).movedim(-1, 0)
+    return image[:, None] * directions
+
+
+def torch_atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """``atan2`` on float32 tensors of any one shape, bit for bit."""
+    ax, ay = x.abs(), y.abs()
+    high, low = torch.maximum(ax, ay), torch.minimum(ax, ay)
+    q = low / torch.where(high > 0, high, 1.0)
+    upper = q > float(TAN_PI_8)
+    u = torch.where(upper, (q - 1) / (q + 1), q)
+    a = _polynomial(u * u, ATAN) * (u * u) * u + u
+    a = torch.where(upper, a + float(PI_4), a)
+    a = torch.where(ay > ax, float(PI_2) - a, a)
+    a = torch.where(x < 0, float(PI) - a, a)
+    return torch.where(y < 0, -a, a)
+
+
+def torch_sqrt(x: torch.Tensor) -> torch.Tensor:
+    """Square root rounded to the nearest float32, which torch's own on a CPU (MKL's) does not promise."""
+    return x.double().sqrt().float()
+
+
+def torch_asin(s: torch.Tensor) -> torch.Tensor:
+    """``asin`` on a float32 tensor of any shape, bit for bit."""
+    a = s.abs()
+    outer = a > 0.5
+    z = torch.where(outer, 0.5 * (1 - a), a * a)
+    u = torch.where(outer, torch_sqrt(z), a)
+    p = _polynomial(z, ASIN) * z * u + u
+    a = torch.where(outer, float(PI_2) - 2 * p, p)
+    return torch.where(s < 0, -a, a)
+
+
+def _polynomial(z: torch.Tensor, coefficients: tuple[np.float32, ...]) -> torch.Tensor:
+    value = torch.full_like(z, float(coefficients[0]))
+    for c in coefficients[1:]:
+        value = value * z + float(c)
+    return value

@@ -1,0 +1,85 @@
+"""From cells back to points: what a range-view network said of each cell, for every point of the scan."""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.projection.spherical import Cells
+
+_NEIGHBOURS = 32  # at most this many of the nearest vote
+
+
+@numba.njit(cache=True)
+def _vote(cell, distance, point, image, labels, half, k, cutoff, out):  # type: ignore[no-untyped-def]
+    rows, columns = image.shape
+    gaps, near = np.empty(_NEIGHBOURS, np.float32), np.empty(_NEIGHBOURS, np.int64)
+    votes = np.empty(256, np.int64)
+    for i in range(len(cell)):
+        if cell[i] < 0:
+            out[i] = IGNORE
+            continue
+        row, column = cell[i] // columns, cell[i] % columns
+        if point[row, column] == i:
+            out[i] = labels[row, column]
+            continue
+        found = 0
+        for r in range(max(row - half, 0), min(row + half + 1, rows)):
+            for offset in range(-half, half + 1):
+                c = (column + offset) % columns
+                if image[r, c] == 0:
+                    continue
+                gap = abs(image[r, c] - distance[i])
+                if found == k and gap >= gaps[k - 1]:
+                    continue
+                j = min(found, k - 1)
+                while j > 0 and gaps[j - 1] > gap:
+                    gaps[j], near[j] = gaps[j - 1], near[j - 1]
+                    j -= 1
+                gaps[j], near[j] = gap, labels[r, c]
+                found = min(found + 1, k)
+        votes[:] = 0
+        winner = near[0]
+        for j in range(found):
+            if gaps[j] <= cutoff:
+                votes[near[j]] += 1
+                if votes[near[j]] > votes[winner]:
+                    winner = near[j]
+        out[i] = winner
+
+
+def fill_points(
+    labels: NDArray[np.uint8],
+    image: NDArray[np.float32],
+    cells: Cells,
+    k: int = 5,
+    window: int = 5,
+    cutoff: float = 1.0,
+) -> NDArray[np.uint8]:
+    """Labels per point from labels per cell; a point that its cell does not show asks its neighbours.
+
+    A hidden point takes the majority among the k returns of the window nearest to it in range, those farther
+    than ``cutoff`` left out; if that leaves none, the label of the nearest (after RangeNet++, Milioto et al. 2019).
+
+    Args:
+        labels: (H, W) uint8 per cell.
+        image: (H, W) float32 range in metres, 0 = no return.
+        cells: where the scan's N points fall, from ``locate``.
+        k: how many vote, at most 32.
+        window: side of the window in cells, odd; columns wrap.
+        cutoff: metres.
+
+    Returns:
+        (N,) uint8; 255 = ignore for a point outside the sensor's range limits.
+
+    Raises:
+        DataError: on shapes that do not fit, or a k or window that cannot be served.
+    """
+    if not labels.shape == image.shape == cells.point.shape:
+        raise DataError(f"labels {labels.shape}, range {image.shape}, cells {cells.point.shape}", "one shape (H, W)")
+    if not (1 <= k <= _NEIGHBOURS and window >= 1 and window % 2):
+        raise DataError(f"k = {k}, window = {window}", f"1 <= k <= {_NEIGHBOURS} and an odd window")
+    out = np.empty(len(cells.cell), np.uint8)
+    _vote(cells.cell, cells.range, cells.point, image, labels, window // 2, k, np.float32(cutoff), out)
+    return out

@@ -1,0 +1,225 @@
+"""The owner of arctan2: where a point lies on a sensor's grid, and the loops over points and cells.
+
+elevation = asin(z / r), azimuth = -atan2(y, x), row and column from them as in the paper and the
+public code of R2Flow and LiDM, float32 operation by operation.
+
+The inverse functions are polynomials (Cephes ``atanf``, ``asinf``; error about 3e-7 rad), written
+without branches so that the compiler turns them into vector instructions, and made of nothing but
+IEEE +, -, *, / and sqrt so that numba on a CPU and torch on any device (batch.py) give the same bits.
+
+Everything that is compiled for ``project`` stands in this one file: numba's cache on disk notices a change of the
+file that holds a function, but not of a file whose functions it has inlined.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.geometry.sensor import Sensor
+
+_f = np.float32
+ATAN = tuple(map(_f, (8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1)))
+ASIN = tuple(map(_f, (4.2163199048e-2, 2.4181311049e-2, 4.5470025998e-2, 7.4953002686e-2, 1.6666752422e-1)))
+_A0, _A1, _A2, _A3 = ATAN
+_S0, _S1, _S2, _S3, _S4 = ASIN
+PI, PI_2, PI_4, TAN_PI_8 = _f(np.pi), _f(np.pi / 2), _f(np.pi / 4), _f(np.tan(np.pi / 8))
+_INF = np.float32(np.inf)
+_BLOCK = 1024  # points located at a time: the buffers stay in the first-level cache
+_ZERO, _HALF, _ONE, _TWO = _f(0), _f(0.5), _f(1), _f(2)
+
+
+class Grid(NamedTuple):
+    """A sensor's grid as the kernels take it.
+
+    Args:
+        up, down: edges of the field of view, radians.
+        edges: (H+1,) edges of the rows, highest first, radians; empty where rows are linear.
+        rows, columns: H, W.
+        range_min, range_max: metres, inclusive.
+    """
+
+    up: np.float32
+    down: np.float32
+    edges: NDArray[np.float32]
+    rows: int
+    columns: int
+    range_min: np.float32
+    range_max: np.float32
+
+
+def grid_of(sensor: Sensor) -> Grid:
+    """The grid of a sensor."""
+    up, down = np.radians(_f(sensor.up)), np.radians(_f(sensor.down))
+    edges = sensor.edges if sensor.elevations is not None else np.empty(0, np.float32)
+    return Grid(up, down, edges, *sensor.shape, _f(sensor.range_min), _f(sensor.range_max))
+
+
+@numba.njit(inline="always")
+def atan2(y, x):  # type: ignore[no-untyped-def]  # float32 scalars, compiled
+    """Angle of (x, y) in [-pi, pi], radians, float32."""
+    ax, ay = abs(x), abs(y)
+    high, low = max(ax, ay), min(ax, ay)
+    q = low / (high if high > _ZERO else _ONE)
+    upper = q > TAN_PI_8
+    u = (q - _ONE) / (q + _ONE) if upper else q
+    z = u * u
+    a = (((_A0 * z + _A1) * z + _A2) * z + _A3) * z * u + u
+    a = a + PI_4 if upper else a
+    a = PI_2 - a if ay > ax else a
+    a = PI - a if x < _ZERO else a
+    return -a if y < _ZERO else a
+
+
+@numba.njit(inline="always")
+def asin(s):  # type: ignore[no-untyped-def]  # float32 scalars, compiled
+    """Arc sine of s in [-1, 1], radians, float32."""
+    a = abs(s)
+    outer = a > _HALF
+    z = _HALF * (_ONE - a) if outer else a * a
+    u = np.sqrt(z) if outer else a
+    p = ((((_S0 * z + _S1) * z + _S2) * z + _S3) * z + _S4) * z * u + u
+    a = PI_2 - _TWO * p if outer else p
+    return -a if s < _ZERO else a
+
+
+@numba.njit(inline="always")
+def column_of(azimuth, columns):  # type: ignore[no-untyped-def]
+    """Column of an azimuth (radians, clockwise); +pi wraps to column 0."""
+    column = np.int32((azimuth / PI + _ONE) * _HALF * _f(columns))
+    return np.int32(0) if column >= columns else column
+
+
+@numba.njit(inline="always")
+def row_of(elevation, up, down, rows):  # type: ignore[no-untyped-def]
+    """Row of an elevation (radians) where rows are linear; outside the field of view, the nearest."""
+    row = (_ONE - (elevation - down) / (up - down)) * _f(rows)
+    return np.int32(min(max(row, _ZERO), _f(rows) - _ONE))
+
+
+@numba.njit(inline="always")
+def row_in_table(elevation, edges):  # type: ignore[no-untyped-def]
+    """Row of an elevation (radians) between tabulated edges; outside the field of view, the nearest."""
+    low, high = 1, len(edges) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if elevation <= edges[middle]:
+            low = middle + 1
+        else:
+            high = middle
+    return np.int32(low - 1)
+
+
+@numba.njit(error_model="numpy", cache=True)
+def _locate_block(x, y, z, grid, cell, distance):  # type: ignore[no-untyped-def]
+    """Cells and ranges of one block of points; outside the range limits: cell 0, range inf."""
+    up, down, rows, columns = grid.up, grid.down, np.int32(grid.rows), np.int32(grid.columns)
+    low, high = grid.range_min, grid.range_max
+    for i in range(len(x)):
+        r = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+        seen = (r >= low) & (r <= high) & (r > 0)
+        elevation = asin(z[i] / (r if r > 0 else np.float32(1)))
+        place = row_of(elevation, up, down, rows) * columns + column_of(-atan2(y[i], x[i]), columns)
+        cell[i] = place if seen else np.int32(0)
+        distance[i] = r if seen else _INF
+    if len(grid.edges) > 0:
+        for i in range(len(x)):
+            if distance[i] < _INF:
+                cell[i] = cell[i] % columns + row_in_table(asin(z[i] / distance[i]), grid.edges) * columns
+
+
+@numba.njit(error_model="numpy", cache=True, inline="always")
+def _scatter(cell, distance, start, image, index):  # type: ignore[no-untyped-def]
+    """Lets points start, start + 1, ... into their cells where they are nearer than what is there."""
+    for i in range(len(cell)):
+        c, r = cell[i], distance[i]
+        if r < image[c]:
+            image[c] = r
+            index[c] = start + i
+
+
+@numba.njit(error_model="numpy", cache=True, inline="always")
+def _close(image, index):  # type: ignore[no-untyped-def]
+    """Marks the cells that no point reached."""
+    for c in range(len(image)):
+        if image[c] == _INF:
+            image[c] = 0
+            index[c] = -1
+
+
+@numba.njit(error_model="numpy", cache=True)
+def nearest_points(points, grid, image, index):  # type: ignore[no-untyped-def]
+    """Fills image (H*W,) with the smallest range per cell (0 = none) and index with its point (-1)."""
+    x, y, z = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
+    cell, distance = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
+    image[:] = _INF
+    for start in range(0, len(points), _BLOCK):
+        n = min(_BLOCK, len(points) - start)
+        for i in range(n):
+            x[i], y[i], z[i] = points[start + i, 0], points[start + i, 1], points[start + i, 2]
+        _locate_block(x[:n], y[:n], z[:n], grid, cell, distance)
+        _scatter(cell[:n], distance[:n], start, image, index)
+    _close(image, index)
+
+
+@numba.njit(error_model="numpy", cache=True)
+def nearest_in_cells(cell, distance, image, index):  # type: ignore[no-untyped-def]
+    """``nearest_points`` for points whose cells (-1 = none) are known."""
+    image[:] = _INF
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            _scatter(cell[i : i + 1], distance[i : i + 1], i, image, index)
+    _close(image, index)
+
+
+@numba.njit(error_model="numpy", cache=True)
+def locate_points(points, grid, cell, distance):  # type: ignore[no-untyped-def]
+    """Cell (-1 outside the range limits) and range of every point."""
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    _locate_block(x, y, z, grid, cell, distance)
+    for i in range(len(points)):
+        if distance[i] == _INF:
+            cell[i] = -1
+            distance[i] = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+
+
+@numba.njit(error_model="numpy", cache=True)
+def gather(values, index, empty, out):  # type: ignore[no-untyped-def]
+    for c in range(len(index)):
+        out[c] = values[index[c]] if index[c] >= 0 else empty
+
+
+@numba.njit(error_model="numpy", cache=True)
+def returns_in(image):  # type: ignore[no-untyped-def]
+    """How many cells of image (H*W,) have a return; -1 where a range is negative or not finite."""
+    n, sound = 0, True
+    for c in range(len(image)):
+        n += image[c] > 0
+        sound &= (image[c] >= 0) & (image[c] < _INF)
+    return n if sound else -1
+
+
+# The two loops below write every cell to the next free place and only then ask whether it stays: a branch that nobody
+# can foresee costs more. So ``out`` has room for one more than there are returns.
+
+
+@numba.njit(error_model="numpy", cache=True)
+def along_rays(image, directions, out):  # type: ignore[no-untyped-def]
+    """Points (N + 1, 3), the last of them spare, of the returns in image (H*W,) along directions (H*W, 3)."""
+    n = 0
+    for c in range(len(image)):
+        r = image[c]
+        # All loads before the stores: the compiler has to take ``out`` for a part of the others.
+        x, y, z = r * directions[c, 0], r * directions[c, 1], r * directions[c, 2]
+        out[n, 0], out[n, 1], out[n, 2] = x, y, z
+        n += r > 0
+
+
+@numba.njit(cache=True)
+def pick_returns(image, values, out):  # type: ignore[no-untyped-def]
+    """What values (H*W,) say of the returns in image (H*W,): (N + 1,), the last of them spare."""
+    n = 0
+    for c in range(len(image)):
+        out[n] = values[c]
+        n += image[c] > 0

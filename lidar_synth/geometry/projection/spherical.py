@@ -1,0 +1,152 @@
+"""Points to range image and back, on one CPU core.
+
+Every point goes to the cell of its direction; the nearest one within the sensor's range limits wins, the
+first in the file among equals. A return goes back to the centre of its cell, so that an image survives
+the way to points and back in every cell.
+"""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.projection.kernels import (
+    along_rays,
+    gather,
+    grid_of,
+    locate_points,
+    nearest_in_cells,
+    nearest_points,
+    pick_returns,
+    returns_in,
+)
+from lidar_synth.geometry.scan import POINT_FIELDS, RangeImage, Scan
+from lidar_synth.geometry.sensor import Rays, Sensor
+
+
+class Cells(NamedTuple):
+    """Which cell each point falls in, and which point each cell shows.
+
+    Args:
+        cell: (N,) int32, row * W + column; -1 for a point outside the range limits.
+        range: (N,) float32 metres.
+        point: (H, W) int32, the point that a cell shows; -1 = none.
+    """
+
+    cell: NDArray[np.int32]
+    range: NDArray[np.float32]
+    point: NDArray[np.int32]
+
+
+def locate(points: NDArray[np.float32], sensor: Sensor) -> Cells:
+    """Where points fall on a sensor's grid: the index map from points to cells and back.
+
+    Args:
+        points: (N, 3) or (N, 4) float32, x, y, z first, metres, sensor frame.
+        sensor: whose grid.
+    """
+    points = _checked(points)
+    cell, distance = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
+    locate_points(points, grid_of(sensor), cell, distance)
+    return Cells(cell, distance, nearest_in(cell, distance, sensor)[1])
+
+
+def nearest_in(
+    cell: NDArray[np.int32], distance: NDArray[np.float32], sensor: Sensor
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """(H, W) range and (H, W) point of the nearest of the points in each cell, the first among equals.
+
+    Args:
+        cell: (N,) row * W + column, -1 = none.
+        distance: (N,) metres.
+        sensor: whose grid.
+    """
+    image, index = np.empty(sensor.shape, np.float32), np.empty(sensor.shape, np.int32)
+    nearest_in_cells(cell, distance, image.reshape(-1), index.reshape(-1))
+    return image, index
+
+
+def project(scan: Scan, sensor: Sensor | None = None, channels: Iterable[str] | None = None) -> RangeImage:
+    """The scan as a range image: spherical projection, nearest return (paper, "Representing LiDAR data").
+
+    Returns outside the sensor's range limits are dropped before the projection; directions outside its
+    field of view go to the first or the last row, as lasers that stick out above and below do.
+
+    Args:
+        scan: N points.
+        sensor: whose grid; the scan's own by default.
+        channels: names of the fields to carry; by default all that the scan has.
+
+    Returns:
+        (H, W) range in metres, 0 = no return, with the channels of the nearest points.
+
+    Raises:
+        ConfigError: on a channel that the scan does not have.
+        DataError: on points that are not float32.
+    """
+    sensor = sensor or scan.sensor
+    image, index = np.empty(sensor.shape, np.float32), np.empty(sensor.shape, np.int32)
+    nearest_points(_checked(scan.points), grid_of(sensor), image.reshape(-1), index.reshape(-1))
+    return RangeImage(image, sensor, carry(scan, index, channels))
+
+
+def carry(scan: Scan, index: NDArray[np.int32], channels: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
+    """The fields of a scan on the cells that show its points.
+
+    Args:
+        scan: N points.
+        index: (H, W) point of each cell, -1 = none.
+        channels: names of the fields; by default all that the scan has.
+
+    Returns:
+        {name: (H, W)} with 0 (``label``: 255 = ignore) where there is no return.
+    """
+    fields = scan.fields()
+    names = list(fields) if channels is None else list(channels)
+    if missing := [n for n in names if n not in fields]:
+        raise ConfigError(f"scan {scan.id!r} has no {missing}", f"some of {sorted(fields)}")
+    carried = {}
+    for name in names:
+        carried[name] = np.empty(index.shape, fields[name].dtype)
+        empty = fields[name].dtype.type(IGNORE if name == "label" else 0)
+        gather(fields[name], index.reshape(-1), empty, carried[name].reshape(-1))
+    return carried
+
+
+def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
+    """The returns of a range image as points, row by row.
+
+    Args:
+        image: (H, W) range in metres, 0 = no return.
+        rays: through the cells' centres, or through their corners as the peers do.
+
+    Returns:
+        A scan with one point per return; the image's channels that a scan knows become its fields.
+
+    Raises:
+        DataError: on a range that is negative or not finite.
+    """
+    directions = image.sensor.ray_directions(rays).reshape(-1, 3)
+    flat = np.ascontiguousarray(image.range, np.float32).reshape(len(directions))
+    count = returns_in(flat)
+    if count < 0:
+        raise DataError(f"range image of sensor {image.sensor.name!r} with negative or non-finite range", "metres")
+    points = np.empty((count + 1, 3), np.float32)
+    along_rays(flat, directions, points)
+    fields: dict[str, Any] = {}
+    for name in [n for n in image.channels if n in POINT_FIELDS]:
+        values = np.ascontiguousarray(image.channels[name]).reshape(len(directions))
+        picked = np.empty(count + 1, values.dtype)
+        pick_returns(flat, values, picked)
+        fields[name] = picked[:count]
+    fields.setdefault("reflectance", np.zeros(count, np.float32))
+    return Scan(points[:count], sensor=image.sensor, **fields)
+
+
+def _checked(points: NDArray[Any]) -> NDArray[np.float32]:
+    if points.dtype != np.float32 or points.ndim != 2 or points.shape[1] < 3:
+        raise DataError(f"points of shape {points.shape}, {points.dtype}", "(N, 3) or (N, 4) float32: x, y, z, metres")
+    return points

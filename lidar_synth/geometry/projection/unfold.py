@@ -1,0 +1,95 @@
+"""Scan unfolding: rows from the order in which the laser rings were recorded, not from elevation.
+
+KITTI and KITTI-360 store a scan ring by ring from the top, each ring counter-clockwise from straight
+ahead. A ring ends where the quadrant falls from the fourth back to the first. Elevation would merge rings
+where the lasers are closer than the rows (HDL-64E's upper half) and leave rows empty where they are not.
+"""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.projection.spherical import carry, locate, nearest_in
+from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.sensor import Sensor
+
+Anchor = Literal["elevation", "last"]
+"""How rings find their rows: each on the beam of its elevation, or, as the public code of R2Flow does,
+counted from the last ring up (which displaces a scan whose lower rings are cut off)."""
+
+
+def ring_numbers(points: NDArray[np.float32]) -> NDArray[np.int16]:
+    """(N,) ring of each point, 0 = the first in the file, of a scan in raw ring order.
+
+    Args:
+        points: (N, 3) float32 metres, in the order of the file.
+    """
+    ahead, left = points[:, 0] >= 0, points[:, 1] >= 0
+    starts = np.zeros(len(points), bool)
+    starts[1:] = (ahead[:-1] & ~left[:-1]) & (ahead[1:] & left[1:])
+    return np.cumsum(starts, dtype=np.int16)
+
+
+def _rows_by_elevation(elevations: NDArray[np.float64], beams: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The rows, one per ring and rising, whose beams are nearest to the rings' elevations in sum."""
+    distance = np.abs(elevations[:, None] - beams[None].astype(np.float64))
+    total = np.full((len(elevations) + 1, len(beams) + 1), np.inf)
+    total[0] = 0
+    for ring, to_beam in enumerate(distance):
+        total[ring + 1, 1:] = np.minimum.accumulate(total[ring, :-1] + to_beam)
+    rows = np.empty(len(elevations), np.int64)
+    end = len(beams)
+    for ring in reversed(range(len(elevations))):
+        end = int(np.argmin(total[ring + 1, : end + 1])) - 1  # the first of equals: the row that was taken
+        rows[ring] = end
+    return rows
+
+
+def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation") -> RangeImage:
+    """The scan as a range image with one row per laser: ring by ring, nearest return in a cell.
+
+    Args:
+        scan: N points in raw ring order, or in any order with ``scan.ring`` known.
+        sensor: whose lasers and columns; the scan's own by default.
+        anchor: how a ring finds its row, where ``scan.ring`` does not tell it.
+
+    Returns:
+        An image on ``sensor.by_beams()``, whose rays point where the lasers do.
+
+    Raises:
+        DataError: on more rings than the sensor has lasers: the scan is not in ring order.
+    """
+    lasers = (sensor or scan.sensor).by_beams()
+    height, width = lasers.shape
+    cell, distance, _ = locate(scan.points, lasers)
+    if scan.ring is not None:
+        rows, ring = np.arange(height), scan.ring
+    else:
+        ring = ring_numbers(scan.points)
+        rows = _rows_of_rings(scan, ring, distance, lasers, anchor)
+    if len(scan) and (rows.size > height or ring.min() < 0 or ring.max() >= len(rows)):
+        raise DataError(
+            f"scan {scan.id!r}: {int(ring.max()) + 1} rings found for the {height} lasers of {lasers.name!r}",
+            "points ring by ring, as KITTI stores them",
+            "Use project() for a scan in another order, or set scan.ring.",
+        )
+    cell = np.where(cell < 0, -1, rows[ring] * width + cell % width).astype(np.int32)
+    image, index = nearest_in(cell, distance, lasers)
+    return RangeImage(image, lasers, carry(scan, index))
+
+
+def _rows_of_rings(
+    scan: Scan, ring: NDArray[np.int16], distance: NDArray[np.float32], lasers: Sensor, anchor: Anchor
+) -> NDArray[np.int64]:
+    """The row of each ring; all -1 where there are more rings than rows."""
+    bounds = np.flatnonzero(np.diff(ring)) + 1
+    count = len(bounds) + 1
+    if count > lasers.shape[0]:
+        return np.full(count, -1)
+    if anchor == "last":
+        return np.arange(count) + lasers.shape[0] - count
+    sine = scan.points[:, 2] / np.where(distance > 0, distance, 1)
+    medians = np.arcsin([np.median(s) for s in np.split(sine, bounds)])
+    return _rows_by_elevation(medians, lasers.laser_elevations)

@@ -1,0 +1,215 @@
+"""What travels through the package: a ``Scan`` of points, its ``Boxes``, and the ``RangeImage``.
+
+All of them live in the sensor frame: right-handed, x forward, y left, z up, metres, float32.
+"""
+
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.sensor import Sensor
+
+REAL, SYNTHETIC = 0, 1
+"""Values of ``Scan.domain``."""
+
+
+@dataclass
+class Boxes:
+    """Oriented 3-D boxes of one scan.
+
+    Args:
+        values: (M, 7) float32: x, y, z of the centre of gravity, length, width, height (metres) and
+            yaw (radians, counter-clockwise about +z from +x), in the sensor frame.
+        names: M class names as KITTI spells them (``Car``, ``Van``, ``Truck``, ``Pedestrian``,
+            ``Person_sitting``, ``Cyclist``, ``Tram``, ``Misc``).
+        truncation: (M,) float32 in [0, 1], share of the object outside the image; -1 = not known.
+        occlusion: (M,) int8, KITTI's 0 visible, 1 partly, 2 largely, 3 unknown; -1 = not known.
+        image_box: (M, 4) float32 left, top, right, bottom in pixels; -1 = not known.
+        instance: (M,) int32, the id that a track keeps over frames; -1 = not known.
+        alpha: (M,) float32 radians, the angle under which KITTI's file says the object is seen; -10 = not known.
+        dont_care: (K, 4) float32 image rectangles of KITTI's ``DontCare`` regions, which have no box.
+
+    Raises:
+        DataError: on shapes that do not fit together, non-finite values or sizes that are not positive.
+    """
+
+    values: NDArray[np.float32]
+    names: tuple[str, ...]
+    truncation: NDArray[np.float32] = None  # type: ignore[assignment]  # filled below
+    occlusion: NDArray[np.int8] = None  # type: ignore[assignment]
+    image_box: NDArray[np.float32] = None  # type: ignore[assignment]
+    instance: NDArray[np.int32] = None  # type: ignore[assignment]
+    alpha: NDArray[np.float32] = None  # type: ignore[assignment]
+    dont_care: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 4), np.float32))
+
+    def __post_init__(self) -> None:
+        self.values = np.asarray(self.values, np.float32).reshape(-1, 7)
+        self.names = tuple(self.names)
+        count = len(self.values)
+        for name, shape, dtype, unknown in (
+            ("truncation", (count,), np.float32, -1),
+            ("occlusion", (count,), np.int8, -1),
+            ("image_box", (count, 4), np.float32, -1),
+            ("instance", (count,), np.int32, -1),
+            ("alpha", (count,), np.float32, -10),
+        ):
+            given = getattr(self, name)
+            setattr(self, name, np.full(shape, unknown, dtype) if given is None else np.asarray(given, dtype))
+            if getattr(self, name).shape != shape:
+                raise DataError(f"boxes: {name} has shape {getattr(self, name).shape}", f"{shape}")
+        if len(self.names) != count:
+            raise DataError(f"boxes: {len(self.names)} names for {count} boxes", "one name per box")
+        if not np.isfinite(self.values).all() or (self.values[:, 3:6] <= 0).any():
+            raise DataError("boxes with a non-finite value or a size that is not positive", "metres and radians")
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, keep: Any) -> "Boxes":
+        """The boxes that a mask or an index array selects; ``dont_care`` stays."""
+        keep = np.arange(len(self))[keep].reshape(-1)
+        picked = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name not in ("names", "dont_care")}
+        return replace(self, names=tuple(self.names[i] for i in keep), **picked)
+
+    def corners(self) -> NDArray[np.float32]:
+        """(M, 8, 3) corners: the floor's four counter-clockwise from front left, then the ceiling's."""
+        unit = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
+        unit = np.concatenate([np.c_[unit, np.full(4, -0.5)], np.c_[unit, np.full(4, 0.5)]]).astype(np.float32)
+        local = unit[None] * self.values[:, None, 3:6]
+        c, s = np.cos(self.values[:, 6:7]), np.sin(self.values[:, 6:7])
+        x, y = local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c
+        return (np.stack([x, y, local[..., 2]], -1) + self.values[:, None, :3]).astype(np.float32)
+
+    def contain(self, points: NDArray[np.float32], above_floor: float = 0.0) -> NDArray[np.bool_]:
+        """(M, N) which of the points (N, 3) each box holds, faces included.
+
+        Args:
+            points: metres, in the boxes' frame.
+            above_floor: metres; leave out points less than this above a box's floor (the road).
+        """
+        inside = np.zeros((len(self), len(points)), bool)
+        for i, (x, y, z, length, width, height, yaw) in enumerate(self.values):
+            dx, dy, dz = points[:, 0] - x, points[:, 1] - y, points[:, 2] - z
+            c, s = np.cos(yaw), np.sin(yaw)
+            along, across = dx * c + dy * s, dy * c - dx * s
+            inside[i] = (abs(along) <= length / 2) & (abs(across) <= width / 2) & (dz <= height / 2)
+            inside[i] &= dz >= above_floor - height / 2
+        return inside
+
+
+@dataclass
+class Scan:
+    """One turn of a LiDAR: points in the sensor frame and what is known about each.
+
+    Args:
+        points: (N, 3) float32 x, y, z in metres.
+        reflectance: (N,) float32 in [0, 1].
+        sensor: the sensor that took it, or that it is meant for.
+        label: (N,) uint8 train ids 0..18, 255 = ignore.
+        raw_label: (N,) uint32 as the file holds it (SemanticKITTI: class in the lower 16 bits, instance
+            above), kept so that writing back loses nothing.
+        instance: (N,) int32 instance ids, 0 = none.
+        ring: (N,) int16 ring numbers where the file has them, 0 = highest.
+        confidence: (N,) float32 in [0, 1], trust in ``label``.
+        boxes: objects around, in the same frame.
+        pose: (4, 4) float64, sensor to world, metres.
+        image_path: the camera image taken with the scan.
+        id: a name that is unique in its source.
+        domain: ``REAL`` (0) or ``SYNTHETIC`` (1).
+
+    Raises:
+        DataError: on shapes that do not fit together.
+    """
+
+    points: NDArray[np.float32]
+    reflectance: NDArray[np.float32]
+    sensor: Sensor
+    label: NDArray[np.uint8] | None = None
+    raw_label: NDArray[np.uint32] | None = None
+    instance: NDArray[np.int32] | None = None
+    ring: NDArray[np.int16] | None = None
+    confidence: NDArray[np.float32] | None = None
+    boxes: Boxes | None = None
+    pose: NDArray[np.float64] | None = None
+    image_path: Path | None = None
+    id: str = ""
+    domain: int = REAL
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise DataError(f"scan {self.id!r}: points of shape {self.points.shape}", "(N, 3): x, y, z in metres")
+        for name in POINT_FIELDS:
+            values = getattr(self, name)
+            if values is not None and values.shape != (len(self),):
+                raise DataError(f"scan {self.id!r}: {name} has shape {values.shape}", f"({len(self)},), one per point")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, keep: Any) -> "Scan":
+        """The scan with the points that a mask or an index array selects; all else stays."""
+        picked = {n: getattr(self, n)[keep] for n in POINT_FIELDS if getattr(self, n) is not None}
+        return replace(self, points=self.points[keep], **picked)
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        """What is known per point beside its position: {name: (N,)}."""
+        return {n: getattr(self, n) for n in POINT_FIELDS if getattr(self, n) is not None}
+
+
+POINT_FIELDS = ("reflectance", "label", "raw_label", "instance", "ring", "confidence")
+"""The fields of a ``Scan`` that hold one value per point, and of a ``RangeImage`` per cell."""
+
+
+@dataclass
+class RangeImage:
+    """A scan on the sensor's grid: one return per cell.
+
+    Args:
+        range: (H, W) float32 metres, Euclidean; 0 = no return.
+        sensor: whose rows and columns these are.
+        channels: {name: (H, W)}, what else is carried; the names of ``POINT_FIELDS`` return to a scan's
+            fields. Where there is no return: 0, and 255 (ignore) for ``label``.
+
+    Raises:
+        DataError: on a shape that is not the sensor's.
+    """
+
+    range: NDArray[np.float32]
+    sensor: Sensor
+    channels: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, values in {"range": self.range, **self.channels}.items():
+            if values.shape != self.sensor.shape:
+                raise DataError(
+                    f"range image: {name} has shape {values.shape}",
+                    f"{self.sensor.shape}, the rows and columns of sensor {self.sensor.name!r}",
+                )
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """(H, W) where there is a return."""
+        return self.range > 0
+
+    @property
+    def reflectance(self) -> NDArray[np.float32] | None:
+        """(H, W) float32 in [0, 1], or None."""
+        return self.channels.get("reflectance")
+
+    @property
+    def label(self) -> NDArray[np.uint8] | None:
+        """(H, W) uint8 train ids, 255 = ignore, or None."""
+        return self.channels.get("label")
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Anything that holds scans by index: a dataset on disk, a bank, a list."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Scan: ...

@@ -1,0 +1,224 @@
+"""A LiDAR sensor as data: where its beams point, how many columns a turn has, how far it sees.
+
+Frame and angles (the whole package): right-handed sensor frame, x forward, y left, z up, metres.
+elevation = asin(z / range). azimuth = -atan2(y, x): it grows clockwise seen from above, so that the
+columns of a range image run as one looks around to the right: 0 straight ahead, which is the edge
+between columns W/2-1 and W/2; the seam is behind. Row 0 is the highest beam.
+"""
+
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from lidar_synth.errors import ConfigError, FileError
+
+Rays = Literal["centre", "corner"]
+"""Where in its cell a ray points: the centre (a point returns to its own cell) or, as the public code of
+R2Flow and LiDM has it, the upper left corner."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One sensor. Angles are in degrees here, as in the configuration; every property is in radians.
+
+    Args:
+        name: what to call it.
+        columns: W, cells of a full turn; even, so that straight ahead is an edge.
+        range_min: metres, inclusive; nearer returns are dropped.
+        range_max: metres, inclusive; farther returns are dropped.
+        rows: H, for beams linear in the row; with ``fov_up`` and ``fov_down`` (the outer edges of the
+            first and the last row).
+        elevations: in their place, one elevation per row, highest first; a row's edges lie halfway
+            between the beams.
+        beams: where the lasers' returns from a street really appear, one per row, if the rows only approximate it.
+        heights: metres above the origin at which each laser starts; 0 by default.
+        description: one line for people.
+
+    Raises:
+        ConfigError: on values that no sensor has.
+    """
+
+    name: str
+    columns: int
+    range_min: float
+    range_max: float
+    rows: int | None = None
+    fov_up: float | None = None
+    fov_down: float | None = None
+    elevations: tuple[float, ...] | None = None
+    beams: tuple[float, ...] | None = None
+    heights: tuple[float, ...] | None = None
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        linear = (self.rows, self.fov_up, self.fov_down)
+        if (self.elevations is None) == (None in linear) or (
+            self.elevations is not None and linear != (None, None, None)
+        ):
+            raise self._error(f"rows, fov_up, fov_down = {linear}, elevations = {self.elevations}",
+                              "either all of rows, fov_up and fov_down, or elevations")  # fmt: skip
+        for key in ("elevations", "beams"):
+            table = getattr(self, key)
+            if table is not None:
+                object.__setattr__(self, key, tuple(float(e) for e in table))
+                if not np.all(np.diff(table) < 0) or max(map(abs, table)) >= 90:
+                    raise self._error(f"{key} = {table}", "degrees within +-90, highest first")
+        if self.rows is not None and not (self.rows >= 2 and 90 >= self.up > self.down >= -90):
+            raise self._error(f"{linear}", "at least 2 rows and 90 >= fov_up > fov_down >= -90")
+        if self.beams is not None and len(self.beams) != self.shape[0]:
+            raise self._error(f"{len(self.beams)} beams", f"one per row ({self.shape[0]})")
+        if self.heights is not None:
+            object.__setattr__(self, "heights", tuple(float(h) for h in self.heights))
+            if len(self.heights) != self.shape[0] or not all(abs(h) < 1 for h in self.heights):
+                raise self._error(
+                    f"heights = {self.heights}", f"one per row ({self.shape[0]}), within 1 m of the origin"
+                )
+        if self.columns < 2 or self.columns % 2:
+            raise self._error(f"columns = {self.columns}", "an even number")
+        if not 0 <= self.range_min < self.range_max < np.inf:
+            raise self._error(f"range_min, range_max = {self.range_min}, {self.range_max}",
+                              "0 <= range_min < range_max, metres")  # fmt: skip
+
+    def _error(self, given: str, expected: str) -> ConfigError:
+        return ConfigError(f"sensor {self.name!r}: {given}", expected)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W) of the range image."""
+        return len(self.elevations) if self.elevations is not None else self.rows or 0, self.columns
+
+    @property
+    def up(self) -> float:
+        """Upper edge of row 0, degrees."""
+        return float(self.fov_up) if self.fov_up is not None else float(np.degrees(self.edges[0]))
+
+    @property
+    def down(self) -> float:
+        """Lower edge of the last row, degrees."""
+        return float(self.fov_down) if self.fov_down is not None else float(np.degrees(self.edges[-1]))
+
+    @cached_property
+    def edges(self) -> NDArray[np.float32]:
+        """(H+1,) elevations of the rows' edges, highest first, radians."""
+        if self.elevations is None:
+            fraction = np.arange(self.shape[0] + 1) / self.shape[0]
+            return np.radians(self.up - fraction * (self.up - self.down)).astype(np.float32)
+        beams = np.asarray(self.elevations)
+        between = (beams[1:] + beams[:-1]) / 2
+        outer = 2 * beams[[0, -1]] - between[[0, -1]]
+        edges: NDArray[np.float64] = np.concatenate([outer[:1], between, outer[1:]])
+        return np.radians(edges).astype(np.float32)
+
+    @cached_property
+    def laser_elevations(self) -> NDArray[np.float32]:
+        """(H,) where the lasers point, highest first, radians: ``beams``, or else the rows."""
+        if self.beams is not None:
+            return np.radians(self.beams).astype(np.float32)
+        return self.row_elevations()
+
+    def row_elevations(self, rays: Rays = "centre") -> NDArray[np.float32]:
+        """(H,) elevation of each row, radians."""
+        if rays == "corner":
+            return self.edges[:-1]
+        if self.elevations is not None:
+            return np.radians(self.elevations).astype(np.float32)
+        fraction = (np.arange(self.shape[0]) + 0.5) / self.shape[0]
+        return np.radians(self.up - fraction * (self.up - self.down)).astype(np.float32)
+
+    def column_azimuths(self, rays: Rays = "centre") -> NDArray[np.float32]:
+        """(W,) azimuth of each column in [-pi, pi), radians, growing clockwise."""
+        offset = 0.5 if rays == "centre" else 0.0
+        fraction = (np.arange(self.columns) + offset) / self.columns
+        return ((2 * fraction - 1) * np.pi).astype(np.float32)
+
+    def ray_angles(self, rays: Rays = "centre") -> NDArray[np.float32]:
+        """(2, H, W) elevation and azimuth of every cell, radians."""
+        grid = np.meshgrid(self.row_elevations(rays), self.column_azimuths(rays), indexing="ij")
+        return np.stack(grid)
+
+    def ray_directions(self, rays: Rays = "centre") -> NDArray[np.float32]:
+        """(H, W, 3) unit vectors x, y, z of every cell; read-only, shared between calls."""
+        return _ray_directions(self, rays)
+
+    def by_beams(self) -> "Sensor":
+        """The same sensor with one row per laser where the laser points, for unfolded scans."""
+        if self.beams is None:
+            return self
+        return Sensor(f"{self.name}/beams", self.columns, self.range_min, self.range_max,
+                      elevations=self.beams, description=self.description)  # fmt: skip
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as in the YAML file, without what is unset."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v not in (None, "")}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "Sensor":
+        """The sensor of ``to_dict``'s values.
+
+        Raises:
+            ConfigError: on an unknown or missing key, or a value of the wrong kind.
+        """
+        known = {f.name for f in fields(cls)}
+        if unknown := set(values) - known:
+            raise ConfigError(f"sensor keys {sorted(unknown)}", f"some of {sorted(known)}")
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise ConfigError(f"sensor {values.get('name')!r}: {error}", "numbers, as in sensors.yaml") from error
+
+
+@lru_cache(maxsize=16)
+def _ray_directions(sensor: Sensor, rays: Rays) -> NDArray[np.float32]:
+    elevation, azimuth = sensor.ray_angles(rays).astype(np.float64)
+    rays_xyz = np.stack([np.cos(azimuth) * np.cos(elevation), -np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    directions = np.ascontiguousarray(np.moveaxis(rays_xyz, 0, -1), np.float32)
+    directions.setflags(write=False)
+    return directions
+
+
+def _read_yaml(text: str, where: str) -> dict[str, dict[str, Any]]:
+    try:
+        entries = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{where} is not YAML ({error})") from error
+    if not isinstance(entries, dict) or not all(isinstance(v, dict) for v in entries.values()):
+        raise ConfigError(f"{where} holds {type(entries).__name__}", "a mapping from a sensor's name to its values")
+    return entries
+
+
+@lru_cache(maxsize=1)
+def presets() -> dict[str, Sensor]:
+    """The sensors of ``sensors.yaml`` by name."""
+    entries = _read_yaml(files("lidar_synth.geometry").joinpath("sensors.yaml").read_text(), "sensors.yaml")
+    return {name: Sensor.from_dict({"name": name, **values}) for name, values in entries.items()}
+
+
+def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
+    """A preset by name, a user's YAML file by path (one entry, same keys), or a ``Sensor`` as it is.
+
+    Raises:
+        ConfigError: on an unknown name, or a file without exactly one sensor.
+        FileError: on a path that cannot be read.
+    """
+    if isinstance(sensor, Sensor):
+        return sensor
+    if str(sensor) in presets():
+        return presets()[str(sensor)]
+    path = Path(sensor)
+    if path.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"sensor {str(sensor)!r}", f"one of {', '.join(presets())}, or a .yaml file")
+    try:
+        entries = _read_yaml(path.read_text(), str(path))
+    except OSError as error:
+        raise FileError(f"sensor file {path} cannot be read ({error.strerror})") from error
+    if len(entries) != 1:
+        raise ConfigError(f"{path} holds {len(entries)} sensors", "exactly one entry: its name, then its values")
+    [(name, values)] = entries.items()
+    return Sensor.from_dict({"name": str(name), **values})

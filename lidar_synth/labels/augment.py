@@ -1,0 +1,153 @@
+"""Augmentations of a scan: points, labels and boxes together.
+
+An augmentation is ``(scan, rng) -> scan``: a function of its two arguments alone, which never changes the scan that it
+is given. Options are bound by ``functools.partial``, several steps by ``compose``::
+
+    fresh = compose([partial(yaw, limit=45), flip_y, scale, beam_drop])
+    scan = fresh(scan, keyed_rng(seed, epoch, position))
+
+What moves points against the world (``yaw``, flips, ``scale``) moves boxes alike; such a scan has no pose and no camera
+image any more.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.projection import locate
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.labels.boxes import moved, turned, turned_points
+from lidar_synth.labels.own import checked_share
+
+Augmentation = Callable[[Scan, np.random.Generator], Scan]
+
+
+def compose(steps: Sequence[Augmentation]) -> Augmentation:
+    """All steps in this order, with one generator."""
+    return partial(_each, tuple(steps))
+
+
+def _each(steps: tuple[Augmentation, ...], scan: Scan, rng: np.random.Generator) -> Scan:
+    for step in steps:
+        scan = step(scan, rng)
+    return scan
+
+
+def yaw(scan: Scan, rng: np.random.Generator, limit: float = 180.0) -> Scan:
+    """Turns the scan about the sensor by up to ``limit`` degrees to either side."""
+    if not 0 <= limit <= 180:
+        raise ConfigError(f"limit={limit}", "0..180 degrees")
+    return rotated(scan, float(np.radians(rng.uniform(-limit, limit))))
+
+
+def flip_x(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
+    """Swaps front and back, with a chance."""
+    return mirrored(scan, "x") if rng.random() < checked_share("chance", chance) else scan
+
+
+def flip_y(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
+    """Swaps left and right, with a chance."""
+    return mirrored(scan, "y") if rng.random() < checked_share("chance", chance) else scan
+
+
+def scale(scan: Scan, rng: np.random.Generator, low: float = 0.95, high: float = 1.05) -> Scan:
+    """Makes the world larger or smaller by a factor between ``low`` and ``high``."""
+    if not 0 < low <= high < np.inf:
+        raise ConfigError(f"low={low}, high={high}", "0 < low <= high")
+    return scaled(scan, float(rng.uniform(low, high)))
+
+
+def jitter(scan: Scan, rng: np.random.Generator, spread: float = 0.01, reflectance: float = 0.02) -> Scan:
+    """Noise along the rays and on the reflectance; a return that would enter or leave a box stays where it was.
+
+    Args:
+        scan: N points.
+        rng: where the noise is from.
+        spread: standard deviation of the range, metres; cut off at three of it.
+        reflectance: standard deviation; the reflectance stays in [0, 1].
+    """
+    if spread < 0 or reflectance < 0:
+        raise ConfigError(f"spread={spread}, reflectance={reflectance}", "0 or more")
+    noise = np.clip(rng.standard_normal((2, len(scan)), np.float32), -3, 3)
+    distance = np.maximum(np.linalg.norm(scan.points, axis=1), 1e-3)
+    points = scan.points * (1 + spread * noise[0] / distance)[:, None]
+    if scan.boxes is not None:
+        crossed = (scan.boxes.contain(scan.points) != scan.boxes.contain(points)).any(0)
+        points[crossed] = scan.points[crossed]
+    brightness = np.clip(scan.reflectance + reflectance * noise[1], 0, 1)
+    return replace(scan, points=points.astype(np.float32), reflectance=brightness.astype(np.float32))
+
+
+def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan:
+    """Takes whole rings away, up to a share of the sensor's beams.
+
+    A point's ring is the file's own where the scan has it, else its row in the sensor's range image.
+    """
+    rows, columns = scan.sensor.shape
+    most = round(checked_share("share", share) * rows)
+    dropped = rng.choice(rows, rng.integers(most + 1), replace=False)
+    row = locate(scan.points, scan.sensor).cell // columns if scan.ring is None else scan.ring
+    return _left(scan, ~np.isin(row, dropped))
+
+
+def range_drop(scan: Scan, rng: np.random.Generator, share: float = 0.3, power: float = 2.0) -> Scan:
+    """Takes returns away, the more the farther they are.
+
+    Args:
+        scan: N points.
+        rng: what decides.
+        share: chance to lose a return at the sensor's largest range.
+        power: the chance grows with range / range_max to this power.
+    """
+    if not power >= 0:
+        raise ConfigError(f"power={power}", "0 or more")
+    far = np.minimum(np.linalg.norm(scan.points, axis=1) / scan.sensor.range_max, 1)
+    return _left(scan, rng.random(len(scan)) >= checked_share("share", share) * far**power)
+
+
+def rotated(scan: Scan, angle: float) -> Scan:
+    """The scan turned about the sensor, counter-clockwise by an angle in radians."""
+    boxes = None if scan.boxes is None else turned(scan.boxes, angle)
+    return _placed(scan, turned_points(scan.points, angle), boxes)
+
+
+def mirrored(scan: Scan, axis: Literal["x", "y"]) -> Scan:
+    """The scan with the sign of its x (front and back) or y (left and right) turned."""
+    if axis not in ("x", "y"):
+        raise ConfigError(f"axis={axis!r}", "'x' or 'y'")
+    column, boxes = "xy".index(axis), None
+    points = scan.points.copy()
+    points[:, column] *= -1
+    if scan.boxes is not None:
+        values = scan.boxes.values.copy()
+        values[:, column] *= -1
+        values[:, 6] = np.pi * (axis == "x") - values[:, 6]
+        boxes = moved(scan.boxes, values)
+    return _placed(scan, points, boxes)
+
+
+def scaled(scan: Scan, factor: float) -> Scan:
+    """The scan with all lengths multiplied by a factor."""
+    boxes = None
+    if scan.boxes is not None:
+        values = scan.boxes.values.copy()
+        values[:, :6] *= factor
+        boxes = moved(scan.boxes, values)
+    return _placed(scan, scan.points * np.float32(factor), boxes)
+
+
+def _placed(scan: Scan, points: NDArray[np.float32], boxes: Boxes | None) -> Scan:
+    return replace(scan, points=points, boxes=boxes, pose=None, image_path=None)
+
+
+def _left(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
+    """The scan with some points; a box that loses all of its own leaves, too."""
+    if scan.boxes is None:
+        return scan[keep]
+    inside = scan.boxes.contain(scan.points)
+    return replace(scan[keep], boxes=scan.boxes[~inside.any(1) | inside[:, keep].any(1)])

@@ -1,0 +1,93 @@
+"""Networks, one file per architecture; they know tensors and, as plain angles, rays, but no sensors.
+
+To add one: write its file, enter its class in ``NETWORKS``. Its arguments have to be plain values, since they
+stand in the checkpoint.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.models.encoders.camera import SightEncoder
+from lidar_synth.models.encoders.maps import ClipViewEncoder, SemanticMapEncoder, ViewEncoder
+from lidar_synth.models.hdit.denoiser import Denoiser
+from lidar_synth.models.hdit.hdit import HDiT
+from lidar_synth.models.lidm.diffusion import DiffusionUNet
+from lidar_synth.models.lidm.unet import UNet
+from lidar_synth.models.lidm.vqvae import VQVAE
+from lidar_synth.models.town_codec.autoencoder import Autoencoder
+
+NETWORKS: dict[str, type[nn.Module]] = {
+    "hdit": HDiT,
+    "denoiser": Denoiser,
+    "unet": UNet,
+    "diffusion_unet": DiffusionUNet,
+    "vqvae": VQVAE,
+    "autoencoder": Autoencoder,
+    "semantic_map": SemanticMapEncoder,
+    "views": ViewEncoder,
+    "clip_views": ClipViewEncoder,
+    "sight": SightEncoder,
+}
+"""Architectures by the name that a checkpoint holds: velocity networks, autoencoders, encoders of conditions."""
+
+AUTOENCODERS = ("vqvae", "autoencoder")
+"""Those of them that make latents of range images."""
+
+
+def build_network(architecture: str, arguments: dict[str, Any]) -> nn.Module:
+    """A network with fresh weights; the one place where a name and arguments become a network.
+
+    Args:
+        architecture: a name of ``NETWORKS``.
+        arguments: of its class.
+
+    Raises:
+        ConfigError: on an unknown name or argument, or values that do not fit.
+    """
+    if architecture not in NETWORKS:
+        raise ConfigError(f"architecture {architecture!r}", f"one of {', '.join(NETWORKS)}")
+    try:
+        return NETWORKS[architecture](**arguments)
+    except ConfigError:
+        raise
+    except (TypeError, ValueError, ArithmeticError, RuntimeError) as error:
+        given = ", ".join(f"{name}={value!r}" for name, value in arguments.items())
+        raise ConfigError(f"{architecture}({given})", f"the arguments of its class ({error})") from error
+
+
+def assemble(
+    architecture: str,
+    arguments: dict[str, Any],
+    state: Mapping[str, Tensor],
+    what: str,
+    device: torch.device | str = "cpu",
+) -> nn.Module:
+    """A network with given weights, float32 and in evaluation mode.
+
+    Args:
+        architecture, arguments: as ``build_network`` takes them.
+        state: the weights by name; used as they are where they are float32 on ``device``.
+        what: to name in an error.
+
+    Raises:
+        DataError: on arguments that give no network, missing or unexpected keys, and other shapes.
+    """
+    try:
+        with torch.device("meta"):  # neither time nor memory for weights that will be replaced
+            network = build_network(architecture, arguments)
+    except ConfigError as error:
+        raise DataError(f"{what}: {error}") from error
+    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    missing, unexpected = sorted(set(expected) - set(state)), sorted(set(state) - set(expected))
+    if missing or unexpected:
+        raise DataError(f"{what} has missing keys {missing} and unexpected keys {unexpected}", "exactly its own keys")
+    if wrong := {key: tuple(v.shape) for key, v in state.items() if v.shape != expected[key]}:
+        shapes = ", ".join(f"{key} {shape} for {expected[key]}" for key, shape in wrong.items())
+        raise DataError(f"{what} has weights of other shapes: {shapes}", "the shapes that its arguments give")
+    network.load_state_dict({key: v.to(device, torch.float32) for key, v in state.items()}, assign=True)
+    # What is no image has no such layout; convolutions would arrange their weights anew at every call.
+    return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload, no-any-return]

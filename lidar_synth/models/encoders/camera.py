@@ -1,0 +1,90 @@
+"""An encoder that knows where the camera looks: every cell of the state gets the image's features along its rays."""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.models.convolution import check_shape, pair, reduced
+from lidar_synth.models.positions import RayAngles
+
+
+class SightEncoder(nn.Module):
+    """A camera image as maps on the grid of the state, by the camera's calibration.
+
+    Convolutions make features of the image; a cell takes those of the pixel that sees a point ``distance`` metres away
+    along the cell's ray. Nearer and farther points lie a little beside it: by as much as the camera stands beside the
+    sensor, which neighbouring features have to make good. The last map is 1 where the camera looks.
+
+    Unlike tokens that are attended to, this need not be learnt: it works after minutes, with hundreds of images. It is
+    made for one camera, beside one sensor.
+
+    Args:
+        target: rows and columns of the state.
+        image: rows and columns of the camera's images.
+        image_from_sensor: (3, 4) pixels of such an image from homogeneous points in the sensor frame
+            (``Calibration.image_from_sensor``).
+        resolution: h, w that images are resized to.
+        channels: of the maps.
+        widths: channels of the convolutions, each of which halves rows and columns.
+        distance: metres.
+        angles: (2, rows, columns) elevation and azimuth (clockwise from ahead) of every cell, radians; without them
+            they have to come from a checkpoint.
+
+    Raises:
+        ConfigError: on values that do not fit together.
+    """
+
+    argument = "condition_channels"
+
+    def __init__(
+        self,
+        target: Sequence[int],
+        image: Sequence[int],
+        image_from_sensor: Sequence[Sequence[float]],
+        resolution: Sequence[int] = (96, 320),
+        channels: int = 32,
+        widths: Sequence[int] = (32, 64, 96),
+        distance: float = 15.0,
+        angles: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.resolution, self.image, self.channels, self.distance = pair(resolution), pair(image), channels, distance
+        self.matrix = [[float(v) for v in row] for row in image_from_sensor]
+        if [len(row) for row in self.matrix] != [4, 4, 4]:
+            raise ConfigError(f"image_from_sensor {image_from_sensor}", "3 rows of 4 numbers")
+        reduced(self.resolution, [(2, 2)] * len(widths), "an image")
+        self.angles = RayAngles(target, angles)
+        self.body = nn.Sequential()
+        for a, b in zip([3, *widths[:-1]], widths, strict=True):
+            self.body.extend([nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.BatchNorm2d(b), nn.SiLU()])
+        self.body.append(nn.Conv2d(widths[-1], channels - 1, 3, 1, 1))
+
+    def places(self) -> Tensor:
+        """(rows, columns, 2) where the cells look: column and row in the image, from -1 to 1 within it; far outside for
+        what lies behind the camera."""
+        elevation, azimuth = self.angles.cells
+        flat = elevation.cos()
+        ray = torch.stack([flat * azimuth.cos(), -flat * azimuth.sin(), elevation.sin()], -1)
+        points = torch.cat([self.distance * ray, torch.ones_like(ray[..., :1])], -1)
+        pixels = points @ torch.tensor(self.matrix, device=ray.device).T
+        ahead = pixels[..., 2:] > 1.0
+        size = torch.tensor(self.image[::-1], device=ray.device)
+        found = (2 * pixels[..., :2] / pixels[..., 2:] + 1) / size - 1
+        return torch.where(ahead, found, torch.full_like(found, 9.0))
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, h, w) uint8 to (B, channels, rows, columns).
+
+        Raises:
+            DataError: on another size.
+        """
+        check_shape(image, (3, *self.resolution), "a camera image")
+        x = image.to(next(self.body.parameters()).dtype) / 127.5 - 1
+        features = self.body(x.contiguous(memory_format=torch.channels_last)).float()
+        places = self.places()
+        seen = (places.abs() <= 1).all(-1).float().expand(len(x), 1, *places.shape[:2])
+        maps = F.grid_sample(features, places.expand(len(x), *places.shape), align_corners=False)
+        return torch.cat([maps * seen, seen], 1).to(x.dtype)

@@ -1,0 +1,1 @@
+"""HDiT, the hourglass transformer of R2Flow (pixel models and the town's latent flow)."""

@@ -1,0 +1,46 @@
+"""HDiT that is asked for the data in place of the velocity: for networks that are small for their images.
+
+A velocity holds the noise, as many numbers as the image has; tokens narrower than their patch cannot pass them on. Of
+the data, few numbers tell most. So the network F gives the data, and only what is finer than it can tell is taken from
+the state (the preconditioning of Karras et al., "Elucidating the Design Space of Diffusion-Based Generative Models",
+NeurIPS 2022, on the rectified path)::
+
+    y0' = (1 - t) s^2 / d(t) y - t / sqrt(d(t)) F(y, t, c),      d(t) = (1 - t)^2 s^2 + t^2
+    v   = (y - y0') / t = (t - (1 - t) s^2) / d(t) y + F(y, t, c) / sqrt(d(t))
+
+with s the standard deviation of these details.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.models.hdit.hdit import HDiT
+
+
+class Denoiser(HDiT):
+    """Velocity network v(y, t, c) as ``HDiT``, through an estimate of the data.
+
+    Args:
+        detail: s, standard deviation of what the state tells better than the network, in normalised units.
+        arguments: of ``HDiT``.
+
+    Raises:
+        ConfigError: on values that do not fit together.
+    """
+
+    def __init__(self, detail: float = 0.1, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        if not 0 < detail <= 1:
+            raise ConfigError(f"detail {detail}", "0 < detail <= 1")
+        self.detail = detail
+
+    def forward(self, y: Tensor, t: Tensor | float, cond: Tensor | None = None) -> Tensor:
+        """The velocity dy/dt at y and t; arguments and result as of ``HDiT``."""
+        answer = super().forward(y, t, cond)
+        t = torch.as_tensor(t, device=y.device, dtype=torch.float32).reshape(-1, 1, 1, 1)
+        data = (1 - t) * self.detail**2
+        spread = (1 - t) * data + t**2
+        return ((t - data) / spread * y + spread.rsqrt() * answer).to(y.dtype)

@@ -1,0 +1,1 @@
+"""The networks of LiDM: convolutional U-Net and VQ-VAE."""

@@ -1,0 +1,259 @@
+"""Autoencoder of range images that two CPU cores can train: patches in, few convolutions, one head per channel.
+
+An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 8) in (-1, 1), the size of LiDM's (Ran et al., "Towards
+Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024). In place of a codebook, the latent is bounded and
+the decoder is trained on latents with noise, so that it forgives what a flow leaves. Every norm is over the channels
+of one cell: a crop in training and the whole turn in use give the same.
+
+What a sensor leaves to chance (whether a ray returns, the speckle of a reflectance) no latent can hold. The decoder
+therefore says distributions, and an image is drawn from them: what it would be on average is smoother than any scan,
+and a network that is trained on such images takes the noise of real ones for something that it has never seen.
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.normalize import NORMALISATIONS
+from lidar_synth.models.codebook import follow
+from lidar_synth.models.convolution import WrapConv, check_shape, pair, reduced
+from lidar_synth.models.layers import EPS
+from lidar_synth.models.town_codec.heads import Heads
+from lidar_synth.models.town_codec.multiscale import LATTICES, Neighbours, on, ratio
+from lidar_synth.models.town_codec.plane_fit import Consensus
+from lidar_synth.models.town_codec.planes import Planes, Surfaces, laplace
+from lidar_synth.models.town_codec.reflectance import Readings
+
+DETAIL = (2, 4)
+"""Rows and columns of the patches that the outer convolutions see."""
+DOWN = (4, 8)
+"""Rows and columns of one latent cell."""
+PLANES = 2
+"""Surfaces of a patch that a cell may see: one, and what is behind its edge."""
+SPREADS = -4.6, 0.0
+"""Limits of the logarithms of other values' spreads."""
+ROUGHNESS = 5e-4
+"""Scale of the noise of drawn ranges, normalised: 1.3 cm at 10 m in R2Flow's scale."""
+
+
+class Residual(nn.Module):
+    """x + conv(silu(conv(norm(x)))).
+
+    Args:
+        channels: C.
+        reach: columns from one cell that the second convolution sees to the next.
+    """
+
+    def __init__(self, channels: int, reach: int = 1) -> None:
+        super().__init__()
+        self.first, self.second = WrapConv(channels, channels), WrapConv(channels, channels, dilation=(1, reach))
+        nn.init.zeros_(self.second.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the same shape."""
+        normed = F.rms_norm(x.movedim(1, -1), x.shape[1:2], eps=EPS).movedim(-1, 1)
+        out: Tensor = x + self.second(F.silu(self.first(normed)))
+        return out
+
+
+class Autoencoder(nn.Module):
+    """Images to latents and back; a codec like ``VQVAE``.
+
+    Args:
+        resolution: H, W of the image, multiples of 4 and 8.
+        channels: C of the image: the range first, then other numbers such as reflectance, then ``bits``.
+        bits: channels of the image that are an analog code (``normalize.encode_labels``).
+        codes: K, how many codes there are.
+        latent_channels: Z.
+        widths: channels on patches of 2 x 4 cells and of 4 x 8.
+        depth: residual blocks of the decoder on the coarser grid; one less after it, one less on it in the encoder.
+        wide: reaches of further blocks of the decoder on the coarser grid: a wall is straight over many cells.
+        window: rows and columns of patches of 2 x 4 cells that settle on common planes; none without.
+        fine: channels of the decoder's last map, on single cells.
+        normalisation: a name of ``NORMALISATIONS``, that of the range.
+        angles: (2, H, W) elevation and azimuth of the cells' rays, radians; without them they have to come from a
+            checkpoint.
+
+    Raises:
+        ConfigError: on values that do not fit together.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(
+        self,
+        resolution: Sequence[int],
+        channels: int = 7,
+        bits: int = 5,
+        codes: int = 20,
+        latent_channels: int = 8,
+        widths: Sequence[int] = (48, 96),
+        depth: int = 3,
+        wide: Sequence[int] = (),
+        window: Sequence[int] = (),
+        fine: int = 24,
+        normalisation: str = "r2flow",
+        angles: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.resolution = pair(resolution)
+        rows = self.resolution[0]
+        if (bits and not 2**bits >= codes > 1) or (not bits and codes) or channels <= bits or depth < 2:
+            raise ConfigError(
+                f"{channels} channels, {codes} codes in {bits} bits, depth {depth}",
+                "a range beside the bits, as many bits as the codes need (0 for 0), and depth >= 2",
+            )
+        if normalisation not in NORMALISATIONS:
+            raise ConfigError(f"normalisation {normalisation!r}", f"one of {', '.join(NORMALISATIONS)}")
+        columns = self.resolution[1] // DOWN[1]
+        if any(not 1 <= reach <= columns for reach in wide):
+            raise ConfigError(f"wide {list(wide)}", f"columns of a latent, from 1 to {columns}")
+        outer, inner = widths
+        self.channels, self.values, self.bits, self.fine = channels, channels - bits - 1, bits, fine
+        self.draws = 2 + self.values
+        """Random numbers that an image takes per cell."""
+        self.latent_shape = (latent_channels, *reduced(self.resolution, [DOWN], "an image"))
+        """Channels, rows and columns of a latent."""
+        # What lies where is known by row: on a road, a beam's elevation gives its range.
+        self.place_stem = _rows(outer, rows // DETAIL[0])
+        self.place_latent = _rows(inner, rows // DOWN[0])
+        self.place_outer = _rows(outer, rows // DETAIL[0])
+        self.place_fine = _rows(fine, rows)
+        self.stem = nn.Conv2d(self.channels + 1, outer, DETAIL, DETAIL)
+        self.encode_outer = Residual(outer)
+        self.merge = nn.Conv2d(outer, inner, 2, 2)
+        self.encode_inner = _blocks(inner, depth - 1)
+        self.to_latent = nn.Conv2d(inner, latent_channels, 1)
+        self.from_latent = nn.Conv2d(latent_channels, inner, 1)
+        self.decode_inner = _blocks(inner, depth, wide)
+        self.split = nn.Conv2d(inner, 4 * outer, 1)
+        self.decode_outer = _blocks(outer, depth - 1)
+        self.spread = nn.Conv2d(outer, DETAIL[0] * DETAIL[1] * fine, 1)
+        self.refine = WrapConv(fine, fine)
+        grid = rows // DETAIL[0], self.resolution[1] // DETAIL[1]
+        rise = torch.zeros(rows) if angles is None else angles[0].mean(1).tan()
+        consensus = Consensus(outer, grid, DETAIL, PLANES, pair(window), rise) if window else None
+        self.planes = Planes(outer, DETAIL, PLANES, NORMALISATIONS[normalisation], consensus)
+        self.sizes = [PLANES, self.values, self.values, self.values, 1, codes]
+        self.heads = nn.Conv2d(fine, sum(self.sizes), 1)
+        self.neighbours = nn.ModuleList(
+            Neighbours(fine, 1 + 2 * self.values, 2 * fine, ratio(a, b)) for a, b in pairwise(LATTICES)
+        )
+        # Latents leave with mean 0 and variance 1 per channel, as a flow from standard normal noise likes them.
+        self.register_buffer("shift", torch.zeros(latent_channels))
+        self.register_buffer("scale", torch.ones(latent_channels))
+
+    def forward(self, x: Tensor, noise: Tensor) -> Heads:
+        """Images (B, C, H, W) there and back with ``noise`` (B, *latent_shape) on the bounded latents; in training, the
+        latents' statistics move."""
+        z = self.squeeze(x)
+        if self.training:
+            follow(z.detach(), self.shift, self.scale)
+        return self.expand(z + noise, x)
+
+    def encoder(self) -> list[nn.Parameter]:
+        """The weights that make latents; all others make images of them."""
+        parts = self.stem, self.encode_outer, self.merge, self.encode_inner, self.to_latent
+        return [self.place_stem, *(weight for part in parts for weight in part.parameters())]
+
+    def bounded(self, z: Tensor) -> Tensor:
+        """Latents (B, *latent_shape) of mean 0 and variance 1 as they leave ``squeeze``."""
+        return z * _channel(self.scale) + _channel(self.shift)
+
+    def encode(self, x: Tensor) -> Tensor:
+        """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of mean 0 and variance 1
+        per channel."""
+        return (self.squeeze(x) - _channel(self.shift)) / _channel(self.scale)
+
+    def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
+        """Latents to images.
+
+        Args:
+            z: (B, *latent_shape).
+            chance: (B, draws, H, W) random numbers in (0, 1) to draw an image by; None = the likeliest of everything.
+
+        Returns:
+            (B, C, H, W): the range -1 where there is no return; the bits as logits of the likeliest code, which are as
+            far from 0 as this one is likely.
+        """
+        check_shape(z, self.latent_shape, "a latent")
+        said = self._tell(
+            self.bounded(z),
+            lambda said, lattice: said.drawn(None if chance is None else on(lattice, chance)),
+        )
+        distance, seen = said.surfaces.likeliest(), said.drawn(chance)
+        if chance is not None:
+            distance = distance + ROUGHNESS * laplace(chance[:, :1])
+        parts = [torch.where(seen[:, :1] > 0, distance, -1.0), seen[:, 1:]]
+        if self.bits:
+            likely, code = said.classes.float().softmax(1).max(1)
+            parts += [self._corners(code) * (2 * torch.atanh(likely.clamp(max=0.9999)))[:, None]]
+        return torch.cat(parts, 1)
+
+    def squeeze(self, x: Tensor) -> Tensor:
+        """Images (B, C, H, W) to bounded latents in (-1, 1), float32."""
+        check_shape(x, (self.channels, *self.resolution), "an image")
+        x = x.to(self.stem.weight.dtype)
+        returned = (x[:, :1] > -1).to(x.dtype)
+        h = self.stem(torch.cat([x, returned], 1).contiguous(memory_format=torch.channels_last))
+        h = self.encode_outer(h + self.place_stem)
+        return torch.tanh(self.to_latent(self.encode_inner(self.merge(h))).float())
+
+    def expand(self, z: Tensor, image: Tensor) -> Heads:
+        """Bounded latents to what is said of every cell, its neighbours on coarser ``LATTICES`` being as in an image
+        (B, C, H, W)."""
+        seen = torch.cat([(image[:, :1] > -1).to(image.dtype), image[:, 1 : 1 + self.values]], 1)
+        return self._tell(z, lambda said, lattice: on(lattice, seen))
+
+    def _tell(self, z: Tensor, see: Callable[[Heads, tuple[int, int]], Tensor]) -> Heads:
+        """What is said of every cell, lattice by lattice; ``see`` tells what came out on one."""
+        z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
+        h = self.decode_inner(self.from_latent(z) + self.place_latent)
+        h = self.decode_outer(F.pixel_shuffle(self.split(h), 2) + self.place_outer)
+        planes = self.planes(h)
+        h = _unpatch(self.spread(h), self.fine) + self.place_fine
+        h = h + F.silu(self.refine(h))
+        said = self.heads(on(LATTICES[0], h))
+        for (known, finer), neighbours in zip(pairwise(LATTICES), self.neighbours, strict=True):
+            seen = see(self._named(planes, said, known), known)
+            alone = self._named(planes, self.heads(on(known, h)), known)
+            closer = self.heads(neighbours(on(finer, h), alone.unexpected(seen)))
+            on(ratio(known, finer), closer)[:] = said
+            said = closer
+        return self._named(planes, said, LATTICES[-1])
+
+    def _named(self, planes: tuple[Tensor, Tensor], said: Tensor, lattice: tuple[int, int]) -> Heads:
+        chosen, middles, spreads, blank, *rest = torch.split(said, self.sizes, 1)
+        ranges, doubts = (on(lattice, part) for part in planes)
+        readings = Readings(middles.float(), spreads.float().clamp(*SPREADS), blank.float())
+        return Heads(Surfaces(ranges, doubts, chosen.float()), readings, *rest)
+
+    def _corners(self, code: Tensor) -> Tensor:
+        """Codes (B, H, W) as their bits (B, bits, H, W), -1 and 1, highest first."""
+        return torch.stack([(code >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
+
+
+def _blocks(channels: int, depth: int, wide: Sequence[int] = ()) -> nn.Sequential:
+    return nn.Sequential(*(Residual(channels, reach) for reach in (*[1] * depth, *wide)))
+
+
+def _rows(channels: int, rows: int) -> nn.Parameter:
+    """(1, C, rows, 1), the same in all columns."""
+    return nn.Parameter(torch.zeros(1, channels, rows, 1))
+
+
+def _channel(x: Tensor) -> Tensor:
+    """(Z,) as (1, Z, 1, 1)."""
+    return x.view(1, -1, 1, 1)
+
+
+def _unpatch(x: Tensor, channels: int) -> Tensor:
+    """(B, 8 C, h, w) to (B, C, 2 h, 4 w)."""
+    batch, _, rows, columns = x.shape
+    x = x.reshape(batch, *DETAIL, channels, rows, columns).permute(0, 4, 1, 5, 2, 3)
+    return x.reshape(batch, rows * DETAIL[0], columns * DETAIL[1], channels).movedim(-1, 1)

@@ -1,6 +1,0 @@
-"""Generation beside the trainer: in a process of its own through shared memory, or between the steps on its device."""
-
-from lidar_synth.service.batches import BatchMixer
-from lidar_synth.service.rolling import RollingBank
-
-__all__ = ["BatchMixer", "RollingBank"]

@@ -1,0 +1,126 @@
+"""YAML in, checked values out; a key that no model knows is refused with the keys that are known."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.generate.conditions import CONDITIONS
+from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.train.config.sections import Run
+from lidar_synth.train.config.training import DistillConfig, TrainConfig
+
+Config = TypeVar("Config", bound=Run)
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def load_config(kind: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """A configuration from a YAML file.
+
+    Args:
+        kind: ``TrainConfig`` or ``DistillConfig``.
+        path: the file.
+        overrides: ``key=value`` with dots between levels and values in YAML, such as ``recipe.batch=4``.
+
+    Raises:
+        FileError: where the file cannot be read.
+        ConfigError: on what is no YAML, an unknown key, a value that does not fit or a resolution that the network
+            cannot have.
+    """
+    values = read_values(path, kind)
+    for override in overrides:
+        _override(values, override)
+    config = validated(kind, values, str(path))
+    check(config)
+    return config
+
+
+def read_values(path: str | Path, kind: type[BaseModel]) -> dict[str, Any]:
+    """The mapping of a YAML file that will be a ``kind``, not checked yet; raises as ``load_config``."""
+    try:
+        values = yaml.safe_load(Path(path).read_text())
+    except OSError as error:
+        raise FileError(
+            f"{path} cannot be read ({error.strerror})", "a configuration, such as those in configs/"
+        ) from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is not YAML ({error})") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path} holds {type(values).__name__}", f"the keys {', '.join(kind.model_fields)}")
+    return values
+
+
+def validated(kind: type[Model], values: dict[str, Any], where: str) -> Model:
+    """Values as the model ``kind`` checks them; ``where`` begins the message of the ConfigError."""
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{where}: {_first(kind, error)}") from error
+
+
+def check(config: Run) -> None:
+    """Refuse what could not be built.
+
+    Raises:
+        ConfigError: naming it.
+    """
+    data = config.data
+    if (data.town is None) == (data.path is None):
+        raise ConfigError(f"data with town={data.town} and path={data.path}", "one of the two")
+    if isinstance(config, TrainConfig):
+        _check_train(config)
+    if isinstance(config, DistillConfig) and config.grid is not None:
+        grid = config.grid
+        if len(grid) != config.intervals + 1 or (grid[0], grid[-1]) != (1, 0) or sorted(set(grid))[::-1] != list(grid):
+            raise ConfigError(f"grid {list(grid)}", f"{config.intervals + 1} descending times from 1 to 0")
+
+
+def _check_train(config: TrainConfig) -> None:
+    if config.autoencodes and (config.codec or config.condition):
+        raise ConfigError("an autoencoder with a codec or a condition", "neither: they belong to a flow")
+    if config.decoder and (config.init is None or config.condition):
+        raise ConfigError("decoder without init, or with a condition", "init: a latent model, with its own condition")
+    if config.data.roll and config.condition and not CONDITIONS[config.condition.kind].turns:
+        raise ConfigError(f"data.roll with the condition {config.condition.kind!r}", "data.roll=false")
+    if config.codec is not None and config.recipe.weights:
+        raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
+    if config.init is None and config.codec is None:  # what a codec makes is in its file
+        resolution = load_sensor(config.sensor).shape
+        config.parts((config.tensors().size, *resolution), resolution)
+
+
+def _override(values: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals or not key:
+        raise ConfigError(f"override {override!r}", "key=value, such as recipe.batch=4")
+    *levels, last = key.split(".")
+    for level in levels:
+        values = values.setdefault(level, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"override {override!r}: {level} is a single value", "a section")
+    try:
+        values[last] = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"override {override!r}: {text!r} is not YAML", "a number, a word, a [list]") from error
+
+
+def _first(kind: type[BaseModel], error: ValidationError) -> str:
+    """The first complaint of pydantic, in one line that helps."""
+    fault = error.errors()[0]
+    place = ".".join(map(str, fault["loc"]))
+    if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"unknown key {place!r}; known there: {', '.join(_keys(kind, fault['loc'][:-1]))}"
+    if fault["type"] == "missing":
+        return f"{place!r} is missing"
+    return f"{place} = {fault['input']!r}: {fault['msg']}"
+
+
+def _keys(kind: Any, path: Sequence[int | str]) -> list[str]:
+    """Names of the fields at a place of the configuration."""
+    for level in path:
+        fields = getattr(kind, "model_fields", None) or getattr(kind, "__pydantic_fields__", {})
+        kind = fields[level].annotation
+    return list(getattr(kind, "model_fields", None) or getattr(kind, "__dataclass_fields__", {}))

@@ -1,0 +1,130 @@
+"""Configurations of teachers, autoencoders and students."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import nn
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Part
+from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.models import AUTOENCODERS, build_network
+from lidar_synth.train import Losses
+from lidar_synth.train.config.sections import Condition, Count, Network, Run, Section
+
+
+class TrainConfig(Run):
+    """A teacher, a rectified flow from noise to scans; or, with one of ``AUTOENCODERS``, the autoencoder of one.
+
+    Args:
+        sensor: a preset's name or a YAML file.
+        channels: of the tensor, in order.
+        normalisation: a name of ``NORMALISATIONS``.
+        rays: through the cells' centres or, as the peers have it, their corners: the angles that the network sees.
+        network: what to train.
+        codec: checkpoint of an autoencoder, for a latent model; sensor, channels and normalisation are its own then.
+        condition: what the model is conditioned on.
+        decoder: train the decoder of ``init``, a latent model, alone: on what its flow leaves.
+        init: checkpoint to start from; its networks, sensor, channels and normalisation are those of the run then.
+        timesteps: a name of ``TIMESTEPS``.
+        steps: of the uniform time grid that the checkpoint names.
+        losses: of an autoencoder.
+    """
+
+    sensor: str = "hdl64e_kitti360"
+    channels: tuple[str, ...] = ("range", "reflectance")
+    normalisation: str = "r2flow"
+    rays: Literal["centre", "corner"] = "centre"
+    network: Network = Network()
+    codec: Path | None = None
+    condition: Condition | None = None
+    init: Path | None = None
+    decoder: bool = False
+    timesteps: Literal["uniform", "u_shaped", "logit_normal", "logit_normal_shifted"] = "uniform"
+    steps: Count = 50
+    losses: Losses = Losses()
+
+    @property
+    def autoencodes(self) -> bool:
+        """Whether an autoencoder is trained, and no flow."""
+        return self.network.architecture in AUTOENCODERS
+
+    def tensors(self) -> TensorFormat:
+        """Layout of the network's tensors.
+
+        Raises:
+            ConfigError: on an unknown channel or normalisation.
+        """
+        if self.normalisation not in NORMALISATIONS:
+            raise ConfigError(f"normalisation {self.normalisation!r}", f"one of {', '.join(NORMALISATIONS)}")
+        return TensorFormat(self.channels, NORMALISATIONS[self.normalisation])
+
+    def parts(self, state: tuple[int, int, int], resolution: tuple[int, int]) -> dict[str, Part]:
+        """The networks to train: the velocity (or the autoencoder) and the condition's encoder.
+
+        Args:
+            state: channels, rows and columns of the flow's states (or of the autoencoder's images).
+            resolution: rows and columns of the sensor.
+
+        Raises:
+            ConfigError: on values that do not fit together.
+        """
+        given: dict[str, Any] = {"resolution": list(state[1:]), "channels": state[0]}
+        parts = {}
+        if self.condition is not None:
+            parts[ENCODER] = part = self.condition.part(resolution, state[1:])
+            encoder = _checked(part)
+            given[str(encoder.argument)] = encoder.channels
+        if self.network.architecture == "autoencoder":
+            given["normalisation"] = self.normalisation
+        if twice := sorted(set(given) & set(self.network.arguments)):
+            raise ConfigError(f"network.arguments with {twice}", "no such keys: they follow from what the states are")
+        part = Part(self.network.architecture, given | self.network.arguments)
+        _checked(part)
+        return parts | {CODEC if self.autoencodes else VELOCITY: part}
+
+
+def _checked(part: Part) -> nn.Module:
+    """The network without weights: no memory and no time, only whether the values fit together."""
+    with torch.device("meta"):
+        return build_network(*part)
+
+
+class Selection(Section):
+    """How timesteps are selected: see ``timesteps.select_timesteps``."""
+
+    candidates: Count = 100
+    trajectories: Count = 256
+    batch: Count = 1
+    seed: int = 0
+
+
+class DistillConfig(Run):
+    """A student that needs few steps.
+
+    Args:
+        teacher: checkpoint; its network, sensor, channels and normalisation are the student's.
+        strategy: a name of ``STRATEGIES``.
+        steps: Euler steps of the teacher per piece.
+        guidance: scale of guidance of the teacher, which the student learns; 1 = none.
+        weaker: checkpoint of a smaller teacher, or one trained for less, which guidance leads away from (autoguidance);
+            without it, from the blank condition (classifier-free guidance).
+        within: least and greatest time at which ``weaker`` is led away from.
+        intervals: N, steps of the student.
+        grid: N + 1 descending times from 1 to 0; without it, ``adaptive_piecewise`` selects them and the other
+            strategies take uniform ones.
+        selection: how.
+    """
+
+    teacher: Path
+    strategy: Literal[
+        "adaptive_piecewise", "uniform_piecewise", "piecewise_reflow", "reflow", "timestep_distillation"
+    ] = "adaptive_piecewise"
+    steps: Count = 20
+    guidance: float = 1.0
+    weaker: Path | None = None
+    within: tuple[float, float] = (0.0, 1.0)
+    intervals: Count = 4
+    grid: tuple[float, ...] | None = None
+    selection: Selection = Selection()

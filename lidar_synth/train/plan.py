@@ -1,0 +1,208 @@
+"""What a training configuration asks for: the networks, what they are trained on, and what the checkpoint will say."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import nn
+from tqdm import tqdm
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.files import write_file
+from lidar_synth.flow.path import METRICS, velocity_loss
+from lidar_synth.flow.solvers import uniform_grid
+from lidar_synth.flow.timesteps import Selection, select_timesteps
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    ENCODER,
+    VELOCITY,
+    Header,
+    join,
+    load_checkpoint,
+    network_hash,
+    split,
+)
+from lidar_synth.generate.codec import Codec, make_codec
+from lidar_synth.generate.conditions import CONDITIONS
+from lidar_synth.models.town_codec.autoencoder import Autoencoder
+from lidar_synth.train import (
+    Autoencoding,
+    Batches,
+    Conditioning,
+    Decoding,
+    Loss,
+    Other,
+    Task,
+    autoencoder_loss,
+    cache_latents,
+    cache_scans,
+    decoding_loss,
+    decoding_task,
+    reconstruction_task,
+    student_task,
+    teacher_task,
+)
+from lidar_synth.train.config import DistillConfig, Run, TrainConfig
+from lidar_synth.train.start import fresh_networks, provenance_of, start_networks
+from lidar_synth.train.teaching import taught_flow
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run before its first step.
+
+    Args:
+        network: what is trained.
+        task: on what.
+        header: what the checkpoint will say.
+        loss: what is lowered.
+        held: parts of the checkpoint that stand still, such as the autoencoder of a latent model.
+    """
+
+    network: nn.Module
+    task: Task
+    header: Header
+    loss: Loss = velocity_loss
+    held: Mapping[str, nn.Module] = field(default_factory=dict)
+
+    @property
+    def autoencoder(self) -> nn.Module | None:
+        """That makes the latents which are trained on."""
+        return self.held.get(CODEC)
+
+    def codec(self) -> Codec:
+        """Between tensors and states."""
+        return make_codec(self.autoencoder, self.header.tensors, self.header.sensor.shape)
+
+    def parts(self, network: nn.Module) -> dict[str, nn.Module]:
+        """The parts of the checkpoint, of the network or its averaged twin."""
+        trained = {CODEC: network.network} if isinstance(network, Autoencoding) else split(network)
+        return {**trained, **self.held}
+
+
+def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -> Plan:
+    """A teacher, a student or an autoencoder.
+
+    Raises:
+        ConfigError: where the configuration does not fit the checkpoints that it names.
+    """
+    if isinstance(config, DistillConfig):
+        return plan_student(config, accelerator)
+    if config.decoder:
+        return plan_decoder(config, accelerator)
+    return plan_autoencoder(config) if config.autoencodes else plan_teacher(config, accelerator)
+
+
+def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> Plan:
+    """Flow matching, from fresh weights or from those of ``config.init``."""
+    task = teacher_task(config.timesteps)
+    networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
+    if config.codec is not None and CODEC not in networks:
+        networks[CODEC] = load_checkpoint(config.codec).networks[CODEC]
+    autoencoder = networks.get(CODEC)
+    if autoencoder is not None:
+        autoencoder.requires_grad_(False).to(accelerator.device)
+    return Plan(join(networks), task, header, held=_codec_of(networks))
+
+
+def plan_autoencoder(config: TrainConfig) -> Plan:
+    """An autoencoder, from fresh weights or from those of ``config.init``."""
+    networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
+    recipe = config.recipe
+    network: Any = networks[CODEC]
+    trained = Autoencoding(
+        network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights
+    )
+    return Plan(trained, reconstruction_task, header, autoencoder_loss)
+
+
+def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> Plan:
+    """The decoder of a latent model, on what its flow leaves."""
+    networks, header = start_networks(config)
+    network = networks[CODEC]
+    if not isinstance(network, Autoencoder):
+        raise ConfigError(f"decoder with init {config.init}", "a model whose autoencoder says distributions")
+    held = {name: part.requires_grad_(False).to(accelerator.device) for name, part in networks.items() if name != CODEC}
+    for weight in network.encoder():
+        weight.requires_grad_(False)
+    recipe = config.recipe
+    trained = Decoding(network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights)
+    task = decoding_task(network, join(held), header.time_grid[-2], config.losses.noise)
+    return Plan(trained, task, header, decoding_loss, held)
+
+
+def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
+    """Distillation on the given, the selected or a uniform grid, from the teacher's weights."""
+    teacher = load_checkpoint(config.teacher, accelerator.device)
+    if VELOCITY not in teacher.networks:
+        raise ConfigError(f"teacher {config.teacher}, an autoencoder", "a model that generates")
+    if CODEC in teacher.networks and config.recipe.weights:
+        raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
+    flow, made = taught_flow(config, teacher, accelerator.device)
+    provenance = provenance_of(config) | made
+    header = replace(teacher.header, time_grid=config.grid or uniform_grid(config.intervals), provenance=provenance)
+    student = join(load_checkpoint(config.teacher).networks)
+    plan = Plan(student, teacher_task(), header, held=_codec_of(teacher.networks))
+    if config.grid is None and config.strategy == "adaptive_piecewise":
+        with accelerator.main_process_first():
+            found = _selection(config, flow, plan, accelerator)
+        provenance |= {"selection": {"cost": found.cost, "uniform_cost": found.uniform_cost}}
+        header = replace(header, time_grid=found.grid, provenance=provenance)
+    return replace(plan, task=student_task(config.strategy, flow, header.time_grid, config.steps), header=header)
+
+
+def _codec_of(networks: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
+    return {CODEC: networks[CODEC]} if CODEC in networks else {}
+
+
+def open_data(config: Run, plan: Plan, device: torch.device) -> Batches:
+    """The run's batches; the scans are projected once, into the run's cache."""
+    sensor, tensors = plan.header.sensor, plan.header.tensors
+    conditioning, channels, others = None, set(tensors.channels), {}
+    for name, options in plan.header.conditioning.items():
+        condition, encoder = CONDITIONS[name], plan.parts(plan.network)[ENCODER]
+        shape = condition.shape(encoder)
+        shares = {key: options.get(key, 0.0) for key in ("dropout", "view_dropout")}
+        conditioning = Conditioning(name, **shares, views=getattr(encoder, "views", 1))
+        if condition.field == "label":  # a channel of the range image
+            channels.add("label")
+        else:
+            others[condition.field] = Other(shape, _reader(name, sensor, shape, options))
+    folder = config.data.cache or config.output / "cache"
+    source = config.data.open(sensor)
+    cache = cache_scans(source, sensor, channels, folder, config.data.describe(), others=others)
+    codec = plan.codec() if plan.autoencoder is not None else None
+    data = Batches(cache, tensors, config.seed, config.data.flip, config.data.roll, device, codec, conditioning)
+    if codec is None or not config.data.latents:
+        return data
+    made_by = network_hash(plan.parts(plan.network)[CODEC])
+    return replace(data, latents=cache_latents(cache, tensors, codec, device, folder, made_by))
+
+
+def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, Any]) -> Callable[[Any], Any]:
+    return lambda scan: CONDITIONS[name].read(scan, sensor, shape, options)
+
+
+def _selection(config: DistillConfig, velocity: Any, plan: Plan, accelerator: "Accelerator") -> Selection:
+    """The timesteps of the student, from the folder where an earlier call left them."""
+    path = config.output / "selection.npz"
+    if path.exists():
+        with np.load(path) as values:
+            return Selection(
+                tuple(values["grid"].tolist()), float(values["cost"]), float(values["uniform_cost"]),
+                tuple(values["candidates"].tolist()), values["costs"], values["per_trajectory"],
+            )  # fmt: skip
+    conditions = open_data(config, plan, accelerator.device).conditions if plan.header.conditioning else None
+    with accelerator.autocast():
+        selection = select_timesteps(
+            velocity, plan.codec().shape, config.intervals, metric=config.recipe.metric, device=accelerator.device,
+            condition=conditions, **config.selection.model_dump(),
+        )  # fmt: skip
+    write_file(path, lambda file: np.savez(file, **asdict(selection)))
+    tqdm.write(f"timesteps {selection.grid}: cost {selection.cost:.4g}, uniform {selection.uniform_cost:.4g}")
+    return selection

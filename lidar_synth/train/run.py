@@ -1,0 +1,174 @@
+"""A training configuration becomes a run in its output folder.
+
+The folder holds::
+
+    config.yaml              what was asked for, overrides included
+    cache/                   the projected scans
+    selection.npz            a student's timesteps and how they were found
+    state.safetensors        to go on after a stop or a kill
+    <folder>.safetensors     the checkpoint: the averaged weights, to use
+    samples/, logs/          pictures; numbers for TensorBoard
+"""
+
+import math
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+import yaml
+from tqdm import tqdm
+
+from lidar_synth.errors import ConfigError, LibraryError
+from lidar_synth.files import write_file
+from lidar_synth.generate.checkpoint import save_checkpoint
+from lidar_synth.generate.codec import Latent
+from lidar_synth.generate.generator import Generator
+from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.train import Autoencoding, Batches, Record, Training, reconstruct, reconstruction_figures, steps
+from lidar_synth.train.config import DistillConfig, Run, TrainConfig
+from lidar_synth.train.plan import Plan, make_plan, open_data
+from lidar_synth.viz import write_view
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+_LOG_EVERY = 10  # steps between two numbers in the logs
+
+
+def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: float | None = None) -> Path:
+    """Train as configured, with a bar, logs, pictures and saves.
+
+    Args:
+        config: of a teacher or of a student.
+        resume: go on from the saved state in the output folder, where there is one.
+        minutes: stop, saved, after so long.
+
+    Returns:
+        The checkpoint.
+
+    Raises:
+        ConfigError: where the folder holds a run and ``resume`` is not set.
+        LibraryError: without Accelerate.
+        DataError: where the training does not stay finite; what was saved last is kept.
+    """
+    try:
+        from accelerate import Accelerator
+    except ImportError as error:
+        hint = "pip install 'lidar_synth[train]'"
+        raise LibraryError("Accelerate is not installed", "the extra 'train'", hint) from error
+
+    state = config.output / "state.safetensors"
+    if state.exists() and not resume:
+        raise ConfigError(f"{config.output} holds a run", "--resume to go on, or another output=FOLDER")
+    # Without being told so, Accelerate takes the processes of torchrun on CPUs for runs of their own.
+    gpu = torch.cuda.is_available() or torch.xpu.is_available() or torch.backends.mps.is_available()
+    accelerator = Accelerator(mixed_precision=config.precision, cpu="LOCAL_RANK" in os.environ and not gpu)
+    if accelerator.is_main_process:
+        write_file(config.output / "config.yaml", yaml.safe_dump(config.model_dump(mode="json")).encode())
+    plan = make_plan(config, accelerator)
+    training = Training(plan.network.to(accelerator.device), config.recipe)
+    if state.exists():
+        training.load(state)
+    if config.compile:
+        plan.network.compile()
+    for module in plan.network.modules():
+        if hasattr(module, "gradient_checkpointing"):
+            module.gradient_checkpointing = config.gradient_checkpointing  # type: ignore[assignment]
+    return _train(config, plan, training, accelerator, minutes)
+
+
+def checkpoint_path(config: Run) -> Path:
+    """Where a run leaves its checkpoint; the name goes into the ids of its scans."""
+    return config.output / f"{config.output.name}.safetensors"
+
+
+def _train(config: Run, plan: Plan, training: Training, accelerator: "Accelerator", minutes: float | None) -> Path:
+    """The loop, its logs and its saves."""
+    with accelerator.main_process_first():
+        data = open_data(config, plan, accelerator.device)
+    log = _Log(config, training.step) if accelerator.is_main_process else None
+    end = math.inf if minutes is None else time.monotonic() + 60 * minutes
+    for record in steps(training, plan.task, data, accelerator, plan.loss):
+        # All processes stop at the same step, whose clock ever is ahead.
+        late = accelerator.reduce(torch.tensor(float(time.monotonic() > end), device=accelerator.device)).item() > 0
+        last = late or record.step == config.recipe.iterations
+        if log is not None:
+            log.add(record)
+            if last or record.step % config.save_every == 0:
+                _save(config, plan, training)
+            if config.samples.every and (last or record.step % config.samples.every == 0):
+                with accelerator.autocast():
+                    log.picture(plan, training, data)
+        if late:
+            break
+    if log is not None:
+        log.close()
+    accelerator.wait_for_everyone()
+    return checkpoint_path(config)
+
+
+def _save(config: Run, plan: Plan, training: Training) -> None:
+    training.save(config.output / "state.safetensors")
+    header = replace(plan.header, provenance=plan.header.provenance | {"iterations": training.step})
+    save_checkpoint(checkpoint_path(config), header, plan.parts(training.average))
+
+
+class _Log:
+    """A bar, TensorBoard's numbers, pictures."""
+
+    def __init__(self, config: Run, step: int) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.config = config
+        self.board: Any = SummaryWriter(config.output / "logs", purge_step=step + 1)
+        self.bar = tqdm(total=config.recipe.iterations, initial=step, desc=config.output.name, unit="step")
+        self.records: list[Record] = []
+
+    def add(self, record: Record) -> None:
+        self.records.append(record)
+        self.bar.update()
+        if record.step % _LOG_EVERY and record.step != self.config.recipe.iterations:
+            return
+        mean = sum(r.loss for r in self.records) / len(self.records)
+        evaluations = sum(r.teacher_evaluations for r in self.records)
+        self.records.clear()
+        for name, value in (("loss", mean), ("gradient", record.gradient), ("rate", record.rate)):
+            self.board.add_scalar(name, value, record.step)
+        if evaluations:
+            self.board.add_scalar("teacher_evaluations", evaluations, record.step)
+        self.bar.set_postfix(loss=f"{mean:.4f}", refresh=False)
+
+    def close(self) -> None:
+        self.bar.close()
+        self.board.close()
+
+    def picture(self, plan: Plan, training: Training, data: Batches) -> None:
+        """Samples of a flow, from the first scans' conditions; of an autoencoder what went in and what came out."""
+        name, some = self.config.output.name, range(self.config.samples.count)
+        given: list[Scan] | list[RangeImage]
+        if isinstance(training.average, Autoencoding):
+            given = self._reconstructions(plan, training.average, data)
+        else:
+            generator = Generator(name, training.average, plan.header, autoencoder=plan.autoencoder)
+            given = generator.scans(0, some, data.conditions(some))
+        write_view(
+            self.config.output / "samples" / f"{training.step:07d}.png",
+            given,
+            title=f"{name}, {training.step} iterations",
+        )
+
+    def _reconstructions(self, plan: Plan, trained: Autoencoding, data: Batches) -> list[RangeImage]:
+        """Real range images, each followed by its reconstruction; figures go to the logs."""
+        codec = Latent(trained.network, plan.header.tensors)
+        images = data(range(self.config.samples.count)).y0
+        for name, value in reconstruction_figures(codec, images, plan.header.sensor).items():
+            self.board.add_scalar(f"reconstruction/{name}", value, self.bar.n)
+        pairs = zip(
+            plan.header.tensors.to_images(images, plan.header.sensor),
+            reconstruct(codec, images, plan.header.sensor),
+            strict=True,
+        )
+        return [image for both in pairs for image in both]

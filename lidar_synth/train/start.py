@@ -1,0 +1,137 @@
+"""What a training run starts with: fresh networks, or those of a checkpoint, and the header of what will come of it."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from lidar_synth import __version__
+from lidar_synth.errors import ConfigError
+from lidar_synth.flow.solvers import uniform_grid
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, Part, load_checkpoint
+from lidar_synth.generate.codec import make_codec
+from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.models import build_network
+from lidar_synth.train.config import Network, Run, TrainConfig
+
+LOOKING = ("hdit", "denoiser", "sight", "autoencoder")
+"""Architectures that take the angles of rays."""
+
+
+def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
+    """New networks and the header that describes them."""
+    provenance = provenance_of(config)
+    if config.codec is not None:
+        codec = load_checkpoint(config.codec)
+        if CODEC not in codec.networks:
+            raise ConfigError(f"codec {config.codec}", "the checkpoint of an autoencoder")
+        _check_held(config, codec.header, ("sensor", "channels", "normalisation"), config.codec)
+        sensor, tensors, fixed = codec.header.sensor, codec.header.tensors, {CODEC: codec.header.networks[CODEC]}
+        state = make_codec(codec.networks[CODEC], tensors, sensor.shape).shape
+        provenance |= {"codec": codec.hash, "codec_provenance": codec.header.provenance}
+    else:
+        sensor, tensors, fixed = load_sensor(config.sensor), config.tensors(), {}
+        state = (tensors.size, *sensor.shape)
+    parts = config.parts(state, sensor.shape)
+    networks = _build(config, parts, sensor, state)
+    header = Header(
+        networks=parts | fixed,
+        sensor=sensor,
+        normalisation=tensors.normalisation,
+        channels=tensors.channels,
+        time_grid=uniform_grid(1 if config.autoencodes else config.steps),
+        provenance=provenance,
+        conditioning={config.condition.kind: config.condition.options()} if config.condition else {},
+    )
+    return networks, header
+
+
+def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
+    """The networks of ``config.init``, and its header for the new run."""
+    assert config.init is not None
+    start = load_checkpoint(config.init)
+    wanted = {CODEC, VELOCITY} if config.decoder else {CODEC if config.autoencodes else VELOCITY}
+    if not wanted <= set(start.networks) or config.codec is not None:
+        raise ConfigError(f"init {config.init} with parts {sorted(start.networks)}", "a checkpoint of the same kind")
+    _check_held(config, start.header, ("sensor", "channels", "normalisation", "network"), config.init)
+    provenance = provenance_of(config) | {"init": start.hash, "init_provenance": start.header.provenance}
+    grid = start.header.time_grid if config.autoencodes or config.decoder else uniform_grid(config.steps)
+    networks = {CODEC: start.networks[CODEC]} if config.autoencodes else start.networks
+    kept = {name: start.header.networks[name] for name in networks}
+    header = replace(start.header, networks=kept, time_grid=grid, provenance=provenance)
+    if config.condition is None or ENCODER in networks or config.autoencodes:
+        return networks, header
+    return _add_condition(config, networks, header)
+
+
+def _add_condition(
+    config: TrainConfig, networks: dict[str, nn.Module], header: Header
+) -> tuple[dict[str, nn.Module], Header]:
+    """An unconditional model as the start of a conditional one: it generates what it did, and learns to look."""
+    assert config.condition is not None
+    held = header.networks[VELOCITY]
+    own = {name: value for name, value in held.arguments.items() if name not in ("resolution", "channels")}
+    asked = config.model_copy(update={"network": Network(architecture=held.architecture, arguments=own)})
+    state = make_codec(networks.get(CODEC), header.tensors, header.sensor.shape).shape
+    parts = asked.parts(state, header.sensor.shape)
+    made = _build(config, parts, header.sensor, state)
+    try:
+        new = made[VELOCITY].load_state_dict(networks[VELOCITY].state_dict(), strict=False)
+    except RuntimeError as error:
+        raise ConfigError(
+            f"a condition for init {config.init}, a {held.architecture}",
+            "init: a model of this condition, or an unconditional hdit",
+        ) from error
+    assert not new.unexpected_keys and all("condition" in k or "context" in k for k in new.missing_keys), new
+    conditioning: dict[str, Any] = {config.condition.kind: config.condition.options()}
+    return networks | made, replace(header, networks=header.networks | parts, conditioning=conditioning)
+
+
+def _build(
+    config: TrainConfig, parts: dict[str, Part], sensor: Sensor, state: tuple[int, int, int]
+) -> dict[str, nn.Module]:
+    """Networks with fresh weights, some of which look where the cells of the state look."""
+    torch.manual_seed(config.seed)
+    angles = torch.from_numpy(sensor.ray_angles(config.rays))
+    pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[0]
+    networks = {}
+    for name, part in parts.items():
+        looks = {"angles": pooled} if part.architecture in LOOKING else {}
+        networks[name] = build_network(part.architecture, part.arguments | looks)
+    return networks
+
+
+def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path: Any) -> None:
+    """What the configuration says, if it says it, has to be what the checkpoint holds."""
+    part = header.networks[CODEC if config.autoencodes or "network" not in keys else VELOCITY]
+    held = {
+        "sensor": header.sensor.to_dict(),
+        "channels": list(header.channels),
+        "normalisation": header.normalisation.to_dict(),
+        "network": {"architecture": part.architecture, "arguments": part.arguments},
+    }
+    arguments = part.arguments | config.network.arguments
+    asked = {
+        "sensor": load_sensor(config.sensor).to_dict(),
+        "channels": list(config.channels),
+        "normalisation": config.tensors().normalisation.to_dict(),
+        "network": {"architecture": config.network.architecture, "arguments": arguments},
+    }
+    for key in set(keys) & config.model_fields_set:
+        if json.dumps(asked[key], sort_keys=True) != json.dumps(held[key], sort_keys=True):
+            raise ConfigError(f"{key} {asked[key]}", f"that of {path}: {held[key]}", f"Or leave out {key}.")
+
+
+def provenance_of(config: Run) -> dict[str, Any]:
+    """What a checkpoint says of its making; the checkpoints that it was made from stand beside, by their hash."""
+    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "init", "teacher", "weaker", "codec"}
+    return {
+        "data": config.data.describe(),
+        "data_licence": config.data.licence,
+        "licence": config.licence,
+        "recipe": config.model_dump(mode="json", exclude=beside),
+        "software": f"lidar_synth {__version__}, torch {torch.__version__}",
+    }
