@@ -3,34 +3,100 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 import yaml
 
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.generate.codec import make_codec
 from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.models import build_network
 from lidar_synth.town import Town
-from lidar_synth.train.config import DistillConfig, Run, TrainConfig, load_config
+from lidar_synth.train.config import DistillConfig, Run, TrainConfig, load_config, published
+from lidar_synth.train.config.recipes import read_recipe
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-RUNS = sorted(p for p in CONFIGS.glob("*.yaml") if "recipe" in yaml.safe_load(p.read_text()))
+RECIPES = {one.name: one for one in published()}
 TINY = CONFIGS / "town_tiny.yaml"
+KINDS = {"train": TrainConfig, "distill": DistillConfig}
 
 
-def kind_of(path: Path) -> type[Run]:
-    return DistillConfig if "teacher" in yaml.safe_load(path.read_text()) else TrainConfig
+def test_every_file_is_a_recipe_a_base_or_a_sensor() -> None:
+    assert {p.stem for p in CONFIGS.glob("*.yaml")} == set(RECIPES) | {"tiny_sensor"}
+    named = {
+        base for p in CONFIGS.rglob("*.yaml") for base in np.atleast_1d(yaml.safe_load(p.read_text()).get("base", []))
+    }
+    assert named == {p.stem for p in (CONFIGS / "base").iterdir()}
 
 
-@pytest.fixture(autouse=True)
-def in_the_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(CONFIGS.parent)
-
-
-@pytest.mark.parametrize("path", RUNS, ids=lambda p: p.stem)
-def test_every_configuration_loads(path: Path) -> None:
-    config = load_config(kind_of(path), path)
-    assert config.output == Path("runs") / path.stem
-    again = kind_of(path).model_validate(yaml.safe_load(yaml.safe_dump(config.model_dump(mode="json"))))
+@pytest.mark.parametrize("name", [n for n, one in RECIPES.items() if one.command in KINDS])
+def test_every_recipe_loads_by_name_from_any_folder(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    kind: type[Run] = KINDS[RECIPES[name].command]
+    config = load_config(kind, name)
+    assert config == load_config(kind, CONFIGS / f"{name}.yaml")
+    assert config.output == Path("runs") / name
+    again = kind.model_validate(yaml.safe_load(yaml.safe_dump(config.model_dump(mode="json"))))
     assert again == config  # what a run writes beside its results is the configuration
+
+
+@pytest.mark.parametrize("name", [n for n, one in RECIPES.items() if one.command == "train"])
+def test_the_listed_size_is_that_of_the_networks(name: str) -> None:
+    """Where a recipe starts from a checkpoint that is not there yet, its size cannot be computed."""
+    config = load_config(TrainConfig, name)
+    if config.init is not None:
+        pytest.skip("starts from a checkpoint")
+    codec = config if config.codec is None else load_config(TrainConfig, config.codec.stem)
+    resolution = load_sensor(codec.sensor).shape
+    state = (codec.tensors().size, *resolution)
+    with torch.device("meta"):
+        if config.codec is not None:
+            autoencoder = build_network(*codec.parts(state, resolution)["codec"])
+            state = make_codec(autoencoder, codec.tensors(), resolution).shape
+        networks = [build_network(*part) for part in config.parts(state, resolution).values()]
+    size = sum(weight.numel() for network in networks for weight in network.parameters())
+    assert RECIPES[name].size == f"{size / 1e6:.1f} M"
+
+
+def test_bases_merge_and_the_recipe_takes_precedence(tmp_path: Path) -> None:
+    (tmp_path / "base").mkdir()
+    (tmp_path / "base" / "a.yaml").write_text("recipe: {batch: 1, rate: 2.0}\nprecision: bf16")
+    (tmp_path / "b.yaml").write_text("base: a\nrecipe: {rate: 3.0}\ndata: {town: 5}")
+    path = tmp_path / "c.yaml"
+    path.write_text("base: [b.yaml, town]\nabout: {size: none}\ndata: {town: 7}\nsensor: mine.yaml")
+    (tmp_path / "mine.yaml").write_text("{}")
+    values = read_recipe(path)
+    assert values["recipe"]["batch"] == 1
+    assert values["recipe"]["schedule"] == "trapezoid"  # of the published base "town"
+    assert values["data"] == {"town": 7, "licence": "MIT (procedural, no one's data)"}
+    assert values["sensor"] == str(tmp_path / "mine.yaml")
+    assert "about" not in values and "base" not in values
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("base: nowhere", "base 'nowhere'; expected a file beside it"),
+        ("base: [3]", "base 3; expected a file beside it"),
+        ("base: loop", "is its own base"),
+        ("base: c.yaml", "base 'c.yaml'; expected a file beside it"),
+    ],
+)
+def test_bases_that_cannot_be_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "loop.yaml").write_text("base: c.yaml")
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_config(TrainConfig, tmp_path / "c.yaml")
+
+
+@pytest.mark.parametrize("name", ["town_techer", "base/town", "../configs/town_tiny"])
+def test_an_unknown_name_is_refused_with_the_known_ones(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"recipe .*expected a YAML file or one of .*town_teacher"):
+        load_config(TrainConfig, name)
 
 
 def test_the_published_recipes() -> None:
@@ -112,7 +178,7 @@ def test_files_that_are_no_configuration_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="is not YAML"):
         load_config(TrainConfig, path)
     path.write_text("- a")
-    with pytest.raises(ConfigError, match="holds list; expected the keys output"):
+    with pytest.raises(ConfigError, match="holds list; expected keys and values"):
         load_config(TrainConfig, path)
     values: dict[str, Any] = yaml.safe_load(TINY.read_text())
     del values["licence"]

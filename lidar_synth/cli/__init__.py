@@ -17,6 +17,7 @@ from lidar_synth.cli.curate import curate
 from lidar_synth.cli.doctor import doctor
 from lidar_synth.cli.evaluate import evaluate
 from lidar_synth.cli.import_ import import_
+from lidar_synth.cli.recipes import recipes
 from lidar_synth.cli.sample import sample
 from lidar_synth.cli.town import town
 from lidar_synth.cli.train import distill, train
@@ -33,6 +34,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "repair": repair,
     "info": info,
     "curate": curate,
+    "recipes": recipes,
     "train": train,
     "distill": distill,
     "evaluate": evaluate,

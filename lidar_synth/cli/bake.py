@@ -48,7 +48,7 @@ def bake(
     \b
     Examples:
       lidar-synth bake bank --count 20000 --seed 1 --engine processes
-      lidar-synth bake bank --config configs/bake_town.yaml --dry-run
+      lidar-synth bake bank --config bake_town --dry-run
       lidar-synth bake bank --count 1000000 --device cuda --engine ray --address auto --workers 8
       lidar-synth bake bank --model semantic.safetensors --condition SemanticKITTI --condition-split train
       lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4

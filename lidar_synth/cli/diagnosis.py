@@ -123,9 +123,9 @@ def as_dict(findings: list[Finding]) -> dict[str, object]:
 
 
 def _libraries() -> Iterator[Finding]:
-    enough = sys.version_info >= (3, 11)
+    enough = sys.version_info >= (3, 10)
     yield Finding("libraries", "python", "ok" if enough else "broken", platform.python_version(),
-                  fix="" if enough else "install Python 3.11 or later")  # fmt: skip
+                  fix="" if enough else "install Python 3.10 or later")  # fmt: skip
     try:
         wanted = requires("lidar_synth") or []
     except PackageNotFoundError:
@@ -142,7 +142,7 @@ def _libraries() -> Iterator[Finding]:
 
 def _library(name: str, minimum: str, extra: str | None) -> Finding:
     """How one dependency is; those of an extra are optional."""
-    buys = f"the extra {extra!r}" if extra else OPTIONAL.get(name, "")
+    buys = OPTIONAL.get(name) or (f"the extra {extra!r}" if extra else "")
     worst: State = "check" if buys else "broken"
     wheel = f"pip install 'lidar_synth[{extra}]'" if extra else f"pip install '{name}>={minimum}'"
     try:

@@ -6,13 +6,15 @@ from typing import Annotated
 
 import typer
 
-ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML, such as those in configs/")]
+RecipeName = Annotated[
+    str, typer.Argument(metavar="RECIPE", help="a name that `lidar-synth recipes` lists, or a YAML file")
+]
 Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="values to change")]
-Resume = Annotated[bool, typer.Option("--resume", help="go on where the run in the output folder stopped")]
-Minutes = Annotated[float | None, typer.Option(help="stop, saved, after so long; --resume goes on")]
+Resume = Annotated[bool, typer.Option("--resume", help="resume the run in the output folder")]
+Minutes = Annotated[float | None, typer.Option(help="save and stop after so many minutes; --resume continues")]
 
 
-def train(config: ConfigFile, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
+def train(recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
     """Trains a teacher: a rectified flow from noise to scans.
 
     The output folder gets the checkpoint, named as the folder; state.safetensors, to go on after a stop or a kill
@@ -20,19 +22,19 @@ def train(config: ConfigFile, overrides: Overrides = None, resume: Resume = Fals
 
     \b
     Examples:
-      lidar-synth train configs/town_codec.yaml
-      lidar-synth train configs/town_teacher.yaml
-      lidar-synth train configs/town_teacher.yaml --resume recipe.iterations=20000
+      lidar-synth train town_codec
+      lidar-synth train town_teacher
+      lidar-synth train town_teacher --resume recipe.iterations=20000
       lidar-synth train mine.yaml init=runs/town_teacher/town_teacher.safetensors data.path=scans
-      torchrun --nproc-per-node 8 -m lidar_synth train configs/kitti360_teacher.yaml precision=bf16
+      torchrun --nproc-per-node 8 -m lidar_synth train kitti360_teacher precision=bf16
     """
     from lidar_synth.train.config import TrainConfig, load_config
     from lidar_synth.train.run import run
 
-    _say(run(load_config(TrainConfig, config, overrides or ()), resume, minutes))
+    _say(run(load_config(TrainConfig, recipe, overrides or ()), resume, minutes))
 
 
-def distill(config: ConfigFile, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
+def distill(recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
     """Distils a student that needs few steps from a teacher.
 
     Where the configuration gives no time grid, the timesteps are selected first. With a weaker teacher the student
@@ -40,15 +42,15 @@ def distill(config: ConfigFile, overrides: Overrides = None, resume: Resume = Fa
 
     \b
     Examples:
-      lidar-synth distill configs/town_student.yaml
-      lidar-synth distill configs/town_student.yaml strategy=uniform_piecewise output=runs/uniform
-      lidar-synth distill configs/town_student.yaml weaker=null guidance=1 output=runs/plain
-      lidar-synth distill configs/kitti360_student.yaml teacher=mine.safetensors grid=[1,0.86,0.58,0.22,0]
+      lidar-synth distill town_student
+      lidar-synth distill town_student strategy=uniform_piecewise output=runs/uniform
+      lidar-synth distill town_student weaker=null guidance=1 output=runs/plain
+      lidar-synth distill kitti360_student teacher=mine.safetensors grid=[1,0.86,0.58,0.22,0]
     """
     from lidar_synth.train.config import DistillConfig, load_config
     from lidar_synth.train.run import run
 
-    _say(run(load_config(DistillConfig, config, overrides or ()), resume, minutes))
+    _say(run(load_config(DistillConfig, recipe, overrides or ()), resume, minutes))
 
 
 def _say(path: Path) -> None:

@@ -4,6 +4,7 @@ What a run needs is built from the checked values by the caller, so that nothing
 """
 
 from lidar_synth.train.config.load import check, load_config, read_values, validated
+from lidar_synth.train.config.recipes import Listed, find_recipe, published
 from lidar_synth.train.config.sections import Condition, Data, Network, Run, Samples, Section
 from lidar_synth.train.config.training import DistillConfig, Selection, TrainConfig
 
@@ -11,6 +12,7 @@ __all__ = [
     "Condition",
     "Data",
     "DistillConfig",
+    "Listed",
     "Network",
     "Run",
     "Samples",
@@ -18,7 +20,9 @@ __all__ = [
     "Selection",
     "TrainConfig",
     "check",
+    "find_recipe",
     "load_config",
+    "published",
     "read_values",
     "validated",
 ]

@@ -1,4 +1,4 @@
-"""YAML in, checked values out; a key that no model knows is refused with the keys that are known."""
+"""From a recipe to checked values; unknown keys are refused, with the known ones named."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,9 +7,10 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.errors import ConfigError
 from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.train.config.recipes import find_recipe, read_recipe
 from lidar_synth.train.config.sections import Run
 from lidar_synth.train.config.training import DistillConfig, TrainConfig
 
@@ -17,12 +18,12 @@ Config = TypeVar("Config", bound=Run)
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def load_config(kind: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> Config:
-    """A configuration from a YAML file.
+def load_config(kind: type[Config], recipe: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """The configuration of a recipe.
 
     Args:
         kind: ``TrainConfig`` or ``DistillConfig``.
-        path: the file.
+        recipe: a published recipe's name, such as ``town_teacher``, or a YAML file.
         overrides: ``key=value`` with dots between levels and values in YAML, such as ``recipe.batch=4``.
 
     Raises:
@@ -30,26 +31,23 @@ def load_config(kind: type[Config], path: str | Path, overrides: Sequence[str] =
         ConfigError: on what is no YAML, an unknown key, a value that does not fit or a resolution that the network
             cannot have.
     """
-    values = read_values(path, kind)
+    values = read_values(recipe, kind)
     for override in overrides:
         _override(values, override)
-    config = validated(kind, values, str(path))
+    config = validated(kind, values, str(recipe))
     check(config)
     return config
 
 
-def read_values(path: str | Path, kind: type[BaseModel]) -> dict[str, Any]:
-    """The mapping of a YAML file that will be a ``kind``, not checked yet; raises as ``load_config``."""
-    try:
-        values = yaml.safe_load(Path(path).read_text())
-    except OSError as error:
-        raise FileError(
-            f"{path} cannot be read ({error.strerror})", "a configuration, such as those in configs/"
-        ) from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not YAML ({error})") from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path} holds {type(values).__name__}", f"the keys {', '.join(kind.model_fields)}")
+def read_values(given: str | Path, kind: type[BaseModel]) -> dict[str, Any]:
+    """The values of a recipe for a ``kind``, its bases included, not checked yet; raises as ``load_config``.
+
+    A run without ``output`` gets the folder ``runs/NAME``.
+    """
+    path = find_recipe(given)
+    values = read_recipe(path)
+    if issubclass(kind, Run):
+        values.setdefault("output", f"runs/{path.stem}")
     return values
 
 

@@ -1,0 +1,145 @@
+"""Recipes: configurations that are found by name and built on shared bases.
+
+A recipe is a YAML file. Its key ``base`` names one file or a list of files that it builds on: mappings are merged;
+later files and the recipe's own values take precedence. Its key ``about`` describes it for ``lidar-synth recipes``.
+Both keys are removed before the values are checked.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lidar_synth.errors import ConfigError, FileError
+
+SUFFIXES = (".yaml", ".yml")
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A published recipe.
+
+    Args:
+        name: what ``lidar-synth train``, ``distill`` or ``bake --config`` takes.
+        command: the one that runs it.
+        data: what it learns from.
+        size: trained parameters.
+        time: how long it takes, and where that is known from.
+        summary: the comment at the head of its file.
+    """
+
+    name: str
+    command: str
+    data: str
+    size: str
+    time: str
+    summary: str
+
+
+def folder() -> Path:
+    """Where the published recipes are installed."""
+    return Path(str(files("lidar_synth.recipes")))
+
+
+def find_recipe(given: str | Path) -> Path:
+    """The file of a recipe.
+
+    Args:
+        given: a published recipe's name, such as ``town_teacher``, or the path of a YAML file.
+
+    Raises:
+        ConfigError: on a name that no published recipe has.
+    """
+    path = Path(given)
+    if path.suffix in SUFFIXES or path.exists():
+        return path
+    published = folder() / f"{given}.yaml"
+    if path.name != str(given) or not published.is_file():
+        names = ", ".join(p.stem for p in sorted(folder().glob("*.yaml")))
+        raise ConfigError(f"recipe {str(given)!r}", f"a YAML file or one of {names}", "lidar-synth recipes lists them.")
+    return published
+
+
+def read_recipe(path: Path) -> dict[str, Any]:
+    """The values of a recipe on top of those of its bases, not checked yet.
+
+    A ``sensor`` that is a YAML file is looked for beside the recipe first.
+
+    Raises:
+        FileError: where a file cannot be read.
+        ConfigError: on what is no YAML, no mapping, or a base that names itself.
+    """
+    values = _merged(path, ())
+    values.pop("about", None)
+    return values
+
+
+def published() -> Iterator[Listed]:
+    """The recipes that come with the package, by name."""
+    for path in sorted(folder().glob("*.yaml")):
+        about = _read(path).get("about")
+        if not isinstance(about, dict):  # a sensor, not a recipe
+            continue
+        values = _merged(path, ())
+        command = "bake" if "recipe" not in values else "distill" if "teacher" in values else "train"
+        yield Listed(path.stem, command, *(str(about[key]) for key in ("data", "size", "time")), summary=_head(path))
+
+
+def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """``above`` on top of ``below``, mapping by mapping."""
+    result = dict(below)
+    for key, value in above.items():
+        both = isinstance(value, dict) and isinstance(result.get(key), dict)
+        result[key] = merged(result[key], value) if both else value
+    return result
+
+
+def _merged(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
+    if path in above:
+        raise ConfigError(f"{path} is its own base", "bases that end")
+    values = _read(path)
+    bases = values.pop("base", [])
+    result: dict[str, Any] = {}
+    for base in [bases] if isinstance(bases, str) else bases:
+        result = merged(result, _merged(_base(path, base), (*above, path)))
+    return merged(result, values)
+
+
+def _base(path: Path, name: Any) -> Path:
+    """The file of a base: beside the recipe, in its folder ``base``, or a published one."""
+    for candidate in (path.parent / str(name), path.parent / "base" / f"{name}.yaml", path.parent / f"{name}.yaml"):
+        if candidate.is_file() and candidate != path:
+            return candidate
+    for candidate in (folder() / "base" / f"{name}.yaml", folder() / f"{name}.yaml"):
+        if candidate.is_file() and candidate != path:
+            return candidate
+    raise ConfigError(f"{path}: base {name!r}", f"a file beside it, or a recipe of {folder()}")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        hint = "lidar-synth recipes lists the published ones."
+        raise FileError(f"{path} cannot be read ({error.strerror})", "a configuration in YAML", hint) from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is not YAML ({error})") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path} holds {type(values).__name__}", "keys and values")
+    sensor = values.get("sensor")
+    if isinstance(sensor, str) and sensor.endswith(SUFFIXES) and (path.parent / sensor).is_file():
+        values["sensor"] = str(path.parent / sensor)
+    return values
+
+
+def _head(path: Path) -> str:
+    """The first sentence of the comment at the head of a file."""
+    lines = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            break
+        lines.append(line.lstrip("# "))
+    return " ".join(lines).split(". ")[0].rstrip(".") + "."
