@@ -1,7 +1,7 @@
 # The two commands: `make demo` and `make test`. Each sets up its own .venv first; nothing is needed from root.
 
-PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell \
-	$(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(p))))
+PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11 python3.10,$(shell \
+	$(p) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null && echo $(p))))
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -10,13 +10,16 @@ TYPES := $(VENV)/types
 DEMO_OUT ?= demo_out
 SCANS ?= 24
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test quick lint bench clean
 
 demo: $(READY)  ## a small town as a user's dataset: write, read, project, convert, look
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
 
 test: $(READY)  ## all tests
 	$(BIN)/python -m pytest
+
+quick: $(READY)  ## the tests that are not marked slow
+	$(BIN)/python -m pytest -m "not slow"
 
 lint: $(READY)  ## style and types
 	$(BIN)/ruff check .
@@ -31,11 +34,14 @@ bench: $(READY)  ## every table of tools/bench
 clean:
 	rm -rf $(VENV) $(DEMO_OUT) build dist *.egg-info
 
+# Python 3.10 has no wheels of some pinned versions: there the newest that fit are taken.
+PINS = $(shell $(PYTHON) -c 'import sys; print("--constraint constraints.txt" * (sys.version_info >= (3, 11)))')
+
 # torch is asked for by itself first, so that its version is settled before anything else can pull another.
 $(READY): pyproject.toml constraints.txt
-	@test -n "$(PYTHON)" || { echo "Python 3.11 or later is needed: apt-get install python3 python3-venv, or make PYTHON=/path/to/python3.11"; exit 1; }
+	@test -n "$(PYTHON)" || { echo "Python 3.10 or later is needed: apt-get install python3 python3-venv, or make PYTHON=/path/to/python3.10"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "$(PYTHON) has no venv: apt-get install python3-venv"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PINS) torch
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PINS) --editable '.[dev]'
 	@touch $@

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError, FileError
 
+_BLOCK = 1 << 20  # bytes read at a time
+
 SKIP_HINT = "Copy the file again, or leave it out with on_bad='skip'."
 
 
@@ -70,8 +72,11 @@ def sha256(path: Path) -> str:
     Raises:
         OSError: where it cannot be read.
     """
+    digest = hashlib.sha256()
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while block := file.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def unreadable(path: Path, error: OSError) -> FileError:

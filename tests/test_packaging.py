@@ -1,21 +1,26 @@
 """What gets installed is what is in the repository."""
 
+import os
+import shutil
 import subprocess
 import sys
-import tomllib
+import sysconfig
+import tarfile
+import venv
 from pathlib import Path
 
 import pytest
 import yaml
+from project import PYPROJECT, ROOT
 
-ROOT = Path(__file__).parent.parent
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+MAPPED = {"lidar_synth.integrations": "integrations", "lidar_synth.recipes": "configs"}
+"""Packages whose folders lie beside lidar_synth/, where readers look for them."""
 
 
 def test_every_package_and_data_file_is_listed() -> None:
     folders = {p.parent for p in (ROOT / "lidar_synth").rglob("*.py")}
-    names = {".".join(f.relative_to(ROOT).parts) for f in folders} | {"lidar_synth.integrations"}
-    setuptools = PROJECT["tool"]["setuptools"]
+    names = {".".join(f.relative_to(ROOT).parts) for f in folders} | set(MAPPED)
+    setuptools = PYPROJECT["tool"]["setuptools"]
     assert set(setuptools["packages"]) == names
     data = {
         p.relative_to(ROOT / "lidar_synth").as_posix()
@@ -23,16 +28,85 @@ def test_every_package_and_data_file_is_listed() -> None:
         if p.is_file() and p.suffix != ".py" and "__pycache__" not in p.parts and p.name[0] != "."
     }
     listed = set()
-    for package, patterns in setuptools["package-data"].items():
+    for package in setuptools["package-data"].keys() - MAPPED.keys():
+        patterns = setuptools["package-data"][package]
         base = ROOT / package.replace(".", "/")
         listed |= {m.relative_to(ROOT / "lidar_synth").as_posix() for g in patterns for m in base.glob(g)}
     assert listed == data
 
 
+def test_every_recipe_is_listed() -> None:
+    patterns = PYPROJECT["tool"]["setuptools"]["package-data"]["lidar_synth.recipes"]
+    listed = {path for pattern in patterns for path in (ROOT / "configs").glob(pattern)}
+    there = {p for p in (ROOT / "configs").rglob("*.*") if p.is_file() and "__pycache__" not in p.parts}
+    assert there - listed == {ROOT / "configs" / "__init__.py"}
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the sdist, and the wheel that was built from it."""
+    folder = tmp_path_factory.mktemp("built")
+    rubbish = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "runs", "demo_out")
+    shutil.copytree(ROOT, folder / "checkout", ignore=rubbish)
+    shutil.copytree(ROOT / ".ci", folder / "checkout" / ".ci")
+    run([sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, folder / "checkout"], folder)
+    return folder
+
+
+def environment_with(what: list[str | Path], folder: Path) -> Path:
+    """The scripts of a new environment that has the package, installed from ``what``, and what it depends on."""
+    venv.create(folder, with_pip=False)
+    [site] = folder.glob("lib/python*/site-packages")
+    # Paths that a .pth file adds are not searched for further .pth files: this checkout stays out of sight.
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    pip = [sys.executable, "-m", "pip", "--python", folder / "bin" / "python", "install", "--quiet"]
+    options = ["--disable-pip-version-check", "--no-deps", "--no-index", "--no-build-isolation"]
+    run([*pip, *options, *what], folder)
+    return folder / "bin"
+
+
+def run(command: list[str | Path], folder: Path) -> str:
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_the_wheel_works_from_any_folder(built: Path, tmp_path: Path) -> None:
+    [wheel] = built.glob("*.whl")
+    bare = environment_with([wheel], built / "environment")
+    where = run([bare / "python", "-c", "import lidar_synth; print(lidar_synth.__file__)"], tmp_path)
+    assert Path(where.strip()).is_relative_to(bare.parent)
+    command = bare / "lidar-synth"
+    assert "town_teacher" in run([command, "recipes"], tmp_path)
+    few = ["recipe.iterations=2", "data.town=4", "samples.every=0"]
+    assert run([command, "train", "town_tiny", *few], tmp_path).strip() == "runs/town_tiny/town_tiny.safetensors"
+    model = tmp_path / "runs" / "town_tiny" / "town_tiny.safetensors"
+    assert "2 scans in 1 shards" in run([command, "bake", "bank", "--model", model, "--count", "2"], tmp_path)
+    assert "2 scans" in run(
+        [command, "bake", "more", "--config", "bake_town", "--model", model, "--count", "2"], tmp_path
+    )
+
+
+@pytest.mark.slow
+def test_the_unpacked_sdist_runs_its_tests(built: Path, tmp_path: Path) -> None:
+    """Those of a minute; all of them take as long as those of the checkout."""
+    [archive] = built.glob("*.tar.gz")
+    with tarfile.open(archive) as file:
+        file.extractall(tmp_path, filter="data")
+    [root] = tmp_path.iterdir()
+    ours = {p.relative_to(ROOT) for p in (ROOT / "tests").rglob("*") if p.is_file() and "__pycache__" not in p.parts}
+    assert all((root / path).is_file() for path in ours)
+    some = [f"tests/test_{name}.py" for name in ("structure", "config", "readme", "sensor", "scan", "solvers")]
+    scripts = environment_with(["--editable", root], tmp_path / "environment")
+    assert " passed" in run([scripts / "python", "-m", "pytest", *some], root)
+
+
 def test_the_versions_agree() -> None:
     import lidar_synth
 
-    assert lidar_synth.__version__ == PROJECT["project"]["version"]
+    assert lidar_synth.__version__ == PYPROJECT["project"]["version"]
 
 
 def test_integrations_are_part_of_the_package() -> None:

@@ -1,6 +1,7 @@
 """The shape of the package: imports run one way, and what is public stays small enough to read."""
 
 import ast
+import graphlib
 from pathlib import Path
 
 import lidar_synth
@@ -53,6 +54,57 @@ def test_a_backward_import_is_noticed(tmp_path: Path) -> None:
 
 def test_the_package_never_imports_its_integrations() -> None:
     assert all("integrations" not in imported(p) for p in PACKAGE.rglob("*.py") if INTEGRATIONS not in p.parents)
+
+
+ROOMS = 18
+LINES = 400
+PUBLIC = {"lidar_synth.__main__", "lidar_synth.labels.augment"}
+"""Modules for users, which nothing in the repository has to import."""
+
+
+def modules() -> dict[str, Path]:
+    """Every module of the package by its name."""
+    names = {".".join(p.relative_to(PACKAGE.parent).with_suffix("").parts): p for p in PACKAGE.rglob("*.py")}
+    return {name.removesuffix(".__init__"): path for name, path in names.items()}
+
+
+def imports_of(path: Path, known: dict[str, Path]) -> set[str]:
+    """The package's modules that a file imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {m if (m := f"{node.module}.{a.name}") in known else node.module for a in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+    return found & known.keys()
+
+
+def test_the_package_has_few_rooms() -> None:
+    there = {p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p / "__init__.py").is_file()}
+    assert there - {"__init__", "__main__"} == set(ORDER)
+    assert len(ORDER) <= ROOMS
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    known = modules()
+    graph = {name: imports_of(path, known) - {name} for name, path in known.items()}
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError
+
+
+def test_every_module_is_imported_by_something() -> None:
+    known = modules()
+    outside = [p for folder in ("integrations", "tools") for p in (PACKAGE.parent / folder).rglob("*.py")]
+    used = set().union(*(imports_of(path, known) - {name} for name, path in known.items()))
+    used |= set().union(*(imports_of(path, known) for path in outside))
+    packages = {name for name, path in known.items() if path.name == "__init__.py"}
+    assert known.keys() - used - packages == PUBLIC
+
+
+def test_no_file_is_too_long_to_read() -> None:
+    root = PACKAGE.parent
+    folders = [root / name for name in ("lidar_synth", "integrations", "tools", "tests", "configs")]
+    long = {p.name for f in folders for p in f.rglob("*.py") if len(p.read_text().splitlines()) > LINES}
+    assert long == set()
 
 
 def test_open3d_is_imported_by_nothing_at_import_time() -> None:

@@ -4,11 +4,11 @@ Tokens lie as (B, N, C), so that a linear layer is one matrix product and no cop
 """
 
 from collections.abc import Callable
-from typing import Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from typing_extensions import Self
 
 EPS = 1e-6
 """Added to a mean square before its root is divided by."""

@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, get_args
+from typing import Any, get_args
 
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import ConfigError
