@@ -28,6 +28,7 @@ from lidar_synth.integrations.detection import in_view, write_gt_database
 from lidar_synth.integrations.mmdet3d_infos import Folder, open_folder, read_url, write_infos
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
 from mmdet3d.registry import DATASETS, TRANSFORMS
+from mmdet3d_parts import CONFIGS, DATA_KEYS, FakeRunner, bare, flat
 from mmengine.config import Config
 from mmengine.dataset import pseudo_collate
 from mmengine.fileio import get
@@ -44,9 +45,7 @@ from lidar_synth.labels import ObjectBank
 REAL, EXTRA, SYNTHETIC = 6, 4, 11
 """Real scans, synthetic samples of an epoch, synthetic scans that there are."""
 MIX = {"ratio": 0.4, "seed": 3}
-CONFIGS = Path(__file__).parent.parent / "configs" / "mmdet3d"
 DETECTION = "pointpillars_kitti.py"
-DATA_KEYS = ("type", "data_root", "ann_file", "data_prefix", "pts", "filter_empty_gt")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -313,21 +312,6 @@ def test_other_synthetic_scans_than_the_lists_are_noticed(made: Path, tmp_path: 
         Folder.open(tmp_path / "seg")
 
 
-class FakeLoader:
-    batch_size = 2
-
-    def __init__(self, dataset: Any) -> None:
-        self.dataset = dataset
-
-
-class FakeRunner:
-    world_size, epoch, iter = 1, 7, 0
-    train_loop: Any = None
-
-    def __init__(self, dataset: Any) -> None:
-        self.train_dataloader = FakeLoader(dataset)
-
-
 def test_the_hook_tells_the_epoch_through_wrappers(made: Path) -> None:
     wrapped = DATASETS.build({"type": "RepeatDataset", "times": 2, "dataset": segmentation(made, [PACK])})
     hook, runner = adapter.SynthEpochHook(), FakeRunner(wrapped)
@@ -377,20 +361,6 @@ def test_other_versions_are_refused(version: str, monkeypatch: pytest.MonkeyPatc
     monkeypatch.delitem(sys.modules, adapter.__name__)
     with pytest.raises(LibraryError, match=f"mmdet3d {version}.*install_mmdet3d.sh"):
         importlib.import_module(adapter.__name__)
-
-
-def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """{dotted key: value} of a configuration."""
-    if not isinstance(config, dict):
-        return {prefix: config}
-    return {key: value for name in config for key, value in flat(config[name], f"{prefix}.{name}").items()}
-
-
-def bare(value: Any) -> Any:
-    """A value without mmengine's notes of whose configuration it comes from."""
-    if isinstance(value, dict):
-        return {key: bare(item) for key, item in value.items() if key != "_scope_"}
-    return [bare(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.py")), ids=lambda p: p.stem)

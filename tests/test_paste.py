@@ -1,25 +1,20 @@
 """Objects set into scans: what a sensor would have seen if they had been there, and nothing else."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import assume, example, given, settings
+from pasting import assert_nothing_shares_a_ray
 from worlds import CAR, HEIGHT, SENSOR, WALL, car, cast, wall
 
-from lidar_synth.classes import IGNORE, TRAIN_ID
-from lidar_synth.errors import DataError, FileError
-from lidar_synth.formats import KITTIObject, SemanticKITTI
+from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import locate, project
-from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
+from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import presets
-from lidar_synth.labels import Object, ObjectBank, instances_of, objects_of, paste
-from lidar_synth.labels.boxes import box_frame, grown, joined, overlapping, turned
-from lidar_synth.labels.ground import FLOOR, ground_under
+from lidar_synth.labels import Object, objects_of, paste
 from lidar_synth.labels.pasting import LIFT
-from lidar_synth.town import Town
 
 places = st.tuples(st.floats(5, 30), st.floats(-180, 180), st.floats(-3.1, 3.1))
 
@@ -34,30 +29,6 @@ def seen(box: np.ndarray, ground: float = -HEIGHT) -> Object:
     """A car as the sensor sees it alone in the world."""
     [found] = objects_of(cast([box], ground=ground)).values()
     return found
-
-
-def assert_nothing_shares_a_ray(scan: Scan, first: int) -> None:
-    """Brute force over the instances from ``first`` on: a box holds its object and, else, ground only;
-    no other return lies behind the outline of an object, nor in a cell that shows it."""
-    assert scan.boxes is not None and scan.instance is not None
-    height, width = scan.sensor.shape
-    x, y, z = scan.points.astype(np.float64).T
-    distance = np.sqrt(x * x + y * y + z * z)
-    column = np.floor((1 - np.arctan2(y, x) / np.pi) / 2 * width).astype(int) % width
-    edges = scan.sensor.edges.astype(np.float64)
-    row = np.clip(np.searchsorted(-edges, -np.arcsin(z / distance), side="right") - 1, 0, height - 1)
-    for box, instance in zip(scan.boxes.values, scan.boxes.instance, strict=True):
-        if instance < first:
-            continue
-        own = scan.instance == instance
-        one = Boxes(box, ("Car",))
-        assert one.contain(scan.points[own]).all() and own.any()
-        assert own[one.contain(scan.points, above_floor=2 * FLOOR)[0]].all()
-        for c in np.unique(column[own]):
-            mine, others = own & (column == c), ~own & (column == c)
-            assert not set(row[mine]) & set(row[others])
-            between = others & (row > row[mine].min()) & (row < row[mine].max())
-            assert (distance[between] <= distance[mine].min() + 1e-3).all()
 
 
 @settings(max_examples=25)
@@ -263,159 +234,3 @@ def test_a_coarser_sensor_cannot_lend_objects() -> None:
     fine = paste(cast(sensor=coarse), [seen(car(8, 3))])
     assert fine.boxes is not None and len(fine.boxes) == 1
     assert_nothing_shares_a_ray(fine, 1)
-
-
-@pytest.fixture(scope="module")
-def town() -> Town:
-    return Town(3, scans=60)
-
-
-@pytest.fixture(scope="module")
-def scans(town: Town) -> list[Scan]:
-    return [town[i] for i in (0, 25, 45)]
-
-
-@pytest.fixture(scope="module")
-def bank(scans: list[Scan]) -> ObjectBank:
-    return ObjectBank.from_scans(scans, least=8)
-
-
-def test_objects_are_their_instances(scans: list[Scan], bank: ObjectBank) -> None:
-    """The town's boxes are so tight that noise sticks out of them: they grow by a little, and hold nearly all of it."""
-    assert len(bank) > 20 and (bank.counts >= 8).all()
-    for index in range(len(bank)):
-        found = bank[index]
-        [scan] = [s for s in scans if s.id == found.scan.id]
-        assert scan.boxes is not None and scan.instance is not None and found.scan.boxes is not None
-        box = scan.boxes.values[bank.number[index]]
-        instance = scan.instance == scan.boxes.instance[bank.number[index]]
-        assert found.scan.boxes.contain(found.scan.points).all()
-        assert (found.box[3:6] >= box[3:6]).all() and (found.box[3:6] - box[3:6]).max() < 0.35
-        assert np.isin(found.scan.points[:, 0].round(3), scan.points[instance][:, 0].round(3)).all()
-        assert len(found.scan) >= 0.7 * instance.sum()
-
-
-def test_a_bank_survives_the_disk(bank: ObjectBank, tmp_path: Path) -> None:
-    bank.save(tmp_path / "objects.npz")
-    again = ObjectBank.load(tmp_path / "objects.npz")
-    assert repr(again) == repr(bank) and again.sensor == bank.sensor and again.boxes.names == bank.boxes.names
-    for name in ("scan", "number", "ground", "start", "points", "reflectance", "label"):
-        a, b = getattr(again, name), getattr(bank, name)
-        assert a.dtype == b.dtype and np.array_equal(a, b)
-    assert np.array_equal(again.boxes.occlusion, bank.boxes.occlusion)
-    content = (tmp_path / "objects.npz").read_bytes()
-    (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
-    np.savez(tmp_path / "other.npz", points=np.zeros(3))
-    for name in ("cut", "other"):
-        with pytest.raises(DataError, match=rf"{name}\.npz.*a bank of objects \(lidar-synth-objects/1\)"):
-            ObjectBank.load(tmp_path / f"{name}.npz")
-    with pytest.raises(FileError, match="nowhere"):
-        ObjectBank.load(tmp_path / "nowhere.npz")
-    with pytest.raises(DataError, match="label has shape"):
-        replace(bank, label=bank.label[1:])
-    with pytest.raises(IndexError, match=f"object {len(bank)} of"):
-        bank[len(bank)]
-
-
-def test_a_bank_needs_boxes_and_one_sensor() -> None:
-    with pytest.raises(DataError, match="no box with 5 points in 1 scans"):
-        ObjectBank.from_scans([cast()])
-    with pytest.raises(DataError, match="has no boxes"):
-        objects_of(replace(cast(), boxes=None))
-    mixed = [cast([car(8, 3)]), cast([car(8, 3)], sensor=presets()["os1_128"])]
-    with pytest.raises(DataError, match=r"sensors \['os1_128', 'town'\]"):
-        ObjectBank.from_scans(mixed)
-
-
-def test_without_instances_an_object_is_what_stands_in_its_box() -> None:
-    scan = cast([car(9, 3)])
-    scan.boxes.values[0, 3:6] += 0.4  # as people draw them, with some road
-    for bare in (replace(scan, instance=None), replace(scan, instance=None, label=None)):
-        [found] = objects_of(bare).values()
-        assert (found.scan.label == CAR).all()
-        above = scan.points[scan.instance == 1][:, 2] > -HEIGHT + 0.1
-        assert len(found.scan) == pytest.approx(above.sum(), rel=0.02)
-        assert found.ground == pytest.approx(-HEIGHT, abs=0.02)
-    scan.boxes = Boxes(scan.boxes.values, ("Misc",))
-    [found] = objects_of(replace(scan, label=None)).values()
-    assert (found.scan.label == IGNORE).all()
-
-
-def test_instances_serve_where_there_are_no_boxes() -> None:
-    scan = replace(cast([car(9, 3), car(14, -5), car(40, 20)]), boxes=None)
-    found = instances_of(scan, least=20)
-    assert [len(o.scan) for o in found] == [(scan.instance == i).sum() for i in (1, 2, 3)]
-    pasted = paste(cast(), [o.turned(1.0) for o in found])
-    assert pasted.boxes is not None and len(pasted.boxes) == 3
-    assert_nothing_shares_a_ray(pasted, 1)
-    assert instances_of(cast()) == []
-    with pytest.raises(DataError, match="has no instances"):
-        instances_of(replace(scan, instance=None))
-
-
-@pytest.mark.parametrize("bare", [False, True])
-def test_town_objects_in_a_town_scan(town: Town, bank: ObjectBank, bare: bool) -> None:
-    host = town[32]
-    if bare:
-        host = replace(host, label=None, instance=None, boxes=None, raw_label=None, ring=None)
-    rng = np.random.default_rng(5)
-    first = 1 if host.boxes is None else int(max(host.instance.max(), host.boxes.instance.max())) + 1
-    angles = rng.uniform(-np.pi, np.pi, len(bank))
-    pasted = paste(host, [bank[i].turned(a) for i, a in zip(rng.permutation(len(bank)), angles, strict=True)], count=12)
-    assert pasted.boxes is not None and (pasted.boxes.instance >= first).sum() >= 4
-    assert_nothing_shares_a_ray(pasted, first)
-    new = pasted.boxes[pasted.boxes.instance >= first]
-    for box in new.values:
-        ground = ground_under(host, box)
-        assert ground is not None and abs(box[2] - box[5] / 2 - ground.height) < 0.35
-
-
-def test_real_objects_in_town_scans(real_scans: Path, town: Town) -> None:
-    bank = ObjectBank.from_scans(KITTIObject(real_scans / "kitti_object", "trainval"))
-    assert set(bank.boxes.names) >= {"Car", "Pedestrian", "Cyclist", "Van", "Truck"}
-    assert set(bank.label.tolist()) <= {TRAIN_ID[n] for n in ("car", "truck", "person", "bicyclist")} | {IGNORE}
-    placed = 0
-    for index in (5, 32):
-        host = replace(town[index], boxes=None, instance=None, raw_label=None, ring=None)
-        rng = np.random.default_rng(index)
-        pasted = paste(host, [bank[i].turned(rng.uniform(-3, 3)) for i in rng.permutation(len(bank))])
-        assert pasted.boxes is not None
-        assert_nothing_shares_a_ray(pasted, 1)
-        placed += len(pasted.boxes)
-    assert placed >= 5
-
-
-def test_real_instances_in_town_scans(real_scans: Path, town: Town) -> None:
-    scan = SemanticKITTI(real_scans / "semantic_kitti", split="train")[0]
-    pasted = paste(replace(town[5], boxes=None), [o.turned(0.5) for o in instances_of(scan, 20)])
-    assert pasted.boxes is not None and len(pasted.boxes) >= 2
-    assert_nothing_shares_a_ray(pasted, int(town[5].instance.max()) + 1)
-
-
-@given(st.integers(0, 200))
-def test_boxes_overlap_where_a_point_lies_in_both(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    values = np.c_[
-        rng.uniform(-4, 4, (5, 2)), np.zeros(5), rng.uniform(1, 6, (5, 2)), np.ones(5), rng.uniform(-4, 4, 5)
-    ]
-    values = values.astype(np.float32)
-    grid = np.stack(np.meshgrid(np.linspace(-8, 8, 161), np.linspace(-8, 8, 161)), -1).reshape(-1, 2)
-    inside = Boxes(values, ("Car",) * 5).contain(np.c_[grid, np.zeros(len(grid))].astype(np.float32))
-    both = (inside[0] & inside[1:]).any(1)
-    found = overlapping(values[0], values[1:])
-    assert (both <= found).all()
-    smaller = values[1:] - np.array([0, 0, 0, 0.4, 0.4, 0, 0], np.float32)
-    assert (overlapping(values[0], smaller) <= both).all()  # a corner may lie between the grid's points
-
-
-def test_boxes_grow_no_more_than_they_have_to() -> None:
-    box = car(5, 5, 0.5)
-    corners = Boxes(box, ("Car",)).corners()[0]
-    assert np.allclose(grown(box, corners[:0]), box)
-    out = box[:3] + (corners - box[:3]) * np.float32(1.02)
-    larger = grown(box, out)
-    assert Boxes(larger, ("Car",)).contain(out).all()
-    assert np.allclose(larger[3:6], 1.02 * box[3:6] + 0.002, atol=1e-4)
-    assert np.allclose(np.abs(box_frame(corners, box)), box[3:6] / 2, atol=1e-5)
-    two = joined([Boxes(box, ("Car",)), turned(Boxes(box, ("Van",)), 0.3)])
-    assert two.names == ("Car", "Van") and two.values[1, 6] == pytest.approx(0.8)

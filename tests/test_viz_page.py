@@ -1,0 +1,134 @@
+"""The page: everything in one file, as the pictures have it."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import random_scan
+from pictures import ROAD, SMALL, page_data, pixels
+from PIL import Image
+
+from lidar_synth.classes import COLOURS, IGNORE, TRAIN_ID
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, Scan
+from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.viz import (
+    html_page,
+    picture,
+    scales,
+)
+from lidar_synth.viz.colour import VALUES
+from lidar_synth.viz.page import POINT
+from lidar_synth.viz.render import box_segments
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[Scan]:
+    boxes = Boxes(np.array([(5, 1, -1, 4, 2, 1.5, 0.3)], np.float32), ("Car",))
+    return [
+        replace(random_scan(load_sensor("town"), 3000), boxes=boxes),
+        replace(random_scan(load_sensor("os1_128"), 500, seed=1), label=None, domain=SYNTHETIC, id="</script>&<b>"),
+    ]
+
+
+@pytest.fixture(scope="module")
+def page(scans: list[Scan]) -> str:
+    return html_page(scans, title="A <title> & more", notes="First.\n\nSecond & <last>. @data@")
+
+
+def test_the_points_come_back_from_the_page(page: str, scans: list[Scan]) -> None:
+    for scan, packed in zip(scans, page_data(page)["scans"], strict=True):
+        points = np.frombuffer(base64.b64decode(packed["points"]), POINT)
+        assert len(points) == len(scan) == packed["count"]
+        step = packed["metres"]
+        assert step <= np.abs(scan.points).max() / 32767 * 1.001
+        np.testing.assert_allclose(points["cell"] * step, scan.points, atol=step / 2 * 1.01)
+        np.testing.assert_allclose(points["reflectance"] / 255, scan.reflectance, atol=0.5 / 255 + 1e-6)
+        expected = np.full(len(scan), IGNORE) if scan.label is None else scan.label
+        np.testing.assert_array_equal(points["label"], expected)
+
+
+def test_a_packed_point_is_eight_bytes_without_gaps() -> None:
+    """The viewer reads three int16 at 0 and two uint8 at 6."""
+    assert POINT.itemsize == 8
+    assert {name: place for name, (_, place) in POINT.fields.items()} == {"cell": 0, "reflectance": 6, "label": 7}
+
+
+def test_the_page_says_what_each_scan_is(page: str, scans: list[Scan]) -> None:
+    first, second = page_data(page)["scans"]
+    assert (first["id"], second["id"]) == ("random-0", "</script>&<b>")
+    assert (first["domain"], second["domain"]) == (REAL, SYNTHETIC)
+    assert (first["sensor"], second["sensor"]) == ("town", "os1_128")
+    assert "label" in first["colours"]
+    assert "label" not in second["colours"]
+    assert scans[0].label is not None
+    assert first["classes"][TRAIN_ID["road"]] == (scans[0].label == ROAD).sum()
+    assert sum(first["classes"]) == len(scans[0])
+    lines = np.frombuffer(base64.b64decode(first["boxes"]), "<f4").reshape(-1, 2, 3)
+    np.testing.assert_array_equal(lines, box_segments(scans[0].boxes))
+    assert second["boxes"] == ""
+
+
+def test_the_page_carries_the_range_images(page: str, scans: list[Scan]) -> None:
+    colours = scales(scans)
+    for scan, packed in zip(scans, page_data(page)["scans"], strict=True):
+        image = project(scan)
+        channels = ["range", "reflectance"] + ["label"] * (scan.label is not None)
+        assert [p["title"] for p in packed["pictures"]] == [colours[c].title for c in channels]
+        for channel, shown in zip(channels, packed["pictures"], strict=True):
+            np.testing.assert_array_equal(pixels(shown["uri"]), picture(image, channel, colours[channel]))
+        assert pixels(packed["still"]).shape == (540, 960, 3)
+
+
+def test_the_page_colours_as_the_pictures_do(page: str, scans: list[Scan]) -> None:
+    data, colours = page_data(page), scales(scans)
+    table = np.frombuffer(base64.b64decode(data["table"]), np.uint8).reshape(len(colours), 256, 3)
+    assert list(data["scales"]) == list(VALUES) == list(colours)
+    for name, scale in colours.items():
+        row = data["scales"][name]
+        np.testing.assert_array_equal(table[row["row"]], scale.table)
+        assert (row["low"], row["high"], row["gamma"]) == (scale.low, scale.high, scale.gamma)
+    np.testing.assert_array_equal(table[data["scales"]["label"]["row"], :19], COLOURS)
+
+
+def test_the_page_needs_nothing_from_outside(page: str) -> None:
+    markup = page.replace(json.dumps(page_data(page)), "")
+    assert not re.search(r"https?:|//cdn|@import|import\s*\(|\bfetch\b|XMLHttpRequest|<link|src=[\"'](?!data:)", markup)
+    assert not re.search(r"@(title|notes|draw|script)@", page)
+
+
+def test_text_of_the_user_is_text_on_the_page(page: str) -> None:
+    assert "<title>A &lt;title&gt; &amp; more</title>" in page
+    assert "<p>First.</p><p>Second &amp; &lt;last&gt;. @data@</p>" in page
+    assert page.count("</script>") == 3, "an id cannot end the data"
+
+
+def test_a_camera_image_stands_on_the_page_where_there_is_one(tmp_path: Path) -> None:
+    Image.new("RGB", (1408, 376), (10, 200, 30)).save(tmp_path / "camera.png")
+    with_image = replace(random_scan(SMALL), image_path=tmp_path / "camera.png")
+    [scan] = page_data(html_page([with_image]))["scans"]
+    photo = pixels(scan["pictures"][-1]["uri"])
+    assert photo.shape[1] == 1200
+    assert np.abs(photo.astype(int) - (10, 200, 30)).max() < 8
+    lost = replace(with_image, image_path=tmp_path / "lost.png")
+    assert "camera" not in [p["title"] for p in page_data(html_page([lost]))["scans"][0]["pictures"]]
+
+
+def test_a_full_scan_is_small_enough_to_send() -> None:
+    """120,000 points in 8 bytes each and base64; noise is the worst case for its pictures."""
+    page = html_page([random_scan(load_sensor("hdl64e_kitti360"), 120_000)])
+    assert len(page_data(page)["scans"][0]["points"]) == 120_000 * 8 * 4 / 3
+    assert len(page) < 2.4e6
+
+
+def test_the_page_has_every_element_that_its_script_asks_for() -> None:
+    folder = files("lidar_synth.viz")
+    asked = set(re.findall(r'\$\("(\w+)"\)', folder.joinpath("page.js").read_text()))
+    there = set(re.findall(r'id="(\w+)"', folder.joinpath("page.html").read_text()))
+    assert len(asked) >= 10
+    assert asked <= there
