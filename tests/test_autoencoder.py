@@ -18,7 +18,7 @@ from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models import build_network
 from lidar_synth.models.town_codec.autoencoder import ROUGHNESS, Autoencoder
-from lidar_synth.models.town_codec.multiscale import LATTICES, on
+from lidar_synth.models.town_codec.multiscale import LATTICES, at_lattice
 from lidar_synth.train import (
     Autoencoding,
     Batch,
@@ -63,8 +63,10 @@ def test_columns_turn_together_in_image_and_latent(arguments: dict[str, Any]) ->
     assert z.shape[1:] == net.latent_shape == (8, 2, 4)
     assert torch.allclose(net.encode(x.roll(8, -1)), z.roll(1, -1), atol=1e-5)
     assert torch.allclose(net.decode(z.roll(1, -1)), net.decode(z).roll(8, -1), atol=1e-5)
-    chance = torch.rand(len(z), net.draws, *SENSOR.shape).clamp(1e-6, 1 - 1e-6)
-    assert torch.allclose(net.decode(z.roll(1, -1), chance.roll(8, -1)), net.decode(z, chance).roll(8, -1), atol=1e-4)
+    uniform_noise = torch.rand(len(z), net.draws, *SENSOR.shape).clamp(1e-6, 1 - 1e-6)
+    assert torch.allclose(
+        net.decode(z.roll(1, -1), uniform_noise.roll(8, -1)), net.decode(z, uniform_noise).roll(8, -1), atol=1e-4
+    )
 
 
 def test_rows_are_told_apart() -> None:
@@ -81,14 +83,14 @@ def test_what_leaves_the_codec_is_what_was_said() -> None:
     codec = make_codec(net, TENSORS, SENSOR.shape)
     z = codec.encode(x)
     assert torch.allclose(z * net.scale.view(1, -1, 1, 1) + net.shift.view(1, -1, 1, 1), net.squeeze(x), atol=1e-5)
-    said = net.expand(net.squeeze(x), net.decode(z))
+    predicted = net.expand(net.squeeze(x), net.decode(z))
     fields = TENSORS.decode(codec.decode(z))
     seen = fields["range"] > 0
-    assert not seen[(said.returned <= 0)[:, 0]].any()
+    assert not seen[(predicted.returned <= 0)[:, 0]].any()
     assert seen.any() and not seen.all()
-    metres = TENSORS.normalisation.decode(said.surfaces.likeliest()[:, 0])
+    metres = TENSORS.normalisation.decode(predicted.surfaces.mode()[:, 0])
     assert torch.allclose(fields["range"][seen], metres[seen], rtol=1e-4)
-    likely, code = said.classes.softmax(1).max(1)
+    likely, code = predicted.classes.softmax(1).max(1)
     expected = torch.where(code == 19, IGNORE, code)
     assert torch.equal(fields["label"][seen].long(), expected[seen])
     assert torch.allclose(fields["confidence"][seen], likely[seen].clamp(max=0.9999), atol=1e-4)
@@ -97,25 +99,25 @@ def test_what_leaves_the_codec_is_what_was_said() -> None:
 @pytest.mark.parametrize("lattice", LATTICES)
 def test_chance_draws_what_was_said(lattice: tuple[int, int]) -> None:
     """Over many draws, coarser lattices being as they are: as many returns as the logit says, the medians and the
-    spreads that were said."""
+    spreads that were predicted."""
     net, draws = network(), 4000
     z = torch.randn(1, *net.latent_shape)
     generator = torch.Generator().manual_seed(0)
-    chance = torch.rand(draws, net.draws, *SENSOR.shape, generator=generator).clamp(1e-6, 1 - 1e-6)
+    uniform_noise = torch.rand(draws, net.draws, *SENSOR.shape, generator=generator).clamp(1e-6, 1 - 1e-6)
     for coarser in LATTICES[: LATTICES.index(lattice)]:
-        on(coarser, chance)[:] = on(coarser, chance)[:1].clone()
+        at_lattice(coarser, uniform_noise)[:] = at_lattice(coarser, uniform_noise)[:1].clone()
     with torch.inference_mode():
-        images = torch.cat([net.decode(z.expand(len(part), -1, -1, -1), part) for part in chance.split(500)])
-        said = net.expand(z, images[:1])
+        images = torch.cat([net.decode(z.expand(len(part), -1, -1, -1), part) for part in uniform_noise.split(500)])
+        predicted = net.expand(z, images[:1])
     new = torch.zeros(SENSOR.shape, dtype=torch.bool)
-    on(lattice, new[None])[:] = True
+    at_lattice(lattice, new[None])[:] = True
     for coarser in LATTICES[: LATTICES.index(lattice)]:
-        on(coarser, new[None])[:] = False
+        at_lattice(coarser, new[None])[:] = False
     back = images[:, 0] > -1
-    share = torch.sigmoid(said.returned[0, 0])
+    share = torch.sigmoid(predicted.returned[0, 0])
     assert (back.float().mean(0) - share)[new].abs().max() < 5 * 0.5 / draws**0.5
-    blank = said.readings.blank[0, 0].sigmoid()
-    middle, scale = said.readings.middles[0, 0], said.readings.spreads[0, 0].exp()
+    blank = predicted.readings.blank[0, 0].sigmoid()
+    middle, scale = predicted.readings.middles[0, 0], predicted.readings.spreads[0, 0].exp()
     for widths, below in ((0.0, 0.5), (1.0, 0.731)):  # of a logistic distribution
         expected = torch.where(middle + widths * scale > -1, blank + (1 - blank) * below, 0)
         found = (images[:, 1] <= middle + widths * scale).float().mean(0)
@@ -124,14 +126,16 @@ def test_chance_draws_what_was_said(lattice: tuple[int, int]) -> None:
 
 def test_ranges_are_rough_and_labels_are_the_likeliest() -> None:
     net = network()
-    z, chance = torch.randn(8, *net.latent_shape), torch.rand(8, net.draws, *SENSOR.shape).clamp(1e-6, 1 - 1e-6)
+    z, uniform_noise = torch.randn(8, *net.latent_shape), torch.rand(8, net.draws, *SENSOR.shape).clamp(1e-6, 1 - 1e-6)
     with torch.inference_mode():
-        images = net.decode(z, chance)
-        said = net.expand(z, images)
-        assert torch.equal(said.drawn(chance)[:, 1:], images[:, 1:2]), "what was drawn is what is said, seeing the rest"
-    off = (images[:, :1] - said.surfaces.likeliest()).abs()[images[:, :1] > -1]
+        images = net.decode(z, uniform_noise)
+        predicted = net.expand(z, images)
+        assert torch.equal(predicted.sample(uniform_noise)[:, 1:], images[:, 1:2]), (
+            "what was drawn is what is predicted, seeing the rest"
+        )
+    off = (images[:, :1] - predicted.surfaces.mode()).abs()[images[:, :1] > -1]
     assert off.mean().item() == pytest.approx(ROUGHNESS, rel=0.2)
-    code = said.classes.argmax(1)
+    code = predicted.classes.argmax(1)
     bits = torch.stack([(code >> bit & 1) > 0 for bit in reversed(range(5))], 1)
     assert torch.equal(images[:, 2:] > 0, bits)
 
@@ -141,15 +145,18 @@ def test_the_loss_by_hand(rare: float) -> None:
     net, x = network(), tensors()
     weights = {"range": 5.0, "reflectance": 0.5, "label": 2.0}
     trained = Autoencoding(net, TENSORS, SENSOR, Losses(noise=0.0, rare=rare), METRICS["l1"], weights).eval()
-    said = net.expand(net.squeeze(x), x)
+    predicted = net.expand(net.squeeze(x), x)
     images = [project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS]
     mask = torch.from_numpy(np.stack([image.mask for image in images]))
     label = torch.from_numpy(np.stack([image.channels["label"] for image in images]).astype(np.int64))
     label = torch.where(label == IGNORE, 19, label)
-    share = said.surfaces.chosen.softmax(1)
-    ranges = Laplace(said.surfaces.values, said.surfaces.spreads.exp()).log_prob(x[:, :1]).exp()
-    blank, off = said.readings.blank.sigmoid(), (x[:, 1:2] - said.readings.middles) / said.readings.spreads.exp()
-    number = (1 - blank) / (4 * said.readings.spreads.exp() * torch.cosh(off / 2) ** 2)
+    share = predicted.surfaces.chosen.softmax(1)
+    ranges = Laplace(predicted.surfaces.values, predicted.surfaces.spreads.exp()).log_prob(x[:, :1]).exp()
+    blank, off = (
+        predicted.readings.blank.sigmoid(),
+        (x[:, 1:2] - predicted.readings.middles) / predicted.readings.spreads.exp(),
+    )
+    number = (1 - blank) / (4 * predicted.readings.spreads.exp() * torch.cosh(off / 2) ** 2)
     others = torch.where(x[:, 1:2] > -1, number, blank + (1 - blank) * torch.sigmoid(off)).log()
     cells = torch.tensor([(label == code).double().mean().item() for code in label.flatten()]).reshape(label.shape)
     weight = cells.pow(-rare)
@@ -158,10 +165,10 @@ def test_the_loss_by_hand(rare: float) -> None:
         return (weight * values)[where].sum() / weight[where].sum()
 
     by_hand = (
-        torch.nn.functional.binary_cross_entropy_with_logits(said.returned[:, 0], mask.float())
+        torch.nn.functional.binary_cross_entropy_with_logits(predicted.returned[:, 0], mask.float())
         - 5 * mean((share * ranges).sum(1).log(), mask)
         - 0.5 * mean(others[:, 0], mask)
-        + 2 * mean(torch.nn.functional.cross_entropy(said.classes, label, reduction="none"), torch.ones_like(mask))
+        + 2 * mean(torch.nn.functional.cross_entropy(predicted.classes, label, reduction="none"), torch.ones_like(mask))
     )
     assert trained(x).item() == pytest.approx(by_hand.item(), rel=1e-5)
     assert trained(x, torch.randn_like(x)).item() == pytest.approx(by_hand.item(), rel=1e-5), "noise of deviation 0"

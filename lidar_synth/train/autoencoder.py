@@ -33,11 +33,11 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models.convolution import Norm, WrapConv
 from lidar_synth.models.lidm.vqvae import VQVAE, Encoding
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
-from lidar_synth.models.town_codec.heads import Heads
+from lidar_synth.models.town_codec.distributions import CellDistributions
 from lidar_synth.train.data import Batch
 
 CURVE_LENGTH = 4
-"""Neighbours in a row whose points are averaged, as LiDM has it."""
+"""LatticeRefinement in a row whose points are averaged, as LiDM has it."""
 
 _QUERIES = 2048  # points whose nearest neighbours are looked for
 
@@ -111,7 +111,7 @@ class Autoencoding(nn.Module):
             shape = self.network.latent_shape
             noise = torch.zeros_like(x) if noise is None else noise
             some = noise.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
-            return self._told(self.network(x, self.losses.noise * some), x)
+            return self._nll(self.network(x, self.losses.noise * some), x)
         encoding: Encoding = self.network(x)
         output = encoding.output.float()
         loss = self.reconstruction(output, x) + self.losses.commitment * encoding.gap.mean()
@@ -132,12 +132,12 @@ class Autoencoding(nn.Module):
             loss = loss + self.weights.get(name, 1.0) * part
         return loss
 
-    def _told(self, heads: Heads, x: Tensor) -> Tensor:
-        """The loss of what an ``Autoencoder`` says, a scalar."""
+    def _nll(self, heads: CellDistributions, x: Tensor) -> Tensor:
+        """The negative log-likelihood of images under the predicted distributions, a scalar."""
         count = 1 + heads.readings.middles.shape[1]
         distance, values = x[:, :1], x[:, 1:count]
         returned = (distance > -1).float()
-        surprise = [heads.surfaces.surprise(distance), heads.readings.surprise(values)]
+        nll = [heads.surfaces.nll(distance), heads.readings.nll(values)]
         loss = F.binary_cross_entropy_with_logits(heads.returned.float(), returned)
         weight = torch.ones_like(returned)
         if codes := heads.classes.shape[1]:
@@ -146,7 +146,7 @@ class Autoencoding(nn.Module):
             unlikely = F.cross_entropy(heads.classes.float(), code, reduction="none")
             loss = loss + self.weights.get("label", 1.0) * (weight[:, 0] * unlikely).sum() / weight.sum()
         weight = weight * returned
-        means = (torch.cat(surprise, 1) * weight).sum((0, 2, 3)) / weight.sum().clamp(min=1)
+        means = (torch.cat(nll, 1) * weight).sum((0, 2, 3)) / weight.sum().clamp(min=1)
         for name, mean in zip(self.tensors.channels, means, strict=False):  # the label has no mean
             loss = loss + self.weights.get(name, 1.0) * mean
         return loss

@@ -26,7 +26,7 @@ class Decoding(Autoencoding):
 
     def forward(self, z: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]  # it does not make its latents
         """The loss of images (B, C, H, W) under what latents (B, *latent_shape) say, a scalar."""
-        return self._told(self.network.expand(self.network.bounded(z), x), x)
+        return self._nll(self.network.expand(self.network.bounded(z), x), x)
 
 
 def decoding_loss(network: nn.Module, example: Example, metric: Metric) -> Tensor:

@@ -1,13 +1,13 @@
-"""Autoencoder of range images that two CPU cores can train: patches in, few convolutions, one head per channel.
+"""Autoencoder of range images that two CPU cores can train.
 
 An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 8) in (-1, 1), the size of LiDM's (Ran et al., "Towards
 Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024). In place of a codebook, the latent is bounded and
-the decoder is trained on latents with noise, so that it forgives what a flow leaves. Every norm is over the channels
-of one cell: a crop in training and the whole turn in use give the same.
+the decoder is trained on noisy latents, so that it tolerates the errors of a flow. Every norm is over the channels of
+one cell, so that crops (in training) and full turns (in use) give the same result.
 
-What a sensor leaves to chance (whether a ray returns, the speckle of a reflectance) no latent can hold. The decoder
-therefore says distributions, and an image is drawn from them: what it would be on average is smoother than any scan,
-and a network that is trained on such images takes the noise of real ones for something that it has never seen.
+No latent can hold what is random about a sensor: whether a ray returns, the speckle of a reflectance. The decoder
+therefore predicts distributions, and an image is sampled from them: the mean would be smoother than any real scan, and
+a network trained on such means would take the noise of real scans for something new.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,22 +22,26 @@ from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.models.codebook import follow
 from lidar_synth.models.convolution import WrapConv, check_shape, pair, reduced
 from lidar_synth.models.layers import EPS
-from lidar_synth.models.town_codec.heads import Heads
-from lidar_synth.models.town_codec.multiscale import LATTICES, Neighbours, on, ratio
-from lidar_synth.models.town_codec.plane_fit import Consensus
-from lidar_synth.models.town_codec.planes import Planes, Surfaces, laplace
-from lidar_synth.models.town_codec.reflectance import Readings
+from lidar_synth.models.town_codec.distributions import CellDistributions
+from lidar_synth.models.town_codec.multiscale import LATTICES, LatticeRefinement, at_lattice, step_ratio
+from lidar_synth.models.town_codec.plane_fit import PlaneFit
+from lidar_synth.models.town_codec.planes import Planes, RangeMixture, laplace_noise
+from lidar_synth.models.town_codec.reflectance import ZeroInflatedLogistic
 
 DETAIL = (2, 4)
-"""Rows and columns of the patches that the outer convolutions see."""
+"""Rows and columns of the patches that the outer convolutions work on."""
 DOWN = (4, 8)
 """Rows and columns of one latent cell."""
 PLANES = 2
-"""Surfaces of a patch that a cell may see: one, and what is behind its edge."""
+"""Planes per patch: one, and what is behind its edge."""
 SPREADS = -4.6, 0.0
-"""Limits of the logarithms of other values' spreads."""
+"""Limits of the logarithm of the other values' scales."""
 ROUGHNESS = 5e-4
-"""Scale of the noise of drawn ranges, normalised: 1.3 cm at 10 m in R2Flow's scale."""
+"""Scale of the noise of sampled ranges, normalised: 1.3 cm at 10 m in R2Flow's scale."""
+
+Grid = tuple[int, int]
+Observe = Callable[[CellDistributions, Grid], Tensor]
+"""(predicted distributions, lattice) to the values of its cells: sampled, or those of a given image."""
 
 
 class Residual(nn.Module):
@@ -45,7 +49,7 @@ class Residual(nn.Module):
 
     Args:
         channels: C.
-        reach: columns from one cell that the second convolution sees to the next.
+        reach: dilation of the second convolution, in columns.
     """
 
     def __init__(self, channels: int, reach: int = 1) -> None:
@@ -71,12 +75,11 @@ class Autoencoder(nn.Module):
         latent_channels: Z.
         widths: channels on patches of 2 x 4 cells and of 4 x 8.
         depth: residual blocks of the decoder on the coarser grid; one less after it, one less on it in the encoder.
-        wide: reaches of further blocks of the decoder on the coarser grid: a wall is straight over many cells.
-        window: rows and columns of patches of 2 x 4 cells that settle on common planes; none without.
+        wide: dilations of further blocks of the decoder on the coarser grid, since a wall is straight over many cells.
+        window: rows and columns of patches of 2 x 4 cells over which planes are fitted; empty = no plane fit.
         fine: channels of the decoder's last map, on single cells.
         normalisation: a name of ``NORMALISATIONS``, that of the range.
-        angles: (2, H, W) elevation and azimuth of the cells' rays, radians; without them they have to come from a
-            checkpoint.
+        angles: (2, H, W) elevation and azimuth of the cells' rays, radians; None if a checkpoint will be loaded.
 
     Raises:
         ConfigError: on values that do not fit together.
@@ -116,10 +119,10 @@ class Autoencoder(nn.Module):
         outer, inner = widths
         self.channels, self.values, self.bits, self.fine = channels, channels - bits - 1, bits, fine
         self.draws = 2 + self.values
-        """Random numbers that an image takes per cell."""
+        """Random numbers per cell that sampling an image takes."""
         self.latent_shape = (latent_channels, *reduced(self.resolution, [DOWN], "an image"))
         """Channels, rows and columns of a latent."""
-        # What lies where is known by row: on a road, a beam's elevation gives its range.
+        # Learned biases by row: on a road, a beam's elevation gives its range.
         self.place_stem = _rows(outer, rows // DETAIL[0])
         self.place_latent = _rows(inner, rows // DOWN[0])
         self.place_outer = _rows(outer, rows // DETAIL[0])
@@ -137,32 +140,32 @@ class Autoencoder(nn.Module):
         self.refine = WrapConv(fine, fine)
         grid = rows // DETAIL[0], self.resolution[1] // DETAIL[1]
         rise = torch.zeros(rows) if angles is None else angles[0].mean(1).tan()
-        consensus = Consensus(outer, grid, DETAIL, PLANES, pair(window), rise) if window else None
+        consensus = PlaneFit(outer, grid, DETAIL, PLANES, pair(window), rise) if window else None
         self.planes = Planes(outer, DETAIL, PLANES, NORMALISATIONS[normalisation], consensus)
         self.sizes = [PLANES, self.values, self.values, self.values, 1, codes]
         self.heads = nn.Conv2d(fine, sum(self.sizes), 1)
         self.neighbours = nn.ModuleList(
-            Neighbours(fine, 1 + 2 * self.values, 2 * fine, ratio(a, b)) for a, b in pairwise(LATTICES)
+            LatticeRefinement(fine, 1 + 2 * self.values, 2 * fine, step_ratio(a, b)) for a, b in pairwise(LATTICES)
         )
-        # Latents leave with mean 0 and variance 1 per channel, as a flow from standard normal noise likes them.
+        # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise needs.
         self.register_buffer("shift", torch.zeros(latent_channels))
         self.register_buffer("scale", torch.ones(latent_channels))
 
-    def forward(self, x: Tensor, noise: Tensor) -> Heads:
-        """Images (B, C, H, W) there and back with ``noise`` (B, *latent_shape) on the bounded latents; in training, the
-        latents' statistics move."""
+    def forward(self, x: Tensor, noise: Tensor) -> CellDistributions:
+        """Encodes images (B, C, H, W) and decodes them with ``noise`` (B, *latent_shape) added to the bounded latents;
+        in training mode, updates the running statistics of the latents."""
         z = self.squeeze(x)
         if self.training:
             follow(z.detach(), self.shift, self.scale)
         return self.expand(z + noise, x)
 
     def encoder(self) -> list[nn.Parameter]:
-        """The weights that make latents; all others make images of them."""
+        """The weights of the encoder; all others belong to the decoder."""
         parts = self.stem, self.encode_outer, self.merge, self.encode_inner, self.to_latent
         return [self.place_stem, *(weight for part in parts for weight in part.parameters())]
 
     def bounded(self, z: Tensor) -> Tensor:
-        """Latents (B, *latent_shape) of mean 0 and variance 1 as they leave ``squeeze``."""
+        """Normalised latents (B, *latent_shape) back to the bounded ones of ``squeeze``."""
         return z * _channel(self.scale) + _channel(self.shift)
 
     def encode(self, x: Tensor) -> Tensor:
@@ -170,28 +173,28 @@ class Autoencoder(nn.Module):
         per channel."""
         return (self.squeeze(x) - _channel(self.shift)) / _channel(self.scale)
 
-    def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
+    def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         """Latents to images.
 
         Args:
             z: (B, *latent_shape).
-            chance: (B, draws, H, W) random numbers in (0, 1) to draw an image by; None = the likeliest of everything.
+            uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample an image with; None = the mode.
 
         Returns:
-            (B, C, H, W): the range -1 where there is no return; the bits as logits of the likeliest code, which are as
-            far from 0 as this one is likely.
+            (B, C, H, W): range -1 where there is no return; bits as logits of the most likely code, whose magnitude
+            grows with its probability.
         """
         check_shape(z, self.latent_shape, "a latent")
-        said = self._tell(
+        predicted = self._decode_lattices(
             self.bounded(z),
-            lambda said, lattice: said.drawn(None if chance is None else on(lattice, chance)),
+            lambda cells, lattice: cells.sample(None if uniform_noise is None else at_lattice(lattice, uniform_noise)),
         )
-        distance, seen = said.surfaces.likeliest(), said.drawn(chance)
-        if chance is not None:
-            distance = distance + ROUGHNESS * laplace(chance[:, :1])
+        distance, seen = predicted.surfaces.mode(), predicted.sample(uniform_noise)
+        if uniform_noise is not None:
+            distance = distance + ROUGHNESS * laplace_noise(uniform_noise[:, :1])
         parts = [torch.where(seen[:, :1] > 0, distance, -1.0), seen[:, 1:]]
         if self.bits:
-            likely, code = said.classes.float().softmax(1).max(1)
+            likely, code = predicted.classes.float().softmax(1).max(1)
             parts += [self._corners(code) * (2 * torch.atanh(likely.clamp(max=0.9999)))[:, None]]
         return torch.cat(parts, 1)
 
@@ -204,34 +207,34 @@ class Autoencoder(nn.Module):
         h = self.encode_outer(h + self.place_stem)
         return torch.tanh(self.to_latent(self.encode_inner(self.merge(h))).float())
 
-    def expand(self, z: Tensor, image: Tensor) -> Heads:
-        """Bounded latents to what is said of every cell, its neighbours on coarser ``LATTICES`` being as in an image
+    def expand(self, z: Tensor, image: Tensor) -> CellDistributions:
+        """Bounded latents to the distributions of every cell, given its neighbours on coarser ``LATTICES`` of an image
         (B, C, H, W)."""
         seen = torch.cat([(image[:, :1] > -1).to(image.dtype), image[:, 1 : 1 + self.values]], 1)
-        return self._tell(z, lambda said, lattice: on(lattice, seen))
+        return self._decode_lattices(z, lambda _, lattice: at_lattice(lattice, seen))
 
-    def _tell(self, z: Tensor, see: Callable[[Heads, tuple[int, int]], Tensor]) -> Heads:
-        """What is said of every cell, lattice by lattice; ``see`` tells what came out on one."""
+    def _decode_lattices(self, z: Tensor, observe: Observe) -> CellDistributions:
+        """The distributions of every cell, lattice by lattice; ``observe`` gives the values of the cells of one."""
         z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
         h = self.decode_inner(self.from_latent(z) + self.place_latent)
         h = self.decode_outer(F.pixel_shuffle(self.split(h), 2) + self.place_outer)
         planes = self.planes(h)
         h = _unpatch(self.spread(h), self.fine) + self.place_fine
         h = h + F.silu(self.refine(h))
-        said = self.heads(on(LATTICES[0], h))
+        predicted = self.heads(at_lattice(LATTICES[0], h))
         for (known, finer), neighbours in zip(pairwise(LATTICES), self.neighbours, strict=True):
-            seen = see(self._named(planes, said, known), known)
-            alone = self._named(planes, self.heads(on(known, h)), known)
-            closer = self.heads(neighbours(on(finer, h), alone.unexpected(seen)))
-            on(ratio(known, finer), closer)[:] = said
-            said = closer
-        return self._named(planes, said, LATTICES[-1])
+            seen = observe(self._distributions(planes, predicted, known), known)
+            alone = self._distributions(planes, self.heads(at_lattice(known, h)), known)
+            closer = self.heads(neighbours(at_lattice(finer, h), alone.residual(seen)))
+            at_lattice(step_ratio(known, finer), closer)[:] = predicted
+            predicted = closer
+        return self._distributions(planes, predicted, LATTICES[-1])
 
-    def _named(self, planes: tuple[Tensor, Tensor], said: Tensor, lattice: tuple[int, int]) -> Heads:
-        chosen, middles, spreads, blank, *rest = torch.split(said, self.sizes, 1)
-        ranges, doubts = (on(lattice, part) for part in planes)
-        readings = Readings(middles.float(), spreads.float().clamp(*SPREADS), blank.float())
-        return Heads(Surfaces(ranges, doubts, chosen.float()), readings, *rest)
+    def _distributions(self, planes: tuple[Tensor, Tensor], predicted: Tensor, lattice: Grid) -> CellDistributions:
+        chosen, middles, spreads, blank, *rest = torch.split(predicted, self.sizes, 1)
+        ranges, doubts = (at_lattice(lattice, part) for part in planes)
+        readings = ZeroInflatedLogistic(middles.float(), spreads.float().clamp(*SPREADS), blank.float())
+        return CellDistributions(RangeMixture(ranges, doubts, chosen.float()), readings, *rest)
 
     def _corners(self, code: Tensor) -> Tensor:
         """Codes (B, H, W) as their bits (B, bits, H, W), -1 and 1, highest first."""

@@ -1,9 +1,9 @@
-"""Patches that see the same plane settle on it: least squares over a neighbourhood, weighted by attention.
+"""Attention-weighted plane fitting: least squares over a neighbourhood of patches.
 
-A patch of a few cells sees too little of a wall to say how far it is to a per cent, and patches that are each off by
-as much are a wall that bends. What they say together is better. With the azimuth p of a ray, the tangent e of its
-elevation and s = 1 / (r cos(elevation)), every plane has s = a cos p + b sin p + c e, with the same a, b and c wherever
-it is seen from the sensor. So each patch attends to those around it, and what it finds are the moments of a fit.
+One patch of a few cells estimates the range of a wall to about a per cent, and neighbouring patches with independent
+errors give a wall that bends. A joint fit is more accurate. With the azimuth p of a ray, the tangent e of its elevation
+and s = 1 / (r cos(elevation)), every plane satisfies s = a cos p + b sin p + c e with the same a, b and c for all rays.
+Each patch attends to its neighbours; the attended values are the moments of the least-squares fit.
 """
 
 import math
@@ -14,17 +14,17 @@ from torch import Tensor, nn
 from lidar_synth.models.attention import Grid, NeighbourhoodAttention
 
 FEATURES = 16
-"""Numbers by which patches know each other."""
+"""Size of the learned part of queries and keys."""
 ALIKE = 0.15
-"""Distances that differ by this share are on different planes, as far as a network knows that has not been trained."""
+"""Relative difference of ranges at which an untrained network takes two patches for different planes."""
 RISE = 8.0
-"""Factor of tangents, which over a few rows differ less than azimuths do."""
+"""Scale of the tangents, which vary less over a few rows than azimuths do."""
 RIDGE = 1e-4
-"""Weight of a plane that faces the sensor, against neighbourhoods that say nothing of a slope."""
+"""Ridge regularisation towards a plane that faces the sensor, for neighbourhoods that do not determine a slope."""
 
 
-class Consensus(nn.Module):
-    """Planes that neighbours agree on.
+class PlaneFit(nn.Module):
+    """Fits planes to the ranges that neighbouring patches predict.
 
     Args:
         channels: of the features of a patch.
@@ -32,7 +32,7 @@ class Consensus(nn.Module):
         patch: rows and columns of a patch.
         count: planes per patch.
         window: rows and columns of a neighbourhood, odd, in patches.
-        rise: (H,) tangents of the elevations of the rows of cells, to begin with.
+        rise: (H,) tangents of the elevations of the rows of cells; initial values of a parameter.
     """
 
     def __init__(self, channels: int, grid: Grid, patch: Grid, count: int, window: Grid, rise: Tensor) -> None:
@@ -46,17 +46,18 @@ class Consensus(nn.Module):
         nn.init.zeros_(self.look.bias)  # type: ignore[arg-type]  # it has one
 
     def forward(self, x: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """What neighbours agree on, and whether to follow them.
+        """Ranges of the fitted planes, and the weight of the fit.
 
         Args:
             x: (B, C, h, w) features.
-            distance: (B, K, h, w) logarithms of what each patch says of its middle by itself, metres.
+            distance: (B, K, h, w) logarithms of the ranges (metres) that each patch predicts for its centre.
 
         Returns:
-            (B, K, H, W) inverse ranges and (B, K, h, w) shares in (0, 1).
+            (B, K, H, W) inverse ranges of the fitted planes, and (B, K, h, w) weights in (0, 1) of the fit against the
+            patch's own prediction.
         """
         seen, shown, trust = self.look(x).float().unflatten(1, (self.count, -1)).split([FEATURES, FEATURES, 1], 2)
-        # -k (d - d')^2, but for what is the same for all keys, is a product too.
+        # -k (d - d')^2, up to a term that is the same for all keys, is a scalar product too.
         strict, far = self.strict.float().exp(), _tokens(distance[:, :, None])
         query = torch.cat([_tokens(seen), 2 * strict * far, torch.ones_like(far)], -1)
         key = torch.cat([_tokens(shown), far, -strict * far**2], -1)
@@ -70,7 +71,7 @@ class Consensus(nn.Module):
         return self._cells(*plane), trust[:, :, 0].sigmoid()
 
     def _cells(self, facing: Tensor, across: Tensor, climb: Tensor) -> Tensor:
-        """The inverse ranges (B, K, H, W) of planes (B, K, h, w), each in the frame of its patch."""
+        """The inverse ranges (B, K, H, W) of planes (B, K, h, w), each given in the frame of its patch."""
         rows, columns = self.patch
         offset = torch.arange(columns, device=facing.device) - (columns - 1) / 2
         turn = (offset * (2 * math.pi / (self.grid[1] * columns))).repeat(self.grid[1])
@@ -85,15 +86,15 @@ def _tokens(x: Tensor) -> Tensor:
 
 
 def _fit(found: Tensor, cos: Tensor, sin: Tensor, up: Tensor, alone: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Planes (B, N, K, 1) from moments (B, N, K, 9), in frames that are turned to azimuths of ``cos`` and ``sin``;
-    where these say nothing, a plane that faces the sensor where a patch by itself says it is."""
+    """Planes (B, N, K, 1) from moments (B, N, K, 9), in frames rotated to the azimuths of ``cos`` and ``sin``. Where
+    the moments do not determine a plane, it faces the sensor at the patch's own range."""
     cc, cs, ss, cu, su, uu, ci, si, ui = torch.split(found, 1, -1)
     m00 = cos * cos * cc + 2 * cos * sin * cs + sin * sin * ss + RIDGE
     m01 = (cos * cos - sin * sin) * cs + cos * sin * (ss - cc)
     m11 = sin * sin * cc - 2 * cos * sin * cs + cos * cos * ss + RIDGE
     m02, m12, m22 = cos * cu + sin * su, cos * su - sin * cu, uu + RIDGE
     y0, y1, y2 = cos * ci + sin * si + RIDGE * alone, cos * si - sin * ci, ui
-    # Gauss: the matrix is positive.
+    # Gaussian elimination; the matrix is positive definite.
     below, last = m01 / m00, m02 / m00
     m11, m12, m22 = m11 - below * m01, m12 - below * m02, m22 - last * m02
     y1, y2 = y1 - below * y0, y2 - last * y0

@@ -1,7 +1,7 @@
-"""What a sensor reads of a return beside its range, such as the reflectance: a number, or 0 for no visible reason.
+"""Zero-inflated reflectance: a logistic distribution with a separate probability of 0.
 
-One return in eleven reads 0 in scans of KITTI-360, one in six in KITTI's. A distribution with one peak makes too few of
-them, or everything darker; so 0 has a chance of its own.
+One return in eleven has reflectance 0 in KITTI-360, one in six in KITTI. A distribution with one mode samples too few
+of them, or makes everything darker.
 """
 
 from typing import NamedTuple
@@ -11,17 +11,17 @@ import torch.nn.functional as F
 from torch import Tensor
 
 BLANK = -1.0
-"""A reading of 0, normalised."""
-_FAR = 8.0  # scales of a reading that could hardly be less expected
-_SURE = 1e-6  # how near to 0 and 1 a chance may come: its logit stays finite
+"""The normalised value of 0."""
+_FAR = 8.0  # largest residual, in scales
+_SURE = 1e-6  # distance from 0 and 1 that keeps a logit finite
 
 
-class Readings(NamedTuple):
-    """What each cell may read of V channels: 0, or a logistic distribution.
+class ZeroInflatedLogistic(NamedTuple):
+    """Per cell and channel: 0 with some probability, else a logistic distribution.
 
     Args:
-        middles: (B, V, H, W) medians, normalised, of what is not 0.
-        spreads: (B, V, H, W) logarithms of the distributions' scales.
+        middles: (B, V, H, W) medians of the logistic distributions, normalised.
+        spreads: (B, V, H, W) logarithms of their scales.
         blank: (B, V, H, W) logits of a 0.
     """
 
@@ -29,27 +29,29 @@ class Readings(NamedTuple):
     spreads: Tensor
     blank: Tensor
 
-    def surprise(self, x: Tensor) -> Tensor:
-        """(B, V, H, W) negative log-likelihoods of normalised readings (B, V, H, W); what would lie below 0 reads 0."""
+    def nll(self, x: Tensor) -> Tensor:
+        """(B, V, H, W) negative log-likelihood of normalised values (B, V, H, W). The logistic mass below 0 counts as
+        0."""
         off = (x - self.middles) * torch.exp(-self.spreads)
         number = F.logsigmoid(-self.blank)
         below = torch.logaddexp(F.logsigmoid(self.blank), number + F.logsigmoid(off))
         density = number + F.logsigmoid(off) + F.logsigmoid(-off) - self.spreads
         return -torch.where(x > BLANK, density, below)
 
-    def unexpected(self, x: Tensor) -> Tensor:
-        """(B, 2 V, H, W) how far readings (B, V, H, W) are from what was said: 0 or not, and the numbers in scales."""
+    def residual(self, x: Tensor) -> Tensor:
+        """(B, 2 V, H, W) of values (B, V, H, W): whether 0 minus its probability, and the distance to the median in
+        scales."""
         nothing = x <= BLANK
         off = ((x - self.middles) * torch.exp(-self.spreads)).clamp(-_FAR, _FAR) / 2
         return torch.cat([nothing.float() - torch.sigmoid(self.blank), torch.where(nothing, 0.0, off)], 1)
 
-    def likeliest(self) -> Tensor:
-        """(B, V, H, W) 0, or the median."""
+    def mode(self) -> Tensor:
+        """(B, V, H, W) 0 where that is more likely than not, else the median."""
         return torch.where(self.blank > 0, BLANK, self.middles)
 
-    def drawn(self, chance: Tensor) -> Tensor:
-        """(B, V, H, W) readings by as many numbers in (0, 1)."""
+    def sample(self, uniform_noise: Tensor) -> Tensor:
+        """(B, V, H, W) values from uniform numbers (B, V, H, W) in (0, 1), by the inverse distribution function."""
         blank = torch.sigmoid(self.blank)
-        rest = ((chance - blank) / (1 - blank)).clamp(_SURE, 1 - _SURE)
+        rest = ((uniform_noise - blank) / (1 - blank)).clamp(_SURE, 1 - _SURE)
         numbers = (self.middles + self.spreads.exp() * torch.logit(rest)).clamp(min=BLANK)
-        return torch.where(chance < blank, BLANK, numbers)
+        return torch.where(uniform_noise < blank, BLANK, numbers)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lidar_synth.geometry.normalize import NORMALISATIONS
-from lidar_synth.models.town_codec.planes import SLOPES, Planes, Surfaces, laplace
+from lidar_synth.models.town_codec.planes import SLOPES, Planes, RangeMixture, laplace_noise
 
 PATCH = (2, 4)
 
@@ -54,14 +54,14 @@ def test_candidates_are_returns_whatever_the_network_says() -> None:
 def test_a_cell_sees_one_surface_never_what_lies_between() -> None:
     values = torch.tensor([-0.5, 0.5]).view(1, 2, 1, 1).expand(1, 2, 4, 8)
     chosen = torch.randn(1, 2, 4, 8)
-    said = Surfaces(values, torch.full_like(values, -3.0), chosen)
-    likeliest = said.likeliest()
+    predicted = RangeMixture(values, torch.full_like(values, -3.0), chosen)
+    likeliest = predicted.mode()
     assert set(likeliest.unique().tolist()) == {-0.5, 0.5}
     assert torch.equal(likeliest[0, 0] > 0, chosen[0, 1] > chosen[0, 0])
-    assert (said.surprise(likeliest) < said.surprise(torch.zeros_like(likeliest))).all()
+    assert (predicted.nll(likeliest) < predicted.nll(torch.zeros_like(likeliest))).all()
 
 
 def test_draws_are_those_of_laplace() -> None:
-    chance = (torch.arange(10_000) + 0.5) / 10_000
-    drawn = laplace(chance)
-    assert torch.allclose(torch.distributions.Laplace(0.0, 1.0).cdf(drawn), chance, atol=1e-6)
+    uniform_noise = (torch.arange(10_000) + 0.5) / 10_000
+    drawn = laplace_noise(uniform_noise)
+    assert torch.allclose(torch.distributions.Laplace(0.0, 1.0).cdf(drawn), uniform_noise, atol=1e-6)

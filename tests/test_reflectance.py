@@ -1,19 +1,19 @@
-"""What a sensor reads beside the range: 0 with a chance of its own, or a number around a median."""
+"""What a sensor reads beside the range: 0 with a uniform_noise of its own, or a number around a median."""
 
 import pytest
 import torch
 from torch import Tensor
 
-from lidar_synth.models.town_codec.reflectance import BLANK, Readings
+from lidar_synth.models.town_codec.reflectance import BLANK, ZeroInflatedLogistic
 
 CASES = [(0.1, 0.15, 0.2), (-0.9, 0.2, 0.001), (0.8, 0.05, 0.9)]
 """Medians, scales, shares of a 0."""
 
 
-def readings(middle: float, scale: float, blank: float, cells: int = 1) -> Readings:
+def readings(middle: float, scale: float, blank: float, cells: int = 1) -> ZeroInflatedLogistic:
     values = torch.tensor([middle, scale, blank], dtype=torch.float64)
     parts = values[0], values[1].log(), values[2].logit()
-    return Readings(*(part.expand(cells, 1, 1, 1) for part in parts))
+    return ZeroInflatedLogistic(*(part.expand(cells, 1, 1, 1) for part in parts))
 
 
 def column(values: Tensor) -> Tensor:
@@ -22,24 +22,24 @@ def column(values: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("case", CASES)
 def test_chances_add_up_to_one(case: tuple[float, float, float]) -> None:
-    said = readings(*case)
+    predicted = readings(*case)
     x = torch.linspace(BLANK + 1e-9, 9, 100_001, dtype=torch.float64)
-    numbers = torch.trapezoid(torch.exp(-said.surprise(column(x))).flatten(), x)
-    nothing = torch.exp(-said.surprise(column(torch.tensor([BLANK]))))
+    numbers = torch.trapezoid(torch.exp(-predicted.nll(column(x))).flatten(), x)
+    nothing = torch.exp(-predicted.nll(column(torch.tensor([BLANK]))))
     assert numbers + nothing == pytest.approx(1, abs=1e-4)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_draws_are_as_likely_as_was_said(case: tuple[float, float, float]) -> None:
     count = 100_000
-    drawn = readings(*case, cells=count).drawn(column((torch.arange(count) + 0.5) / count)).flatten()
-    said = readings(*case)
-    nothing = torch.exp(-said.surprise(column(torch.tensor([BLANK])))).item()
+    drawn = readings(*case, cells=count).sample(column((torch.arange(count) + 0.5) / count)).flatten()
+    predicted = readings(*case)
+    nothing = torch.exp(-predicted.nll(column(torch.tensor([BLANK])))).item()
     assert (drawn == BLANK).double().mean().item() == pytest.approx(nothing, abs=1e-4)
     numbers = drawn[drawn > BLANK]
     low, high = numbers.quantile(torch.tensor([0.4, 0.6], dtype=torch.float64)).tolist()
     x = torch.linspace(low, high, 1001, dtype=torch.float64)
-    between = torch.trapezoid(torch.exp(-said.surprise(column(x))).flatten(), x)
+    between = torch.trapezoid(torch.exp(-predicted.nll(column(x))).flatten(), x)
     assert between.item() == pytest.approx(0.2 * len(numbers) / count, rel=0.01)
 
 
@@ -47,33 +47,33 @@ def test_draws_are_as_likely_as_was_said(case: tuple[float, float, float]) -> No
 def test_what_was_said_is_not_unexpected(case: tuple[float, float, float]) -> None:
     """Draws are 0 as often as expected, and around the median."""
     count = 100_000
-    said = readings(*case, cells=count)
-    nothing, off = said.unexpected(said.drawn(column((torch.arange(count) + 0.5) / count))).unbind(1)
+    predicted = readings(*case, cells=count)
+    nothing, off = predicted.residual(predicted.sample(column((torch.arange(count) + 0.5) / count))).unbind(1)
     assert nothing.mean().item() == pytest.approx(0, abs=0.002)
     assert off.median().item() == pytest.approx(0, abs=0.01)
 
 
 def test_the_unexpected_is_in_scales_and_has_an_end() -> None:
-    said = readings(0.1, 0.15, 0.2, cells=4)
-    nothing, off = said.unexpected(column(torch.tensor([0.1, 0.25, 90.0, BLANK]))).flatten(2).squeeze(2).unbind(1)
+    predicted = readings(0.1, 0.15, 0.2, cells=4)
+    nothing, off = predicted.residual(column(torch.tensor([0.1, 0.25, 90.0, BLANK]))).flatten(2).squeeze(2).unbind(1)
     assert torch.allclose(off, torch.tensor([0, 0.5, 4, 0], dtype=off.dtype), atol=1e-6)
     assert torch.allclose(nothing, torch.tensor([-0.2, -0.2, -0.2, 0.8], dtype=off.dtype), atol=1e-6)
 
 
 def test_the_likeliest_is_0_or_the_median() -> None:
-    assert readings(0.1, 0.15, 0.6).likeliest().item() == BLANK
-    assert readings(0.1, 0.15, 0.4).likeliest().item() == pytest.approx(0.1)
+    assert readings(0.1, 0.15, 0.6).mode().item() == BLANK
+    assert readings(0.1, 0.15, 0.4).mode().item() == pytest.approx(0.1)
 
 
 def test_numbers_at_the_ends_of_chance_are_finite() -> None:
     ends = column(torch.tensor([1e-12, 0.5, 1 - 1e-12], dtype=torch.float64))
     for blank in (0.0, 1.0):
-        assert readings(0.1, 0.15, blank, cells=3).drawn(ends).isfinite().all()
+        assert readings(0.1, 0.15, blank, cells=3).sample(ends).isfinite().all()
 
 
 def test_gradients_are_finite_where_a_reading_is_far_off() -> None:
     parts = [torch.tensor(v).view(1, 1, 1, 1).requires_grad_() for v in (1.0, -4.6, -30.0)]
-    said = Readings(*parts)
+    predicted = ZeroInflatedLogistic(*parts)
     for x in (BLANK, -0.99, 1.0):
-        said.surprise(torch.full((1, 1, 1, 1), x)).sum().backward()
+        predicted.nll(torch.full((1, 1, 1, 1), x)).sum().backward()
     assert all(part.grad is not None and part.grad.isfinite().all() for part in parts)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from lidar_synth.models.town_codec.plane_fit import Consensus
+from lidar_synth.models.town_codec.plane_fit import PlaneFit
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -18,9 +18,9 @@ ELEVATION = torch.linspace(0.05, -0.4, ROWS).tan()
 """Tangents, by row."""
 
 
-def consensus(scale: float = 0.1, window: tuple[int, int] = (3, 9)) -> Consensus:
+def consensus(scale: float = 0.1, window: tuple[int, int] = (3, 9)) -> PlaneFit:
     torch.manual_seed(0)
-    net = Consensus(5, GRID, PATCH, 2, window, ELEVATION)
+    net = PlaneFit(5, GRID, PATCH, 2, window, ELEVATION)
     with torch.no_grad():
         net.look.weight.normal_(std=scale)
     return net

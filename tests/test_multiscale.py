@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
-from lidar_synth.models.town_codec.multiscale import LATTICES, on
+from lidar_synth.models.town_codec.multiscale import LATTICES, at_lattice
 
 SHAPE = 8, 32
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -28,7 +28,7 @@ def depths() -> Tensor:
     """(H, W) the first lattice that a cell lies on."""
     depth = torch.zeros(1, *SHAPE, dtype=torch.long)
     for i in reversed(range(len(LATTICES))):
-        on(LATTICES[i], depth)[:] = i
+        at_lattice(LATTICES[i], depth)[:] = i
     return depth[0]
 
 
@@ -41,7 +41,7 @@ def test_lattices_are_one_within_the_other_and_end_with_all_cells() -> None:
 @pytest.mark.parametrize("channel", [0, 1], ids=["return", "reading"])
 @pytest.mark.parametrize("depth", range(len(LATTICES)))
 def test_cells_look_at_coarser_lattices_only(depth: int, channel: int) -> None:
-    """Otherwise the product of what is said of the cells were no likelihood of the image."""
+    """Otherwise the product of what is predicted of the cells were no likelihood of the image."""
     net, x = network(0.3), torch.rand(1, 7, *SHAPE) - 0.5
     z = torch.randn(1, *net.latent_shape)
     row, column = (depths() == depth).nonzero()[-1].tolist()
@@ -77,13 +77,13 @@ def test_drawn_neighbours_are_alike_where_those_that_were_learnt_were() -> None:
         common, own = (torch.randn(16, *shape, generator=generator) for shape in (net.latent_shape[1:], SHAPE))
         x[:, 1] = 0.1 * common.repeat_interleave(4, 1).repeat_interleave(8, 2) + 0.03 * own
         optimizer.zero_grad()
-        said = net.expand(z, x).readings
-        said.surprise(x[:, 1:2]).mean().backward()
+        predicted = net.expand(z, x).readings
+        predicted.nll(x[:, 1:2]).mean().backward()
         optimizer.step()
-    spreads = said.spreads.exp()[:, 0]
+    spreads = predicted.spreads.exp()[:, 0]
     assert spreads[:, depths() > 0].mean() < 0.5 * spreads[:, depths() == 0].mean()
-    chance = torch.rand(64, net.draws, *SHAPE, generator=generator).clamp(1e-6, 1 - 1e-6)
+    uniform_noise = torch.rand(64, net.draws, *SHAPE, generator=generator).clamp(1e-6, 1 - 1e-6)
     with torch.inference_mode():
-        drawn = net.decode(z[:1].expand(64, -1, -1, -1), chance)[:, 1]
+        drawn = net.decode(z[:1].expand(64, -1, -1, -1), uniform_noise)[:, 1]
     pairs = torch.stack([drawn[..., ::2].flatten(), drawn[..., 1::2].flatten()])
     assert torch.corrcoef(pairs)[0, 1] > 0.2
