@@ -85,7 +85,8 @@ def published() -> Iterator[Listed]:
             continue
         values = _merged(path, ())
         command = "bake" if "recipe" not in values else "distill" if "teacher" in values else "train"
-        yield Listed(path.stem, command, *(str(about[key]) for key in ("data", "size", "time")), summary=_head(path))
+        data, size, time = (str(about[key]) for key in ("data", "size", "time"))
+        yield Listed(path.stem, command, data, size, time, _head(path))
 
 
 def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
