@@ -1,4 +1,4 @@
-"""The base class of all readers: names of scans, reading by index, and the handling of a bad scan."""
+"""What all readers have in common: names of scans, reading by index, and what happens to a bad scan."""
 
 import warnings
 from abc import ABC, abstractmethod
@@ -12,28 +12,27 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 OnBad = Literal["error", "skip"]
-"""What a source does with a scan that cannot be read: raise an error, or skip it and record its name."""
+"""What a source does with a scan that cannot be read: raise, or count and name it and go on."""
 
 Choice = TypeVar("Choice")
 
 
 class ScanFiles(ABC):
-    """An indexable source of scans on disk; a subclass for each dataset defines how one scan is read.
+    """An indexable source of scans on disk; a dataset says how one scan is read.
 
     Args:
-        root: the folder of the files.
+        root: where the files are.
         ids: the scans' names, unique in the source, in order.
         sensor: a preset's name, a YAML file or a ``Sensor``.
-        on_bad: ``"error"`` raises on a scan that cannot be read. With ``"skip"``, ``source[i]`` is the next scan that
-            can be read (after the last scan comes the first), iterating leaves the bad ones out, and ``skipped``
-            names them.
+        on_bad: ``"error"`` raises on a scan that cannot be read. With ``"skip"`` ``source[i]`` is the next good
+            scan (from the end on, the first), iterating leaves the bad ones out, and ``skipped`` names them.
 
     Attributes:
-        skipped: {id: reason} of the scans that this process could not read so far.
+        skipped: {id: reason} of the scans that could not be read so far, in this process.
 
     Raises:
         ConfigError: on another ``on_bad``.
-        DataError: if there is no scan.
+        DataError: where there is no scan.
     """
 
     def __init__(self, root: Path, ids: Sequence[str], sensor: str | Path | Sensor, on_bad: OnBad = "error") -> None:
@@ -52,11 +51,11 @@ class ScanFiles(ABC):
         """The scan at ``index``, 0 <= index < len.
 
         Raises:
-            DataError, FileError: if it cannot be read.
+            DataError, FileError: where it cannot be read.
         """
 
     def calibration(self, index: int) -> Calibration | None:
-        """The calibration of the camera that recorded scan ``index``'s image; None if the dataset has none."""
+        """The camera beside the sensor when scan ``index`` was taken; None where the dataset tells none."""
         return None
 
     def __len__(self) -> int:

@@ -226,8 +226,9 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
         >>> sensor = load_sensor("os1_128")
         >>> sensor.shape, sensor.range_max
         ((128, 1024), 170.0)
+        >>> entry = "mine: {rows: 32, fov_up: 15, fov_down: -25, columns: 2048, range_min: 1, range_max: 120}"
         >>> with open("mine.yaml", "w") as file:
-        ...     _ = file.write("mine: {rows: 32, fov_up: 15, fov_down: -25, columns: 2048, range_min: 1, range_max: 120}")
+        ...     _ = file.write(entry)
         >>> load_sensor("mine.yaml").shape
         (32, 2048)
     """
