@@ -22,8 +22,8 @@ FURTHER = {
     "lidar_synth.mixing": ("Generated", "MixedScans.batches", "MixedScans.domain", "MixedScans.wrap"),
     "lidar_synth.noise": ("gaussian",),
 }
-"""What the README names besides ``lidar_synth.__all__``. A dictionary such as ``NORMALISATIONS`` has no docstring at run
-time: the example of its values' class shows it."""
+"""What the README names besides ``lidar_synth.__all__``. A dictionary such as ``NORMALISATIONS`` has no docstring that
+Python keeps: the example of its values' class shows it."""
 
 PACKAGE = Path(lidar_synth.__file__).parent
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE

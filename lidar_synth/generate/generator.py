@@ -232,15 +232,15 @@ def load_generator(
     """Load a generator from a shipped model or a checkpoint file.
 
     Args:
-        model: the name of a shipped model ("town"), or the path of a ``.safetensors`` checkpoint.
+        model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
         device: "cpu" or "cuda".
-        dtype: in which the network computes; the states of the flow stay float32.
-        compile: whether to use ``torch.compile``, which makes the first scan slow.
-        batch: number of scans computed at a time; the default depends on the device.
+        dtype: what the network computes in; states stay float32.
+        compile: by ``torch.compile``; the first scan takes long.
+        batch: scans at a time; by default what suits the device.
 
     Raises:
-        ConfigError: on an unknown name, a device that is not available, or CUDA in a DataLoader worker.
-        FileError, DataError: if the checkpoint cannot be read.
+        ConfigError: on an unknown name, a device that is not there, or CUDA in a DataLoader worker.
+        FileError, DataError: where the checkpoint cannot be read.
 
     Example:
         >>> from lidar_synth import load_generator

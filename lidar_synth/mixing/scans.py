@@ -32,8 +32,8 @@ ToSample = Callable[[Scan, np.random.Generator], Any]
 class MixedScans(Dataset[Any]):
     """A dataset of real scans mixed with synthetic ones at an exact ratio; real scans stay unchanged.
 
-    The order of an epoch is a pure function of the arguments and the epoch (plan.py) and already shuffled: iterate in
-    order (a ``DataLoader`` without ``shuffle``) or by ``batches``, which also serves several ranks. Any
+    What stands where in an epoch is a pure function of the arguments and the epoch (plan.py), already shuffled: go
+    through it in order (a ``DataLoader`` without ``shuffle``) or by ``batches``, which also serves several ranks. Any
     other sampler works too. Call ``set_epoch`` before each epoch; otherwise the same scans come again.
 
     Args:
@@ -47,16 +47,16 @@ class MixedScans(Dataset[Any]):
         epoch_size: ``"add"`` gives every real scan once and adds synthetic ones; ``"replace"`` keeps the number of
             real scans as the length; a number is the length.
         reuse: how often a synthetic scan is given, each time augmented anew.
-        balanced: whether synthetic samples are spread evenly, so that every batch in order has its exact share (up to
-            one sample if that is not a whole number).
+        balanced: spread synthetic samples evenly, so that every batch in order holds its exact share (up to one
+            sample where that is no whole number).
         augment: ``(scan, rng) -> scan`` for synthetic scans, after the label policy.
         augment_real: whether ``augment`` is also for real scans, which otherwise stay unchanged, bit for bit.
         to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py).
         collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"`` (collate.py), or
             your own function.
-        unlabelled: ``"error"`` raises on a batch without one valid label, ``"allow"`` returns it; with
-            ``labels="none"`` it is always allowed.
-        real_as_is: whether real samples are not ``Scan`` but already have the trainer's form; see ``wrap``.
+        unlabelled: ``"error"`` refuses a batch without one valid label, ``"allow"`` hands it out, as
+            ``labels="none"`` always does.
+        real_as_is: real samples are no ``Scan`` but what a trainer wants already; see ``wrap``.
 
     Attributes:
         collate: the ``collate_fn``.
@@ -145,7 +145,7 @@ class MixedScans(Dataset[Any]):
                 beforehand, by ``make_policy(..., real=scans)``.
 
         Raises:
-            ConfigError, DataError: as ``MixedScans``.
+            ConfigError, DataError: as above.
 
         Example:
             >>> import torch
