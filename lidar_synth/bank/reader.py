@@ -145,12 +145,12 @@ class Bank:
 
 
 def is_bank(path: str | Path) -> bool:
-    """Whether a folder holds a bank, or parts of one."""
+    """Whether a folder holds a bank, or what is left of one."""
     return (Path(path) / INDEX).is_file() or any(Path(path).glob("shard-*.h5"))
 
 
 def is_url(path: str | Path) -> bool:
-    """Whether a path is a URL for fsspec."""
+    """Whether a path leads to another machine, by fsspec."""
     return isinstance(path, str) and "://" in path
 
 

@@ -51,15 +51,15 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
     """Unfold a scan to a range image with one row per laser; a cell shows its nearest return.
 
     Args:
-        scan: N points in raw ring order, or in any order if ``scan.ring`` is set.
-        sensor: the sensor that defines lasers and columns; the scan's own by default.
-        anchor: how the row of a ring is found if ``scan.ring`` is not set.
+        scan: N points in raw ring order, or in any order with ``scan.ring`` known.
+        sensor: whose lasers and columns; the scan's own by default.
+        anchor: how a ring finds its row, where ``scan.ring`` does not tell it.
 
     Returns:
         An image on ``sensor.by_beams()``, whose rays have the elevations of the lasers.
 
     Raises:
-        DataError: on more rings than the sensor has lasers, because the scan is then not in ring order.
+        DataError: on more rings than the sensor has lasers: the scan is not in ring order.
 
     Example:
         >>> from lidar_synth import open_scans, unfold
