@@ -8,6 +8,7 @@ from pkgutil import resolve_name
 
 import pytest
 from layouts import write_kitti_raw, write_nuscenes
+from project import ROOT
 
 import lidar_synth
 from lidar_synth.bake import Job, bake, make_plan
@@ -87,7 +88,7 @@ def test_every_new_name_of_the_package_needs_an_example(monkeypatch: pytest.Monk
 
 
 def test_every_name_of_the_readme_has_an_example() -> None:
-    named = named_in((PACKAGE.parent / "README.md").read_text())
+    named = named_in((ROOT / "README.md").read_text())
     assert {"MixedScans", "solve", "Taxonomy"} <= named
     assert named <= {name.rsplit(".", 1)[1] for name in public_names()[2:]}
 

@@ -108,7 +108,7 @@ def open_scans(
         sensor: the sensor that recorded the scans, if it is not the layout's own.
         layout: one of ``READERS``; by default it is recognised from the files.
         split: name of a split, for the layouts that have splits.
-        on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` leaves it out with a warning.
+        on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` leaves it out, with a warning.
 
     Returns:
         An indexable source of ``Scan``.

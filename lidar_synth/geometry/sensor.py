@@ -36,8 +36,8 @@ class Sensor:
         range_max: metres, inclusive; farther returns are dropped.
         rows: H, for beams whose elevation is linear in the row; needs ``fov_up`` and ``fov_down``, the outer edges of
             the first and the last row in degrees.
-        elevations: instead of these three, the elevation of each row in degrees, highest first; the edges of a row
-            lie halfway between the beams.
+        elevations: instead of ``rows``, ``fov_up`` and ``fov_down``, the elevation of each row in degrees, highest
+            first; the edges of a row lie halfway between the beams.
         beams: the measured elevation of each laser in degrees, highest first, if the rows only approximate it.
         heights: metres above the origin at which each laser starts, one per row; 0 by default.
         description: one line of text.

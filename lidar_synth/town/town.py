@@ -39,7 +39,7 @@ class Town:
         sensor: the sensor whose rays are cast, as ``load_sensor`` takes it.
         scans: number of scans.
         interval: seconds between neighbouring scans of a stretch, 0 < interval < 60.
-        noise: the measurement noise of the sensor; by default that of a real one.
+        noise: the measurement noise of the sensor; by default ``Noise()``.
 
     Raises:
         ConfigError: on a negative seed or number of scans, an interval out of range, or an unknown sensor.
