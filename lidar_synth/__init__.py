@@ -1,6 +1,14 @@
 """lidar_synth: synthetic LiDAR scans for perception training.
 
-Names are imported when they are first used, so that ``import lidar_synth`` and the command line start at once.
+Each name is imported when it is first used, so that ``import lidar_synth`` and the command line start at once.
+
+Example:
+    >>> import lidar_synth
+    >>> lidar_synth.__version__
+    '0...'
+    >>> scan = lidar_synth.Town(seed=0, scans=1)[0]
+    >>> lidar_synth.project(scan).range.shape
+    (64, 1024)
 """
 
 from importlib import import_module

@@ -41,13 +41,22 @@ COLOURS = np.array(
 
 @dataclass(frozen=True)
 class Taxonomy:
-    """How one dataset's class ids meet the train ids.
+    """The mapping between one dataset's class ids and the train ids.
 
     Args:
-        name: the dataset.
-        to_train: train id (or ``IGNORE``) of every id that the dataset knows.
-        from_train: the id to write for each train id; ``None`` where the dataset has no file format
-            that the package writes.
+        name: of the dataset.
+        to_train: {class id: train id or ``IGNORE``}, for every class id that the dataset defines.
+        from_train: the class id to write for each train id; ``None`` if the package does not write this dataset's
+            format.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth.classes import SEMANTIC_KITTI
+        >>> train = SEMANTIC_KITTI.decode(np.array([10, 252, 40, 0]))  # car, moving car, road, unlabelled
+        >>> train
+        array([  0,   0,   8, 255], dtype=uint8)
+        >>> SEMANTIC_KITTI.encode(train)
+        array([10, 10, 40,  0], dtype=uint32)
     """
 
     name: str
@@ -61,11 +70,11 @@ class Taxonomy:
         return table
 
     def decode(self, ids: NDArray[np.integer], where: str = "the labels") -> NDArray[np.uint8]:
-        """Train ids of a dataset's own class ids.
+        """Map the dataset's class ids to train ids.
 
         Args:
-            ids: any shape, the dataset's class ids (SemanticKITTI: the lower 16 bits of the file).
-            where: what to name in the error, usually the path.
+            ids: any shape, class ids of the dataset (for SemanticKITTI, the lower 16 bits of the file's values).
+            where: the name of the labels in an error message, usually their path.
 
         Returns:
             The same shape as uint8: 0..18 or ``IGNORE``.
@@ -89,12 +98,12 @@ class Taxonomy:
         return train.astype(np.uint8)
 
     def encode(self, train: NDArray[np.uint8]) -> NDArray[np.uint32]:
-        """The dataset's (static) class ids of train ids, 0 for ``IGNORE``; the inverse of ``decode``
-        up to the classes that share a train id.
+        """Map train ids to the dataset's (static) class ids, and ``IGNORE`` to 0.
+
+        This is the inverse of ``decode``, except that classes with the same train id become one.
 
         Raises:
-            DataError: on a train id that is neither 0..18 nor ``IGNORE``, or where the dataset has no
-                table to write.
+            DataError: on a train id that is neither 0..18 nor ``IGNORE``, or if ``from_train`` is None.
         """
         if self.from_train is None:
             raise DataError(f"no table from train ids to {self.name}", "SemanticKITTI or KITTI-360")
@@ -128,7 +137,7 @@ SEMANTIC_KITTI = Taxonomy(
     ),
     (10, 11, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81),
 )  # fmt: skip
-"""``learning_map`` of semantic-kitti.yaml and its inverse to the static classes."""
+"""SemanticKITTI's ids: ``learning_map`` of semantic-kitti.yaml and its inverse to the static classes."""
 
 KITTI360 = Taxonomy(
     "KITTI-360",

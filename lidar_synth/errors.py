@@ -9,12 +9,20 @@ Every error says what was given, what was expected and what to type, in that ord
 
 
 class LidarSynthError(Exception):
-    """Base of all errors that the package raises on purpose.
+    """Base class of every error that the package raises on purpose.
 
     Args:
         given: what was found, with the path, shape or value.
         expected: what would have been right.
         hint: what the reader of the message can type or change.
+
+    Example:
+        >>> from lidar_synth import LidarSynthError, open_scans
+        >>> try:
+        ...     open_scans("no/such/folder")
+        ... except LidarSynthError as error:
+        ...     print(error)
+        no/such/folder does not exist; expected ...
     """
 
     def __init__(self, given: str, expected: str = "", hint: str = "") -> None:

@@ -37,7 +37,7 @@ def gaussian(
 ) -> Tensor:
     """Standard normal noise, one sample per index.
 
-    Computed in float64 by Box and Muller's transform and rounded once, so that devices agree to float
+    The noise is computed in float64 by the Box-Muller transform and rounded once, so that devices agree up to float
     rounding.
 
     Args:
@@ -52,6 +52,15 @@ def gaussian(
 
     Raises:
         ConfigError: on a seed, an index or a shape out of range.
+
+    Example:
+        >>> import torch
+        >>> from lidar_synth.noise import gaussian
+        >>> noise = gaussian(seed=0, indices=[7, 3], shape=(2, 64, 1024))
+        >>> noise.shape
+        torch.Size([2, 2, 64, 1024])
+        >>> torch.equal(gaussian(seed=0, indices=[3], shape=(2, 64, 1024))[0], noise[1])
+        True
     """
     words, count = _words(seed, indices, shape, device, _GAUSSIAN)
     radius = ((words[0::2].double() + 0.5) * 2.0**-32).log_().mul_(-2).sqrt_()

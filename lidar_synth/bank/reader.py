@@ -19,24 +19,31 @@ _OPEN = 64  # shards kept open at a time
 
 
 class Bank:
-    """The scans of a bank, read when they are asked for.
+    """The scans of a bank, read from disk on access.
 
-    Shards are opened when they are first needed, once per process: a bank may be handed to workers, forked or
-    spawned.
+    Each process opens a shard when it first needs it, so that a bank can be passed to workers, forked or spawned.
 
     Args:
-        root: the bank's folder, or a URL that fsspec knows ("s3://bucket/bank").
+        root: the bank's folder, or a URL that fsspec supports ("s3://bucket/bank").
 
     Attributes:
-        index: what is in it.
-        sensor: whose grid the images have.
-        fields: what a scan carries beside its points.
-        identity: what tells this bank from every other one.
+        index: the list of shards and sources.
+        sensor: the sensor that defines the grid of the range images.
+        fields: the fields that a scan has besides its points.
+        identity: the checksum of the index, different for every bank.
 
     Raises:
-        FileError: where there is no bank, a shard is missing, or something cannot be read.
+        FileError: if there is no bank, a shard is missing, or a file cannot be read.
         DataError: on an index that is damaged or of another version, or a shard of another size.
         LibraryError: on a URL whose file system is not installed.
+
+    Example:
+        >>> from lidar_synth import Bank
+        >>> bank = Bank("demo_out/bank")
+        >>> bank[0].id, sorted(bank.fields)
+        ('town/1/0', ['confidence', 'label', 'reflectance'])
+        >>> bank.image(0).range.shape
+        (64, 1024)
     """
 
     def __init__(self, root: str | Path) -> None:
@@ -49,7 +56,7 @@ class Bank:
 
     @property
     def facts(self) -> Facts:
-        """What all its scans have in common, by the first of its sources."""
+        """The facts that its scans have in common, from the first of its sources."""
         return self.index.sources[0]
 
     @property
@@ -81,7 +88,7 @@ class Bank:
         """The returns of ``image(number)`` through the centres of their cells.
 
         Raises:
-            DataError, FileError: where it cannot be read; the message names shard and scan.
+            DataError, FileError: if it cannot be read; the message names shard and scan.
         """
         if not -len(self) <= number < len(self):
             raise IndexError(f"scan {number} of {len(self)}")
@@ -95,11 +102,11 @@ class Bank:
         return self.facts.encoding.decode(self.shard(shard).read(position))
 
     def facts_of(self, number: int) -> Facts:
-        """The facts behind a scan."""
+        """The facts of the source that a scan comes from."""
         return self.index.sources[self.index.shards[_place(self.index, number)[0]].source]
 
     def condition(self, number: int) -> str | None:
-        """The name, in the source of conditions, of what a scan was conditioned on; None for an unconditional one."""
+        """The name of the scan that conditioned scan ``number``; None for an unconditional one."""
         shard, position = _place(self.index, number)
         return self.shard(shard).condition(position)
 
@@ -118,7 +125,7 @@ class Bank:
         return self._shards[number]
 
     def close(self) -> None:
-        """Close the shards that are open; reading opens them again."""
+        """Close the open shards; reading opens them again."""
         while self._shards and self._process == os.getpid():
             self._shards.popitem()[1].close()
 

@@ -70,16 +70,17 @@ def uniform_grid(steps: int, start: float = 1.0, end: float = 0.0) -> tuple[floa
 
 
 def trajectory(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None) -> Iterator[State]:
-    """The states on the grid, one at a time; only the current one is held.
+    """Solve dy/dt = v(y, t, cond) along the grid, and yield the states one at a time.
 
-    The state keeps its own dtype (float32 is advised) whatever the network computes in.
+    Only the current state is in memory. It keeps its own dtype (float32 is advised), whatever dtype the network
+    computes in.
 
     Args:
         velocity: the flow.
         y: (B, ...) state at the first time of the grid.
         grid: descending times within [0, 1].
         solver: a name of ``SOLVERS``.
-        cond: passed on to ``velocity``.
+        cond: the condition that ``velocity`` is given at each step.
 
     Yields:
         S + 1 states.
@@ -98,7 +99,18 @@ def trajectory(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler",
 
 
 def solve(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None) -> Tensor:
-    """(B, ...) the state at the last time of the grid; see ``trajectory``."""
+    """Solve dy/dt = v(y, t, cond) along the grid, and return the state (B, ...) at its last time.
+
+    Arguments and errors are those of ``trajectory``.
+
+    Example:
+        >>> import torch
+        >>> from lidar_synth.flow.solvers import solve, uniform_grid
+        >>> def velocity(y, t, cond):  # dy/dt = y, so that from t = 1 to t = 0 the state shrinks by the factor e
+        ...     return y
+        >>> solve(velocity, torch.ones(1), uniform_grid(100), solver="heun")
+        tensor([0.3679])
+    """
     for state in trajectory(velocity, y, grid, solver, cond):
         y = state.y
     return y

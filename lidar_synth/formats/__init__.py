@@ -1,8 +1,8 @@
 """Datasets and file formats: scans in, scans out.
 
 A reader is an indexable source of ``Scan`` (source.py), a writer puts scans into one output folder (writer.py). One
-file per dataset or format holds both. To add a format: write that file, and put its class into ``READERS``,
-``WRITERS`` or both; ``open_scans``, the command line and the parametrised tests then know it.
+file per dataset or format holds both. To add a format, write such a file and add its classes to ``READERS`` and
+``WRITERS``; ``open_scans``, the command line and the parametrised tests then include it.
 """
 
 from collections.abc import Callable
@@ -101,19 +101,31 @@ def open_scans(
     split: str | None = None,
     on_bad: OnBad = "error",
 ) -> ScanFiles:
-    """A source of the scans at a path: a dataset's root, a bank, a folder of scans, or one file.
+    """Open the scans at a path: a dataset's root, a bank, a folder of scans, or one file.
 
     Args:
-        path: where they are; for a bank also a URL.
-        sensor: which sensor took them, where it is not the layout's own.
-        layout: one of ``READERS``; by default recognised by what is there.
-        split: a split's name, for the layouts that have splits.
-        on_bad: ``"error"``, or ``"skip"`` to count and name what cannot be read.
+        path: of the scans; for a bank also a URL.
+        sensor: the sensor that recorded the scans, if it is not the layout's own.
+        layout: one of ``READERS``; by default it is recognised from the files.
+        split: name of a split, for the layouts that have splits.
+        on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` leaves it out, with a warning.
+
+    Returns:
+        An indexable source of ``Scan``.
 
     Raises:
-        FileError: where there is no such path.
-        DataError: where no layout is recognised, or it holds no scan.
+        FileError: if the path does not exist.
+        DataError: if no layout is recognised, or there is no scan.
         ConfigError: on an unknown layout or split, or a split for a layout that has none.
+
+    Example:
+        >>> from lidar_synth import open_scans
+        >>> scans = open_scans("demo_out/town")
+        >>> type(scans).__name__, scans.ids[0]
+        ('SemanticKITTI', '00/000000')
+        >>> scan = scans[0]
+        >>> scan.points.shape == (len(scan), 3), scan.label.dtype
+        (True, dtype('uint8'))
     """
     if isinstance(path, str) and is_url(path):
         layout = layout or "bank"

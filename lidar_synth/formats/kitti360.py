@@ -64,17 +64,27 @@ R2Flow tests on, LiDM trains on."""
 class KITTI360(ScanFiles):
     """KITTI-360's drives: <root>/data_3d_raw/DRIVE/velodyne_points/data/*.bin with poses, boxes, calibration, images.
 
-    Boxes and labels are there only where their files are; a scan has boxes only where its pose is known.
+    A scan has labels if there is a file with its labels, and boxes if the drive has them and the scan's pose is known.
 
     Args:
         root: the folder that holds ``data_3d_raw``.
-        split: a split by its full name, ``r2flow/train`` for instance, or ``all``.
+        split: the full name of a split, such as ``r2flow/train``, or ``all``.
         sensor: a preset's name, a YAML file or a ``Sensor``.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        ConfigError: on a name that is no split; a bare ``train`` is none, because works split the drives differently.
-        DataError: where none of the split's drives is there.
+        ConfigError: on an unknown split; ``train`` alone is unknown, because published works split the drives
+            differently.
+        DataError: if the folder has none of the split's drives.
+
+    Example:
+        >>> from lidar_synth import KITTI360
+        >>> scans = KITTI360("KITTI-360", split="r2flow/train")
+        >>> scans.ids[0]
+        '2013_05_28_drive_0004_sync/0000000000'
+        >>> scan = scans[0]
+        >>> scan.boxes.values.shape == (len(scan.boxes), 7), scan.pose.shape
+        (True, (4, 4))
     """
 
     def __init__(

@@ -54,15 +54,24 @@ class KITTIObject(ScanFiles):
 
     Args:
         root: the folder that holds ``training`` and ``testing``.
-        split: ``train``, ``val``, ``trainval``, ``test`` (by ``ImageSets/<split>.txt``) or ``all``. Where there is no
+        split: ``train``, ``val``, ``trainval``, ``test`` (as listed in ``ImageSets/<split>.txt``) or ``all``. Without
             ``ImageSets``, ``trainval`` is all of ``training`` and ``test`` all of ``testing``.
-        reduced: read ``velodyne_reduced``, the points that camera 2 sees.
+        reduced: read ``velodyne_reduced``, the points in the view of camera 2.
         sensor: a preset's name, a YAML file or a ``Sensor``.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        ConfigError: on a split that KITTI does not have, or one that only ``ImageSets`` could tell.
-        DataError: where none of its scans is there.
+        ConfigError: on a split that KITTI does not have, or ``train`` or ``val`` without ``ImageSets``.
+        DataError: if the folder has none of the split's scans.
+
+    Example:
+        >>> from lidar_synth import KITTIObject
+        >>> scans = KITTIObject("KITTI", split="trainval")
+        >>> scans.ids[0]
+        'training/000000'
+        >>> boxes = scans[0].boxes
+        >>> boxes.names[0], boxes.values.shape[1], boxes.image_box.shape[1]
+        ('Car', 7, 4)
     """
 
     def __init__(

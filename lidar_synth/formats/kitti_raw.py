@@ -32,15 +32,24 @@ DRIVES = "*_drive_*/velodyne_points/data"
 class KITTIRaw(ScanFiles):
     """KITTI's raw drives: <root>/[DATE/]DATE_drive_NNNN_sync/velodyne_points/data/*.bin, tracklet_labels.xml.
 
-    A scan of a drive without tracklets has no boxes; one of a drive with tracklets has those of its frame, maybe none.
+    If the drive has tracklets, a scan has the boxes of its frame, of which there may be none; otherwise ``boxes`` is
+    None.
 
     Args:
-        root: the folder with the dates, one date's folder, or one drive's.
+        root: the folder that holds the dates, the folder of one date, or the folder of one drive.
         sensor: a preset's name, a YAML file or a ``Sensor``.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        DataError: where there is no drive.
+        DataError: if the folder has no drive.
+
+    Example:
+        >>> from lidar_synth import KITTIRaw
+        >>> scans = KITTIRaw("KITTI-raw")
+        >>> scans.ids[1]
+        '2011_09_26_drive_0001_sync/0000000001'
+        >>> scans[1].boxes.names
+        ('Person_sitting',)
     """
 
     def __init__(

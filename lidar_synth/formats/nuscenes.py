@@ -45,7 +45,15 @@ class NuScenes(ScanFiles):
         on_bad: see ``ScanFiles``.
 
     Raises:
-        DataError: where there is no sweep.
+        DataError: if the folder has no sweep.
+
+    Example:
+        >>> from lidar_synth import NuScenes
+        >>> scans = NuScenes("nuScenes")
+        >>> scans.ids[0], scans.sensor.name
+        ('n015__LIDAR_TOP__0', 'hdl32e_nuscenes')
+        >>> list(scans[0].fields())
+        ['reflectance', 'label', 'raw_label', 'ring']
     """
 
     def __init__(

@@ -55,8 +55,8 @@ PERIOD = 0.1
 class SemanticKITTI(ScanFiles):
     """SemanticKITTI's sequences: <root>/sequences/NN/velodyne/*.bin with labels, calib.txt, poses.txt, image_2.
 
-    ``raw_label`` keeps the file's uint32, moving classes and instances included. Sequences without a ``labels``
-    folder (the test set) give scans without labels.
+    ``raw_label`` keeps the uint32 values of the file, with moving classes and instances. The scans of a sequence
+    without a ``labels`` folder (the test set) have no labels.
 
     Args:
         root: the folder that holds ``sequences``.
@@ -66,7 +66,15 @@ class SemanticKITTI(ScanFiles):
 
     Raises:
         ConfigError: on a split that SemanticKITTI does not have.
-        DataError: where none of its sequences is there.
+        DataError: if the folder has none of the split's sequences.
+
+    Example:
+        >>> from lidar_synth import SemanticKITTI
+        >>> scans = SemanticKITTI("demo_out/town", split="train")
+        >>> scans.ids[0], scans[0].pose.shape
+        ('00/000000', (4, 4))
+        >>> list(scans[0].fields())
+        ['reflectance', 'label', 'raw_label', 'instance']
     """
 
     def __init__(

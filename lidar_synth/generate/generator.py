@@ -1,7 +1,7 @@
-"""From a checkpoint to scans: where geometry, network and flow meet.
+"""From a checkpoint to scans: geometry, network and flow together.
 
-A scan is a function of (checkpoint, condition, time grid and solver, seed, index). What else is scanned along with
-it, in which order and on which device changes float rounding only.
+A scan is a function of (checkpoint, condition, time grid and solver, seed, index). The other scans of its batch, the
+order and the device change float rounding only.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -34,15 +34,24 @@ BATCH = {"cpu": 1, "cuda": 16}
 
 @dataclass(frozen=True)
 class Generator:
-    """Scans by (seed, index).
+    """A generative model that makes scans by (seed, index); ``load_generator`` makes one.
 
     Args:
-        name: of the checkpoint; stands in the scans' ids.
+        name: of the checkpoint; part of the scans' ids.
         network: the flow, ``checkpoint.join`` of the checkpoint's networks, in evaluation mode.
-        header: what the checkpoint says about it.
-        hash: of the checkpoint; "" for weights that are in none.
-        batch: scans at a time; bounds the memory and changes nothing else.
+        header: of the checkpoint.
+        hash: of the checkpoint; "" for weights that come from none.
+        batch: number of scans computed at a time; it limits the memory and changes nothing else.
         autoencoder: of a latent model; None for a pixel model.
+
+    Example:
+        >>> from lidar_synth import Generator, load_generator
+        >>> generator = load_generator("town")
+        >>> isinstance(generator, Generator), generator.sensor.shape
+        (True, (64, 1024))
+        >>> [image] = generator.range_images(seed=0, indices=[3], steps=2)
+        >>> image.range.shape, sorted(image.channels)
+        ((64, 1024), ['confidence', 'label', 'reflectance'])
     """
 
     name: str
@@ -54,34 +63,34 @@ class Generator:
 
     @property
     def sensor(self) -> Sensor:
-        """Whose grid the images have."""
+        """The sensor that defines the grid of the range images."""
         return self.header.sensor
 
     @property
     def tensors(self) -> TensorFormat:
-        """The layout of the network's tensors."""
+        """The channels and normalisation of the network's tensors."""
         return TensorFormat(self.header.channels, self.header.normalisation)
 
     @property
     def codec(self) -> Codec:
-        """Between tensors and the states of the flow."""
+        """The mapping between tensors and the states of the flow."""
         return make_codec(self.autoencoder, self.tensors, self.sensor.shape)
 
     @property
     def condition(self) -> str | None:
-        """The name of what the model is conditioned on (``conditions.CONDITIONS``); None = nothing."""
+        """The name of the model's condition, a key of ``conditions.CONDITIONS``; None for an unconditional model."""
         return next(iter(self.header.conditioning), None)
 
     @property
     def fields(self) -> frozenset[str]:
-        """What its scans carry per point: some of "reflectance", "label", "confidence"."""
+        """The fields of its scans: some of "reflectance", "label", "confidence"."""
         labelled = "label" in self.header.channels or self.condition == "semantic"
         fields = set(self.header.channels) - {"range"}
         return frozenset(fields | {"label", "confidence"} if labelled else fields)
 
     @property
     def device(self) -> torch.device:
-        """Where the network is."""
+        """The device of the network."""
         return next(self.network.parameters()).device
 
     def range_images(
@@ -93,31 +102,31 @@ class Generator:
         solver: str = "euler",
         guidance: float = 1.0,
     ) -> list[RangeImage]:
-        """Generated range images.
+        """Generate range images.
 
         Args:
             seed: of the noise, 0 <= seed < 2^64.
             indices: B numbers of scans, 0 <= index < 2^63, in any order.
-            condition: what the model is conditioned on, one for all scans or B of them; None for an unconditional
-                model. A semantic map is a (H, W) uint8 array of train ids, 255 = unknown, such as the ``label`` of a
-                range image on the model's sensor; a camera image is (3, h, w) uint8. A real ``Scan``, or a list of B,
-                stands for what it has of that: its labels, projected, or the image at its ``image_path``. A
-                dictionary of conditions by name is looked into. See ``conditions``.
-            steps: of a uniform time grid; by default the checkpoint's own grid.
+            condition: one condition for all scans, or B of them; None for an unconditional model. A semantic map is a
+                (H, W) uint8 array of train ids, 255 = unknown, such as the ``label`` of a range image on the model's
+                sensor; a camera image is (3, h, w) uint8. A real ``Scan``, or a list of B, provides the condition
+                itself: its projected labels, or the image at its ``image_path``. In a dictionary of conditions, the
+                one with the condition's name is used. See ``conditions``.
+            steps: number of steps of a uniform time grid; by default the checkpoint's own grid.
             solver: a name of ``SOLVERS``.
-            guidance: scale of classifier-free guidance, 1 = none; more follows the condition more closely. Twice the
-                work.
+            guidance: scale of classifier-free guidance, 1 = none. A larger scale follows the condition more closely;
+                any scale but 1 takes twice the work.
 
         Returns:
             B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its ``confidence`` in
-            [0, 1] where the checkpoint has them, empty (0, 255 = ignore, 0) where there is no return. A model of
-            semantic maps that makes no labels of its own gives the map's where there is a return, confidence 1 where
-            they are known.
+            [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0) where there is no return. If a
+            model conditioned on semantic maps makes no labels of its own, ``label`` is the map's where there is a
+            return, with confidence 1 where the map's label is known.
 
         Raises:
-            ConfigError: on a seed, index, number of steps or solver that cannot be served, a condition for a model
-                that takes none, guidance of a model that never met a blank condition, or CUDA in a DataLoader worker.
-            DataError: on a condition of another shape, with values that are none, or none where one is needed.
+            ConfigError: on an invalid seed, index, number of steps or solver, a condition for an unconditional model,
+                guidance of a model that was trained without blank conditions, or CUDA in a DataLoader worker.
+            DataError: on a condition of another shape or with invalid values, or if a condition is missing.
         """
         given = self._condition(condition, len(indices))
         images = []
@@ -138,9 +147,10 @@ class Generator:
         solver: str = "euler",
         guidance: float = 1.0,
     ) -> list[Scan]:
-        """Generated scans: the returns of ``range_images`` through the centres of their cells.
+        """Generate scans: the returns of ``range_images`` through the centres of their cells.
 
-        Their ``id`` is ``<checkpoint>/<seed>/<index>``, their ``domain`` ``SYNTHETIC``.
+        Arguments and errors are those of ``range_images``. The ``id`` of a scan is ``<checkpoint>/<seed>/<index>``,
+        and its ``domain`` is ``SYNTHETIC``.
         """
         images = self.range_images(seed, indices, condition, steps, solver, guidance)
         return [
@@ -157,7 +167,7 @@ class Generator:
         solver: str = "euler",
         guidance: float = 1.0,
     ) -> Iterator[Tensor]:
-        """The normalised tensors behind ``range_images``, at most ``batch`` at a time: (b, C, H, W) each."""
+        """Yield the normalised tensors behind ``range_images``: (b, C, H, W) each, with b at most ``batch``."""
         return self._solve(seed, indices, self._condition(condition, len(indices)), steps, solver, guidance)
 
     def _solve(
@@ -219,7 +229,7 @@ def load_generator(
     compile: bool = False,
     batch: int | None = None,
 ) -> Generator:
-    """A generator from a shipped model or a checkpoint file.
+    """Load a generator from a shipped model or a checkpoint file.
 
     Args:
         model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
@@ -231,6 +241,13 @@ def load_generator(
     Raises:
         ConfigError: on an unknown name, a device that is not there, or CUDA in a DataLoader worker.
         FileError, DataError: where the checkpoint cannot be read.
+
+    Example:
+        >>> from lidar_synth import load_generator
+        >>> generator = load_generator("town")
+        >>> first, second = generator.scans(seed=0, indices=[0, 1])
+        >>> second.id, sorted(second.fields())
+        ('town/0/1', ['confidence', 'label', 'reflectance'])
     """
     device = torch.device(device)
     _refuse_worker(device)
@@ -250,13 +267,13 @@ def load_generator(
 
 
 def shipped_models() -> dict[str, Path]:
-    """The checkpoints that come with the package, by name."""
+    """The checkpoints that ship with the package: {name: path}."""
     folder = Path(str(files("lidar_synth"))) / "weights"
     return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
 
 
 def find_model(model: str | Path) -> Path:
-    """The checkpoint file of a shipped model's name, or a path as it is.
+    """The checkpoint file of a shipped model, or the given path itself.
 
     Raises:
         ConfigError: on an unknown name.

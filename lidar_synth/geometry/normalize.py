@@ -23,18 +23,30 @@ NO_LABEL = len(NAMES)
 
 @dataclass(frozen=True)
 class Normalisation:
-    """How a range in metres becomes a value in [-1, 1].
+    """A mapping between a range in metres and a value in [-1, 1].
+
+    ``NORMALISATIONS`` holds the mappings that published networks were trained with, by name.
 
     Args:
         kind: "log": 2 log2(d + offset) / scale - 1; "linear": 2 d / scale - 1;
             "inverse": 2 range_min / d - 1.
         range_min: metres, exclusive.
         range_max: metres, exclusive.
-        scale: the divisor; by default the one that takes range_max to 1.
+        scale: the divisor; by default the one that maps range_max to 1.
         offset: added before the logarithm.
 
     Raises:
         ConfigError: on an unknown kind or limits that are not 0 <= range_min < range_max.
+
+    Example:
+        >>> import torch
+        >>> from lidar_synth.geometry.normalize import NORMALISATIONS
+        >>> scale = NORMALISATIONS["r2flow_metric"]
+        >>> x = scale.encode(torch.tensor([0.0, 10.0, 60.0]))  # no return, 10 m, 60 m
+        >>> x
+        tensor([-1.0000, -0.7500,  0.5000])
+        >>> scale.decode(x)
+        tensor([ 0., 10., 60.])
     """
 
     kind: Literal["log", "linear", "inverse"]
@@ -51,17 +63,17 @@ class Normalisation:
 
     @property
     def divisor(self) -> float:
-        """The ``scale`` in force."""
+        """The divisor: ``scale``, or its default."""
         if self.scale is not None:
             return self.scale
         return float(np.log2(self.range_max + self.offset)) if self.kind == "log" else self.range_max
 
     def inside(self, distance: torch.Tensor) -> torch.Tensor:
-        """Where a range (any shape, metres) counts as a return."""
+        """Whether each range (any shape, metres) is a return, which is to say inside the limits."""
         return (distance > self.range_min) & (distance < self.range_max)
 
     def encode(self, distance: torch.Tensor) -> torch.Tensor:
-        """Ranges (any shape, metres, 0 = no return) to [-1, 1]; no return lies at -1."""
+        """Map ranges (any shape, metres, 0 = no return) to [-1, 1]; no return becomes -1."""
         inside = self.inside(distance)
         if self.kind == "inverse":
             unit = torch.where(inside, self.range_min / torch.where(inside, distance, 1.0), 0.0)
@@ -71,7 +83,7 @@ class Normalisation:
         return (2 * unit - 1).clamp(-1, 1)
 
     def decode(self, x: torch.Tensor) -> torch.Tensor:
-        """Values (any shape) to ranges in metres, 0 = no return; values beyond [-1, 1] are clamped."""
+        """Map values (any shape) to ranges in metres, 0 = no return; values outside [-1, 1] are clamped."""
         unit = ((x + 1) / 2).clamp(0, 1)
         if self.kind == "log":
             distance = torch.exp2(unit * self.divisor) - self.offset
@@ -80,7 +92,7 @@ class Normalisation:
         return torch.where(self.inside(distance), distance, 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as a checkpoint's header holds them; ``Normalisation(**values)`` is the inverse."""
+        """The arguments as plain values for a checkpoint's header; ``Normalisation(**values)`` is the inverse."""
         return asdict(self)
 
 
@@ -91,7 +103,7 @@ NORMALISATIONS = {
     "lidm_log": Normalisation("log", 1.0, 56.0, scale=5.84, offset=1.0001),
     "lidm_linear": Normalisation("linear", 1.0, 56.0),
 }
-"""The peers' scales by name."""
+"""The normalisations of R2Flow and LiDM by name."""
 
 
 def encode_reflectance(reflectance: torch.Tensor) -> torch.Tensor:

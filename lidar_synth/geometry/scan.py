@@ -1,6 +1,6 @@
-"""What travels through the package: a ``Scan`` of points, its ``Boxes``, and the ``RangeImage``.
+"""The data that the package passes around: a ``Scan`` of points, its ``Boxes``, and the ``RangeImage``.
 
-All of them live in the sensor frame: right-handed, x forward, y left, z up, metres, float32.
+All of them are in the sensor frame: right-handed, x forward, y left, z up, metres, float32.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -29,12 +29,21 @@ class Boxes:
         truncation: (M,) float32 in [0, 1], share of the object outside the image; -1 = not known.
         occlusion: (M,) int8, KITTI's 0 visible, 1 partly, 2 largely, 3 unknown; -1 = not known.
         image_box: (M, 4) float32 left, top, right, bottom in pixels; -1 = not known.
-        instance: (M,) int32, the id that a track keeps over frames; -1 = not known.
-        alpha: (M,) float32 radians, the angle under which KITTI's file says the object is seen; -10 = not known.
+        instance: (M,) int32, the id of the object's track over frames; -1 = not known.
+        alpha: (M,) float32 radians, the observation angle in KITTI's label file; -10 = not known.
         dont_care: (K, 4) float32 image rectangles of KITTI's ``DontCare`` regions, which have no box.
 
     Raises:
-        DataError: on shapes that do not fit together, non-finite values or sizes that are not positive.
+        DataError: on shapes that do not match each other, non-finite values or sizes that are not positive.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Boxes
+        >>> boxes = Boxes(np.array([[10, 2, -0.9, 4, 2, 1.6, 0]], np.float32), ("Car",))
+        >>> boxes.contain(np.array([(11, 2, -0.5), (11, 4, -0.5)], np.float32))
+        array([[ True, False]])
+        >>> boxes.corners().shape
+        (1, 8, 3)
     """
 
     values: NDArray[np.float32]
@@ -70,13 +79,13 @@ class Boxes:
         return len(self.values)
 
     def __getitem__(self, keep: Any) -> "Boxes":
-        """The boxes that a mask or an index array selects; ``dont_care`` stays."""
+        """The boxes that a mask or an index array selects; ``dont_care`` is kept."""
         keep = np.arange(len(self))[keep].reshape(-1)
         picked = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name not in ("names", "dont_care")}
         return replace(self, names=tuple(self.names[i] for i in keep), **picked)
 
     def corners(self) -> NDArray[np.float32]:
-        """(M, 8, 3) corners: the floor's four counter-clockwise from front left, then the ceiling's."""
+        """(M, 8, 3) corners in metres: the four of the bottom counter-clockwise from front left, then the top's."""
         unit = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
         unit = np.concatenate([np.c_[unit, np.full(4, -0.5)], np.c_[unit, np.full(4, 0.5)]]).astype(np.float32)
         local = unit[None] * self.values[:, None, 3:6]
@@ -85,11 +94,11 @@ class Boxes:
         return (np.stack([x, y, local[..., 2]], -1) + self.values[:, None, :3]).astype(np.float32)
 
     def contain(self, points: NDArray[np.float32], above_floor: float = 0.0) -> NDArray[np.bool_]:
-        """(M, N) which of the points (N, 3) each box holds, faces included.
+        """(M, N) bool: which points lie inside each box, its faces included.
 
         Args:
-            points: metres, in the boxes' frame.
-            above_floor: metres; leave out points less than this above a box's floor (the road).
+            points: (N, 3) metres, in the boxes' frame.
+            above_floor: metres; points less than this above a box's bottom (the road) count as outside.
         """
         inside = np.zeros((len(self), len(points)), bool)
         for i, (x, y, z, length, width, height, yaw) in enumerate(self.values):
@@ -103,26 +112,36 @@ class Boxes:
 
 @dataclass
 class Scan:
-    """One turn of a LiDAR: points in the sensor frame and what is known about each.
+    """One revolution of a LiDAR: N points in the sensor frame, their fields, boxes and pose.
 
     Args:
         points: (N, 3) float32 x, y, z in metres.
         reflectance: (N,) float32 in [0, 1].
-        sensor: the sensor that took it, or that it is meant for.
+        sensor: the sensor that recorded the scan, or that a synthetic scan imitates.
         label: (N,) uint8 train ids 0..18, 255 = ignore.
-        raw_label: (N,) uint32 as the file holds it (SemanticKITTI: class in the lower 16 bits, instance
-            above), kept so that writing back loses nothing.
+        raw_label: (N,) uint32 as in the file (SemanticKITTI: class in the lower 16 bits, instance in the upper),
+            kept so that the scan can be written back without loss.
         instance: (N,) int32 instance ids, 0 = none.
-        ring: (N,) int16 ring numbers where the file has them, 0 = highest.
-        confidence: (N,) float32 in [0, 1], trust in ``label``.
-        boxes: objects around, in the same frame.
+        ring: (N,) int16 ring numbers if the file has them, 0 = highest.
+        confidence: (N,) float32 in [0, 1], the confidence of ``label``.
+        boxes: of the objects around the sensor, in the same frame.
         pose: (4, 4) float64, sensor to world, metres.
         image_path: the camera image taken with the scan.
         id: a name that is unique in its source.
         domain: ``REAL`` (0) or ``SYNTHETIC`` (1).
 
     Raises:
-        DataError: on shapes that do not fit together.
+        DataError: on shapes that do not match each other.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Scan, load_sensor
+        >>> points = np.array([(10, 0, -1), (10, 2, -1), (40, -3, 1)], np.float32)
+        >>> scan = Scan(points, np.full(3, 0.3, np.float32), load_sensor("hdl64e_kitti"), label=np.uint8([8, 8, 12]))
+        >>> list(scan.fields())
+        ['reflectance', 'label']
+        >>> scan[scan.label == 8].points[:, 1]
+        array([0., 2.], dtype=float32)
     """
 
     points: NDArray[np.float32]
@@ -151,12 +170,12 @@ class Scan:
         return len(self.points)
 
     def __getitem__(self, keep: Any) -> "Scan":
-        """The scan with the points that a mask or an index array selects; all else stays."""
+        """The scan with the points that a mask or an index array selects; everything else is kept."""
         picked = {n: getattr(self, n)[keep] for n in POINT_FIELDS if getattr(self, n) is not None}
         return replace(self, points=self.points[keep], **picked)
 
     def fields(self) -> dict[str, NDArray[Any]]:
-        """What is known per point beside its position: {name: (N,)}."""
+        """The fields that the scan has for each point besides its position: {name: (N,)}."""
         return {n: getattr(self, n) for n in POINT_FIELDS if getattr(self, n) is not None}
 
 
@@ -166,16 +185,25 @@ POINT_FIELDS = ("reflectance", "label", "raw_label", "instance", "ring", "confid
 
 @dataclass
 class RangeImage:
-    """A scan on the sensor's grid: one return per cell.
+    """A scan on the sensor's grid: at most one return per cell.
 
     Args:
-        range: (H, W) float32 metres, Euclidean; 0 = no return.
-        sensor: whose rows and columns these are.
-        channels: {name: (H, W)}, what else is carried; the names of ``POINT_FIELDS`` return to a scan's
-            fields. Where there is no return: 0, and 255 (ignore) for ``label``.
+        range: (H, W) float32 metres, Euclidean distance; 0 = no return.
+        sensor: the sensor that defines the rows and columns.
+        channels: {name: (H, W)}, further values of each cell. Channels named in ``POINT_FIELDS`` become fields of the
+            scan when the image is unprojected. A cell without a return holds 0, and 255 (ignore) in ``label``.
 
     Raises:
         DataError: on a shape that is not the sensor's.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import RangeImage, load_sensor, unproject
+        >>> distance = np.zeros((64, 1024), np.float32)
+        >>> distance[20, 512] = 12.5
+        >>> image = RangeImage(distance, load_sensor("hdl64e_kitti"))
+        >>> unproject(image).points.round(2)
+        array([[12.43, -0.04, -1.3 ]], dtype=float32)
     """
 
     range: NDArray[np.float32]
@@ -192,7 +220,7 @@ class RangeImage:
 
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """(H, W) where there is a return."""
+        """(H, W) bool: which cells have a return."""
         return self.range > 0
 
     @property
@@ -208,7 +236,14 @@ class RangeImage:
 
 @runtime_checkable
 class Source(Protocol):
-    """Anything that holds scans by index: a dataset on disk, a bank, a list."""
+    """Any indexable collection of scans: a dataset on disk, a bank, a list.
+
+    Example:
+        >>> from lidar_synth import Source, open_scans
+        >>> scans = open_scans("demo_out/town")
+        >>> isinstance(scans, Source), isinstance([scans[0]], Source), isinstance(iter(scans), Source)
+        (True, True, False)
+    """
 
     def __len__(self) -> int: ...
 

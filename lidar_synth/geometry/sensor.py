@@ -1,9 +1,9 @@
-"""A LiDAR sensor as data: where its beams point, how many columns a turn has, how far it sees.
+"""A LiDAR sensor as data: the directions of its beams, the columns of a revolution, its range limits.
 
-Frame and angles (the whole package): right-handed sensor frame, x forward, y left, z up, metres.
-elevation = asin(z / range). azimuth = -atan2(y, x): it grows clockwise seen from above, so that the
-columns of a range image run as one looks around to the right: 0 straight ahead, which is the edge
-between columns W/2-1 and W/2; the seam is behind. Row 0 is the highest beam.
+Frame and angles (in the whole package): right-handed sensor frame, x forward, y left, z up, metres.
+elevation = asin(z / range). azimuth = -atan2(y, x), which increases clockwise seen from above, as the columns of a
+range image do. Azimuth 0 is straight ahead, at the edge between columns W/2-1 and W/2; the seam is behind the sensor.
+Row 0 is the highest beam.
 """
 
 from dataclasses import dataclass, fields
@@ -25,23 +25,33 @@ R2Flow and LiDM has it, the upper left corner."""
 
 @dataclass(frozen=True)
 class Sensor:
-    """One sensor. Angles are in degrees here, as in the configuration; every property is in radians.
+    """The geometry of one sensor.
+
+    The arguments, ``up`` and ``down`` are in degrees, as in the configuration; other angles are in radians.
 
     Args:
-        name: what to call it.
-        columns: W, cells of a full turn; even, so that straight ahead is an edge.
+        name: of the sensor.
+        columns: W, cells of a full revolution; even, so that straight ahead is an edge.
         range_min: metres, inclusive; nearer returns are dropped.
         range_max: metres, inclusive; farther returns are dropped.
-        rows: H, for beams linear in the row; with ``fov_up`` and ``fov_down`` (the outer edges of the
-            first and the last row).
-        elevations: in their place, one elevation per row, highest first; a row's edges lie halfway
-            between the beams.
-        beams: where the lasers' returns from a street really appear, one per row, if the rows only approximate it.
-        heights: metres above the origin at which each laser starts; 0 by default.
-        description: one line for people.
+        rows: H, for beams whose elevation is linear in the row; needs ``fov_up`` and ``fov_down``, the outer edges of
+            the first and the last row in degrees.
+        elevations: instead of ``rows``, ``fov_up`` and ``fov_down``, the elevation of each row in degrees, highest
+            first; the edges of a row lie halfway between the beams.
+        beams: the measured elevation of each laser in degrees, highest first, if the rows only approximate it.
+        heights: metres above the origin at which each laser starts, one per row; 0 by default.
+        description: one line of text.
 
     Raises:
-        ConfigError: on values that no sensor has.
+        ConfigError: on values that no sensor can have.
+
+    Example:
+        >>> from lidar_synth import Sensor
+        >>> sensor = Sensor("mine", columns=2048, range_min=1.0, range_max=120.0, rows=32, fov_up=15.0, fov_down=-25.0)
+        >>> sensor.shape
+        (32, 2048)
+        >>> sensor.ray_directions().shape
+        (32, 2048, 3)
     """
 
     name: str
@@ -95,12 +105,12 @@ class Sensor:
 
     @property
     def up(self) -> float:
-        """Upper edge of row 0, degrees."""
+        """The upper edge of row 0, degrees."""
         return float(self.fov_up) if self.fov_up is not None else float(np.degrees(self.edges[0]))
 
     @property
     def down(self) -> float:
-        """Lower edge of the last row, degrees."""
+        """The lower edge of the last row, degrees."""
         return float(self.fov_down) if self.fov_down is not None else float(np.degrees(self.edges[-1]))
 
     @cached_property
@@ -117,7 +127,7 @@ class Sensor:
 
     @cached_property
     def laser_elevations(self) -> NDArray[np.float32]:
-        """(H,) where the lasers point, highest first, radians: ``beams``, or else the rows."""
+        """(H,) elevation of each laser, highest first, radians: ``beams`` if they are given, otherwise the rows."""
         if self.beams is not None:
             return np.radians(self.beams).astype(np.float32)
         return self.row_elevations()
@@ -132,7 +142,7 @@ class Sensor:
         return np.radians(self.up - fraction * (self.up - self.down)).astype(np.float32)
 
     def column_azimuths(self, rays: Rays = "centre") -> NDArray[np.float32]:
-        """(W,) azimuth of each column in [-pi, pi), radians, growing clockwise."""
+        """(W,) azimuth of each column in [-pi, pi), radians, increasing clockwise."""
         offset = 0.5 if rays == "centre" else 0.0
         fraction = (np.arange(self.columns) + offset) / self.columns
         return ((2 * fraction - 1) * np.pi).astype(np.float32)
@@ -143,24 +153,24 @@ class Sensor:
         return np.stack(grid)
 
     def ray_directions(self, rays: Rays = "centre") -> NDArray[np.float32]:
-        """(H, W, 3) unit vectors x, y, z of every cell; read-only, shared between calls."""
+        """(H, W, 3) unit vector x, y, z of every cell; the array is read-only and shared between calls."""
         return _ray_directions(self, rays)
 
     def by_beams(self) -> "Sensor":
-        """The same sensor with one row per laser where the laser points, for unfolded scans."""
+        """The same sensor with one row per laser at the laser's own elevation, for unfolded scans."""
         if self.beams is None:
             return self
         return Sensor(f"{self.name}/beams", self.columns, self.range_min, self.range_max,
                       elevations=self.beams, description=self.description)  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as in the YAML file, without what is unset."""
+        """The arguments that are set, as plain values, with the keys of the YAML file."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v not in (None, "")}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "Sensor":
-        """The sensor of ``to_dict``'s values.
+        """Make a sensor from the values of ``to_dict``.
 
         Raises:
             ConfigError: on an unknown or missing key, or a value of the wrong kind.
@@ -201,11 +211,26 @@ def presets() -> dict[str, Sensor]:
 
 
 def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
-    """A preset by name, a user's YAML file by path (one entry, same keys), or a ``Sensor`` as it is.
+    """Load a sensor: a preset by name, or one of your own from a YAML file.
+
+    Args:
+        sensor: a name of ``presets()``; the path of a YAML file with one entry, whose keys are those of
+            ``sensors.yaml``; or a ``Sensor``, which is returned as it is.
 
     Raises:
         ConfigError: on an unknown name, or a file without exactly one sensor.
         FileError: on a path that cannot be read.
+
+    Example:
+        >>> from lidar_synth import load_sensor
+        >>> sensor = load_sensor("os1_128")
+        >>> sensor.shape, sensor.range_max
+        ((128, 1024), 170.0)
+        >>> entry = "mine: {rows: 32, fov_up: 15, fov_down: -25, columns: 2048, range_min: 1, range_max: 120}"
+        >>> with open("mine.yaml", "w") as file:
+        ...     _ = file.write(entry)
+        >>> load_sensor("mine.yaml").shape
+        (32, 2048)
     """
     if isinstance(sensor, Sensor):
         return sensor

@@ -1,13 +1,18 @@
 """Augmentations of a scan: points, labels and boxes together.
 
-An augmentation is ``(scan, rng) -> scan``: a function of its two arguments alone, which never changes the scan that it
-is given. Options are bound by ``functools.partial``, several steps by ``compose``::
+An augmentation is ``(scan, rng) -> scan``: a pure function of its two arguments, which never changes the scan that it
+is given. ``functools.partial`` sets its options, and ``compose`` makes one augmentation of several.
 
-    fresh = compose([partial(yaw, limit=45), flip_y, scale, beam_drop])
-    scan = fresh(scan, keyed_rng(seed, epoch, position))
+``yaw``, the flips and ``scale`` move points and boxes alike; afterwards the scan has neither pose nor camera image.
 
-What moves points against the world (``yaw``, flips, ``scale``) moves boxes alike; such a scan has no pose and no camera
-image any more.
+Example:
+    >>> import numpy as np
+    >>> from lidar_synth import Town
+    >>> from lidar_synth.labels.augment import yaw
+    >>> scan = Town(seed=0, scans=1)[0]
+    >>> turned = yaw(scan, np.random.default_rng(0), limit=45)
+    >>> np.array_equal(turned.label, scan.label), np.array_equal(turned.boxes.values, scan.boxes.values)
+    (True, False)
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +33,18 @@ Augmentation = Callable[[Scan, np.random.Generator], Scan]
 
 
 def compose(steps: Sequence[Augmentation]) -> Augmentation:
-    """All steps in this order, with one generator."""
+    """Make one augmentation that applies several in this order, with one random generator.
+
+    Example:
+        >>> from functools import partial
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.labels.augment import beam_drop, compose, flip_y, scale, yaw
+        >>> from lidar_synth.noise import keyed_rng
+        >>> augment = compose([partial(yaw, limit=45), flip_y, scale, beam_drop])  # as MixedScans' augment
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> 0 < len(augment(scan, keyed_rng(0, 3, 17))) <= len(scan)  # the key: seed, epoch, position
+        True
+    """
     return partial(_each, tuple(steps))
 
 
@@ -39,37 +55,37 @@ def _each(steps: tuple[Augmentation, ...], scan: Scan, rng: np.random.Generator)
 
 
 def yaw(scan: Scan, rng: np.random.Generator, limit: float = 180.0) -> Scan:
-    """Turns the scan about the sensor by up to ``limit`` degrees to either side."""
+    """Rotate the scan about the vertical axis by a random angle of up to ``limit`` degrees to either side."""
     if not 0 <= limit <= 180:
         raise ConfigError(f"limit={limit}", "0..180 degrees")
     return rotated(scan, float(np.radians(rng.uniform(-limit, limit))))
 
 
 def flip_x(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
-    """Swaps front and back, with a chance."""
+    """Mirror front and back with probability ``chance``."""
     return mirrored(scan, "x") if rng.random() < checked_share("chance", chance) else scan
 
 
 def flip_y(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
-    """Swaps left and right, with a chance."""
+    """Mirror left and right with probability ``chance``."""
     return mirrored(scan, "y") if rng.random() < checked_share("chance", chance) else scan
 
 
 def scale(scan: Scan, rng: np.random.Generator, low: float = 0.95, high: float = 1.05) -> Scan:
-    """Makes the world larger or smaller by a factor between ``low`` and ``high``."""
+    """Multiply all lengths by a random factor between ``low`` and ``high``."""
     if not 0 < low <= high < np.inf:
         raise ConfigError(f"low={low}, high={high}", "0 < low <= high")
     return scaled(scan, float(rng.uniform(low, high)))
 
 
 def jitter(scan: Scan, rng: np.random.Generator, spread: float = 0.01, reflectance: float = 0.02) -> Scan:
-    """Noise along the rays and on the reflectance; a return that would enter or leave a box stays where it was.
+    """Add noise along the rays and to the reflectance; a return that would enter or leave a box is not moved.
 
     Args:
         scan: N points.
-        rng: where the noise is from.
-        spread: standard deviation of the range, metres; cut off at three of it.
-        reflectance: standard deviation; the reflectance stays in [0, 1].
+        rng: source of the noise.
+        spread: standard deviation of the range, metres; the noise is clipped at three standard deviations.
+        reflectance: standard deviation of the reflectance, which stays in [0, 1].
     """
     if spread < 0 or reflectance < 0:
         raise ConfigError(f"spread={spread}, reflectance={reflectance}", "0 or more")
@@ -84,9 +100,9 @@ def jitter(scan: Scan, rng: np.random.Generator, spread: float = 0.01, reflectan
 
 
 def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan:
-    """Takes whole rings away, up to a share of the sensor's beams.
+    """Drop whole rings, at most ``share`` of the sensor's beams.
 
-    A point's ring is the file's own where the scan has it, else its row in the sensor's range image.
+    The ring of a point is ``scan.ring``, or its row in the sensor's range image if that is not set.
     """
     rows, columns = scan.sensor.shape
     most = round(checked_share("share", share) * rows)
@@ -96,13 +112,13 @@ def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan
 
 
 def range_drop(scan: Scan, rng: np.random.Generator, share: float = 0.3, power: float = 2.0) -> Scan:
-    """Takes returns away, the more the farther they are.
+    """Drop returns with a probability that increases with their range.
 
     Args:
         scan: N points.
-        rng: what decides.
-        share: chance to lose a return at the sensor's largest range.
-        power: the chance grows with range / range_max to this power.
+        rng: source of the random numbers.
+        share: probability that a return at ``range_max`` is dropped.
+        power: the probability is proportional to range / range_max to this power.
     """
     if not power >= 0:
         raise ConfigError(f"power={power}", "0 or more")
@@ -111,13 +127,13 @@ def range_drop(scan: Scan, rng: np.random.Generator, share: float = 0.3, power: 
 
 
 def rotated(scan: Scan, angle: float) -> Scan:
-    """The scan turned about the sensor, counter-clockwise by an angle in radians."""
+    """Rotate the scan about the vertical axis, counter-clockwise, by an angle in radians."""
     boxes = None if scan.boxes is None else turned(scan.boxes, angle)
     return _placed(scan, turned_points(scan.points, angle), boxes)
 
 
 def mirrored(scan: Scan, axis: Literal["x", "y"]) -> Scan:
-    """The scan with the sign of its x (front and back) or y (left and right) turned."""
+    """Mirror the scan: change the sign of x (front and back) or of y (left and right)."""
     if axis not in ("x", "y"):
         raise ConfigError(f"axis={axis!r}", "'x' or 'y'")
     column, boxes = "xy".index(axis), None
@@ -132,7 +148,7 @@ def mirrored(scan: Scan, axis: Literal["x", "y"]) -> Scan:
 
 
 def scaled(scan: Scan, factor: float) -> Scan:
-    """The scan with all lengths multiplied by a factor."""
+    """Multiply all lengths of the scan by a factor."""
     boxes = None
     if scan.boxes is not None:
         values = scan.boxes.values.copy()
@@ -146,7 +162,7 @@ def _placed(scan: Scan, points: NDArray[np.float32], boxes: Boxes | None) -> Sca
 
 
 def _left(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
-    """The scan with some points; a box that loses all of its own leaves, too."""
+    """Keep some of the points, and drop the boxes that lose all of their points."""
     if scan.boxes is None:
         return scan[keep]
     inside = scan.boxes.contain(scan.points)

@@ -1,4 +1,4 @@
-"""A bank of objects: what stood in the boxes of many scans, as a plain ``.npz``.
+"""A bank of objects: the contents of the boxes of many scans, as a plain ``.npz``.
 
 Arrays of the file (numpy's format, never pickled), M objects of P points in all::
 
@@ -37,10 +37,19 @@ FORMAT = "lidar-synth-objects/1"
 
 @dataclass(frozen=True, repr=False)
 class ObjectBank:
-    """Objects of many scans; see the module for the arrays.
+    """Objects cut out of many scans; the module describes the arrays.
 
     Raises:
-        DataError: on shapes that do not fit together.
+        DataError: on shapes that do not match each other.
+
+    Example:
+        >>> from lidar_synth import ObjectBank, Town
+        >>> objects = ObjectBank.from_scans(Town(seed=0, scans=2))
+        >>> objects[0].scan.points.shape == (objects.counts[0], 3)
+        True
+        >>> objects.save("objects.npz")
+        >>> len(ObjectBank.load("objects.npz")) == len(objects)
+        True
     """
 
     sensor: Sensor
@@ -70,15 +79,15 @@ class ObjectBank:
 
     @classmethod
     def from_scans(cls, source: Source, scans: Iterable[int] | None = None, least: int = 5) -> "ObjectBank":
-        """The objects in the boxes of a source's scans.
+        """Collect the objects in the boxes of a source's scans.
 
         Args:
-            source: whose scans; those without boxes are left out.
-            scans: their indices; all by default.
-            least: points that an object needs.
+            source: of the scans; scans without boxes are left out.
+            scans: indices of the scans to use; by default all.
+            least: minimum number of points of an object.
 
         Raises:
-            DataError: where there is no object in any of them, or the scans are of several sensors.
+            DataError: if there is no object in any of the scans, or the scans have several sensors.
         """
         found: list[tuple[int, Object]] = []
         chosen = range(len(source)) if scans is None else list(scans)
@@ -111,11 +120,11 @@ class ObjectBank:
 
     @classmethod
     def load(cls, path: str | Path) -> "ObjectBank":
-        """The bank in a file.
+        """Load a bank from a file.
 
         Raises:
-            FileError: where it cannot be read.
-            DataError: where it is no bank of objects, or damaged.
+            FileError: if it cannot be read.
+            DataError: if it is not a bank of objects, or damaged.
         """
         path = Path(path)
         content = BytesIO(read_file(path))
@@ -132,10 +141,10 @@ class ObjectBank:
             raise DataError(f"{path}: {error}", f"a bank of objects ({FORMAT})") from error
 
     def save(self, path: str | Path) -> None:
-        """Writes the bank to a file; ``load`` is the inverse.
+        """Write the bank to a file; ``load`` is the inverse.
 
         Raises:
-            FileError: where it cannot be written.
+            FileError: if it cannot be written.
         """
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sensor", "boxes")}
         arrays |= {f"box_{f.name}": np.asarray(getattr(self.boxes, f.name)) for f in fields(Boxes)}
@@ -149,7 +158,7 @@ class ObjectBank:
         return f"ObjectBank({len(self)} objects, {len(self.points)} points, {self.sensor.name})"
 
     def __getitem__(self, index: int) -> Object:
-        """Object ``index`` where it was seen."""
+        """Object ``index`` at the place where it was recorded."""
         if not 0 <= index < len(self):
             raise IndexError(f"object {index} of {len(self)}")
         box, part = self.boxes[[index]], slice(self.start[index], self.start[index + 1])
@@ -165,5 +174,5 @@ class ObjectBank:
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """(M,) points of each object."""
+        """(M,) number of points of each object."""
         return np.diff(self.start)

@@ -13,7 +13,7 @@ from lidar_synth.labels.own import condition, generated, ignored, unlabelled
 from lidar_synth.labels.pseudo import pseudo
 
 LabelPolicy = Callable[[Scan, np.random.Generator], Scan]
-"""What decides on the labels of a synthetic scan; it never changes the scan that it is given."""
+"""Sets the labels of a synthetic scan; it returns a new scan and never changes the one that it is given."""
 
 KINDS: dict[str, Callable[..., LabelPolicy]] = {"objects": objects, "polar": polar, "laser": laser}
 """Kinds of ``mix``, built as policies are."""
@@ -44,16 +44,25 @@ POLICIES: dict[str, Callable[..., LabelPolicy]] = {
 def make_policy(
     labels: str | LabelPolicy, *, real: Source | None = None, fields: frozenset[str] = frozenset(), **options: Any
 ) -> LabelPolicy:
-    """A label policy by name.
+    """Make a label policy by name.
 
     Args:
-        labels: a name of ``POLICIES``, or a policy as it is.
+        labels: a name of ``POLICIES``, or a policy, which is returned as it is.
         real: the real labelled scans, for policies that draw from them.
-        fields: which of ``POINT_FIELDS`` the synthetic scans carry.
+        fields: the fields of ``POINT_FIELDS`` that the synthetic scans have.
         options: of the policy.
 
     Raises:
-        ConfigError: on an unknown name or option, or a policy that the sources cannot serve.
+        ConfigError: on an unknown name or option, or a policy that the sources cannot support.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Bank, make_policy
+        >>> bank = Bank("demo_out/bank")
+        >>> policy = make_policy("generated", fields=bank.fields, threshold=0.6)
+        >>> scan = policy(bank[0], np.random.default_rng(0))
+        >>> np.unique(scan.label[scan.confidence < 0.6])  # labels of low confidence are ignored
+        array([255], dtype=uint8)
     """
     if not isinstance(labels, str):
         if options:

@@ -30,7 +30,7 @@ ToSample = Callable[[Scan, np.random.Generator], Any]
 
 
 class MixedScans(Dataset[Any]):
-    """Real scans as they are and synthetic scans among them, at an exact ratio.
+    """A dataset of real scans mixed with synthetic ones at an exact ratio; real scans stay unchanged.
 
     What stands where in an epoch is a pure function of the arguments and the epoch (plan.py), already shuffled: go
     through it in order (a ``DataLoader`` without ``shuffle``) or by ``batches``, which also serves several ranks. Any
@@ -42,31 +42,39 @@ class MixedScans(Dataset[Any]):
         ratio: share of synthetic samples in [0, 1]: a number, a list with one for each epoch, ``{epoch: share}``,
             ``Linear(first, last, epochs)`` or a function of the epoch.
         labels: label policy of the synthetic scans: a name of ``lidar_synth.labels.POLICIES`` or a function.
-        seed: of the order, of everything that is drawn for a sample, and of a generator's scans.
-        label_options: of the policy.
+        seed: of the order, of all random numbers of a sample, and of a generator's scans.
+        label_options: keyword arguments of the label policy.
         epoch_size: ``"add"`` gives every real scan once and adds synthetic ones; ``"replace"`` keeps the number of
             real scans as the length; a number is the length.
         reuse: how often a synthetic scan is given, each time augmented anew.
         balanced: spread synthetic samples evenly, so that every batch in order holds its exact share (up to one
             sample where that is no whole number).
         augment: ``(scan, rng) -> scan`` for synthetic scans, after the label policy.
-        augment_real: also for real scans, which otherwise pass untouched, bit for bit.
-        to_sample: ``(scan, rng) -> sample``; by default the plain PyTorch item (items.py).
+        augment_real: whether ``augment`` is also for real scans, which otherwise stay unchanged, bit for bit.
+        to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py).
         collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"`` (collate.py), or
-            a function of its own.
+            your own function.
         unlabelled: ``"error"`` refuses a batch without one valid label, ``"allow"`` hands it out, as
             ``labels="none"`` always does.
         real_as_is: real samples are no ``Scan`` but what a trainer wants already; see ``wrap``.
 
     Attributes:
         collate: the ``collate_fn``.
-        mixture: what the plan follows from.
+        mixture: the settings that determine the plan.
         real, synthetic: the sources, in the plan's order.
 
     Raises:
         ConfigError: on a ratio outside [0, 1], sources of different sensors or classes, a policy that a source
-            cannot serve, or sizes that cannot be kept.
+            cannot support, or sizes that are impossible.
         DataError: without real scans, unless ratio is 1.
+
+    Example:
+        >>> from lidar_synth import Bank, MixedScans, open_scans
+        >>> train = MixedScans(open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.25)
+        >>> len(train), sum(train.domain(i) for i in range(len(train)))  # three real scans, one synthetic
+        (4, 1)
+        >>> list(train[0])
+        ['points', 'label', 'confidence', 'boxes', 'names', 'domain', 'id']
     """
 
     def __init__(
@@ -122,21 +130,32 @@ class MixedScans(Dataset[Any]):
         collate: Callable[[Any], Any] = default_collate,
         **options: Any,
     ) -> "MixedScans":
-        """A trainer's own map-style dataset with synthetic samples among its own.
+        """Mix synthetic samples into a trainer's own map-style dataset.
 
-        Its samples pass through as they are and nothing is added to them: ``domain(i)`` tells which are synthetic.
-        What else the trainer asks its dataset for (class names, a collate function) comes from the wrapped one.
+        Its samples are passed on unchanged, with nothing added; ``domain(i)`` tells which samples are synthetic.
+        Other attributes that the trainer reads from its dataset (class names, a collate function) come from the
+        wrapped one.
 
         Args:
             dataset: has ``__len__`` and ``__getitem__``; or ``Sources`` of several.
-            synth, ratio: as above.
-            to_sample: ``(scan, rng) -> sample`` makes of a synthetic scan what ``dataset`` makes of a real one.
-            collate: the trainer's own.
-            options: the others as above. A label policy that draws from real scans has to be made beforehand, by
-                ``make_policy(..., real=scans)``.
+            synth, ratio: as for ``MixedScans``.
+            to_sample: ``(scan, rng) -> sample`` gives a synthetic scan the form of ``dataset``'s samples.
+            collate: the trainer's own collate function.
+            options: other arguments of ``MixedScans``. A label policy that draws from real scans has to be made
+                beforehand, by ``make_policy(..., real=scans)``.
 
         Raises:
             ConfigError, DataError: as above.
+
+        Example:
+            >>> import torch
+            >>> from lidar_synth import Bank, MixedScans
+            >>> yours = [torch.rand(1000, 3) for _ in range(3)]  # any dataset: here its samples are points (N, 3)
+            >>> def to_sample(scan, rng):
+            ...     return torch.from_numpy(scan.points)
+            >>> train = MixedScans.wrap(yours, Bank("demo_out/bank"), ratio=0.25, to_sample=to_sample)
+            >>> [train[i].shape[1] for i in range(len(train))]
+            [3, 3, 3, 3]
         """
         return cls(dataset, synth, ratio, to_sample=to_sample, collate=collate, real_as_is=True, **options)
 
@@ -149,7 +168,7 @@ class MixedScans(Dataset[Any]):
 
     @property
     def seed(self) -> int:
-        """The mixture's."""
+        """The seed of the mixture."""
         return self.mixture.seed
 
     @property
@@ -213,12 +232,20 @@ class MixedScans(Dataset[Any]):
         return self.sample(epoch, int(index) % length)
 
     def domain(self, index: int) -> int:
-        """0 where a real sample stands in the current epoch, 1 where a synthetic one does."""
+        """The domain of the sample at ``index`` in the current epoch: 0 = real, 1 = synthetic.
+
+        Example:
+            >>> from lidar_synth import Bank, MixedScans, open_scans
+            >>> train = MixedScans(open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.5)
+            >>> domains = [train.domain(i) for i in range(len(train))]
+            >>> domains.count(0), domains.count(1)
+            (3, 3)
+        """
         made = self.plan()
         return SYNTHETIC if made.source[index] >= made.reals else REAL
 
     def sample(self, epoch: int, position: int) -> Any:
-        """What stands at a position of an epoch, 0 <= position < length; ``self[i]`` is ``sample(epoch, i)``."""
+        """The sample at a position of an epoch, 0 <= position < length; ``self[i]`` is ``sample(epoch, i)``."""
         made = self.plan(epoch)
         source, index = int(made.source[position]), int(made.index[position])
         if source >= made.reals:
@@ -234,9 +261,9 @@ class MixedScans(Dataset[Any]):
         return self._to_sample(real, rng)
 
     def finish(self, scan: Scan, epoch: int, position: int) -> Any:
-        """The sample of a synthetic scan at its position: label policy, augmentation, ``to_sample``.
+        """Make the sample of a synthetic scan at its position: label policy, augmentation, ``to_sample``.
 
-        For those who fetch the scan elsewhere, such as in the main process on a GPU.
+        This is for callers that make the scan elsewhere, such as in the main process on a GPU.
         """
         made = self.plan(epoch)
         rng = keyed_rng(self.seed, epoch, position)
@@ -248,5 +275,14 @@ class MixedScans(Dataset[Any]):
     def batches(
         self, batch_size: int, *, rank: int | None = None, world_size: int | None = None, drop_last: bool = False
     ) -> MixedBatches:
-        """A ``batch_sampler`` along the plan, for one rank or several; see ``MixedBatches``."""
+        """Make a ``batch_sampler`` in the order of the plan, for one rank or several; see ``MixedBatches``.
+
+        Example:
+            >>> from torch.utils.data import DataLoader
+            >>> from lidar_synth import Bank, MixedScans, open_scans
+            >>> train = MixedScans(open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.5, balanced=True)
+            >>> loader = DataLoader(train, batch_sampler=train.batches(2), collate_fn=train.collate)
+            >>> [sorted(batch["domain"].tolist()) for batch in loader]
+            [[0, 1], [0, 1], [0, 1]]
+        """
         return MixedBatches(self, batch_size, rank=rank, world_size=world_size, drop_last=drop_last)

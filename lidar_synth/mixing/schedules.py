@@ -52,12 +52,21 @@ class Steps:
 
 @dataclass(frozen=True)
 class Linear:
-    """A share that changes evenly from epoch to epoch, then stays.
+    """A ratio that changes linearly from epoch to epoch and then stays constant.
 
     Args:
-        first: share in epoch 0.
-        last: share from epoch ``epochs - 1`` on.
-        epochs: how many the way takes, at least 2.
+        first: ratio in epoch 0, in [0, 1].
+        last: ratio from epoch ``epochs - 1`` on, in [0, 1].
+        epochs: number of epochs from ``first`` to ``last``, at least 2.
+
+    Raises:
+        ConfigError: on a ratio outside [0, 1], or fewer than 2 epochs.
+
+    Example:
+        >>> from lidar_synth import Linear
+        >>> ratio = Linear(0.5, 0.1, epochs=5)
+        >>> [round(ratio(epoch), 1) for epoch in range(7)]
+        [0.5, 0.4, 0.3, 0.2, 0.1, 0.1, 0.1]
     """
 
     first: float

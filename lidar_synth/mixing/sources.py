@@ -1,4 +1,4 @@
-"""Several sources as one, and whether sources may be mixed at all."""
+"""Several sources as one, and the check that sources can be mixed."""
 
 import hashlib
 from collections.abc import Sequence
@@ -13,15 +13,22 @@ from lidar_synth.geometry.sensor import Sensor
 
 
 class Sources:
-    """Several real or several synthetic sources, to be given in the place of one.
+    """Several real or several synthetic sources that ``MixedScans`` takes as one.
 
     Args:
         sources: in order.
-        weights: one for each; how many samples of an epoch a source gives is proportional to its weight. By default
-            real sources count by their lengths and synthetic ones all the same.
+        weights: one for each source; its number of samples in an epoch is proportional to its weight. By default the
+            weight of a real source is its length, and synthetic sources have equal weights.
 
     Raises:
         ConfigError: without a source, or on another number of weights.
+
+    Example:
+        >>> from lidar_synth import Bank, MixedScans, Sources, load_generator
+        >>> synth = Sources(Bank("demo_out/bank"), load_generator("town"), weights=[3, 1])
+        >>> train = MixedScans(None, synth, ratio=1.0, epoch_size=4)
+        >>> sorted(train[i]["id"] for i in range(4))  # one of the generator (seed 0), three of the bank (seed 1)
+        ['town/0/0', 'town/1/0', 'town/1/1', 'town/1/2']
     """
 
     def __init__(self, *sources: Any, weights: Sequence[float] | None = None) -> None:
@@ -36,7 +43,7 @@ class Sources:
         return sum(map(len, self.sources))
 
     def __getitem__(self, index: int) -> Any:
-        """The scan at ``index``, one source after another."""
+        """The scan at ``index``; the sources follow one another."""
         if not 0 <= index < len(self):
             raise IndexError(f"scan {index} of {len(self)}")
         for source in self.sources:

@@ -1,4 +1,4 @@
-"""``MixedStream``: the same plan as an ``IterableDataset``, epoch by epoch or without end."""
+"""``MixedStream``: the same plan as an ``IterableDataset``, epoch by epoch or endlessly."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain, count, islice, takewhile
@@ -13,10 +13,10 @@ from lidar_synth.mixing.state import checked_state, place, shared_integers
 
 
 class MixedStream(IterableDataset[Any]):
-    """The samples of a ``MixedScans`` in the order of its plan.
+    """The samples of a ``MixedScans`` as an iterable dataset, in the order of its plan.
 
-    Worker w of W gives every W-th batch, so that ``DataLoader(stream, batch_size=B, num_workers=W)`` with the same B
-    gives the same batches in the same order for every W. Over all ranks and workers every sample is given once.
+    Worker w of W yields every W-th batch, so that ``DataLoader(stream, batch_size=B, num_workers=W)`` with the same B
+    yields the same batches in the same order for every W. Over all ranks and workers every sample is yielded once.
 
     The state is {seed, epoch, position} where the batches given so far end. A worker's own state, which torchdata's
     ``StatefulDataLoader`` asks for, adds how many samples it has given since, and fits the same ranks and workers only.
@@ -24,13 +24,24 @@ class MixedStream(IterableDataset[Any]):
     Args:
         scans: the mixed dataset; also one that ``MixedScans.wrap`` made.
         batch_size: that of the ``DataLoader``, on each rank.
-        endless: go on from epoch to epoch; otherwise iterating ends with the epoch, and ``set_epoch`` chooses the next.
-        drop_last: with an end, leave out what does not fill a batch on every rank. Without it the last batches of
-            ranks differ in size, and some ranks may have none, which trainers that wait for one another do not bear.
+        endless: whether the next epoch follows without a pause; otherwise iterating ends with the epoch, and
+            ``set_epoch`` chooses the next one.
+        drop_last: without ``endless``, whether to drop the samples that do not fill a batch on every rank. If they are
+            kept, the last batches of the ranks differ in size and some ranks may have none, so that trainers whose
+            ranks wait for one another hang.
         rank, world_size: see ``place``; they have to be known before workers start.
 
     Raises:
         ConfigError: on a batch size below 1 or a rank out of range.
+
+    Example:
+        >>> from torch.utils.data import DataLoader
+        >>> from lidar_synth import Bank, MixedScans, MixedStream, open_scans
+        >>> train = MixedScans(open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.5, balanced=True)
+        >>> stream = MixedStream(train, batch_size=2, endless=False)
+        >>> loader = DataLoader(stream, batch_size=2, collate_fn=stream.collate)
+        >>> [sorted(batch["domain"].tolist()) for batch in loader]
+        [[0, 1], [0, 1], [0, 1]]
     """
 
     def __init__(
@@ -54,7 +65,7 @@ class MixedStream(IterableDataset[Any]):
         self._resume: dict[str, int] = {}  # a state that this process has to go on from
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch in which iterating begins."""
+        """Set the epoch in which iterating begins."""
         self.scans.set_epoch(epoch)
 
     def __iter__(self) -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""Where synthetic scans come from: one interface for generation on the CPU, banks and held scans."""
+"""Sources of synthetic scans: one interface for generators, banks and scans that exist already."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -44,20 +44,29 @@ class Synthetic(Protocol):
 
 
 class Generated:
-    """Scans made when they are asked for, in the process that asks: on the CPU also in DataLoader workers.
+    """Scans that a generator makes on access, in the process that accesses them.
 
     Args:
-        generator: what makes them. One on a GPU serves the main process only; a worker that asks it gets an error
-            that names the three ways to have a GPU's scans.
+        generator: the model. On the CPU it also works in DataLoader workers. On a GPU it works in the main process
+            only; in a worker it raises an error that names the three ways to use a GPU's scans.
         seed: of the scans; the number of a scan is its index.
-        condition: for a conditional model, what conditions scan n: entry n modulo their number of an indexable source,
-            such as the real scans (``Generator.scans`` tells what it takes).
-        cache: how many of the latest scans each process keeps in memory (about 1 MB each at 64 x 1024), which saves
-            time where one process is asked for a scan again (``reuse``).
+        condition: for a conditional model, an indexable source of conditions, such as the real scans. Scan n is
+            conditioned on entry n modulo the source's length; ``Generator.range_images`` lists the kinds of entries.
+        cache: number of latest scans that each process keeps in memory (about 1 MB each at 64 x 1024), which saves
+            time if a process accesses a scan again (``reuse``).
         sampling: steps, solver and guidance, as for ``Generator.scans``.
 
     Raises:
-        ConfigError: on a negative cache, or a conditional model without conditions.
+        ConfigError: on a negative cache, a conditional model without conditions, or conditions for an unconditional
+            model.
+
+    Example:
+        >>> from lidar_synth import load_generator, open_scans
+        >>> from lidar_synth.mixing import Generated
+        >>> real = open_scans("demo_out/town")
+        >>> synth = Generated(load_generator("town-semantic"), condition=real)  # for MixedScans(real, synth, ...)
+        >>> sorted(synth[0].fields())
+        ['confidence', 'label', 'reflectance']
     """
 
     length: None = None
@@ -79,17 +88,17 @@ class Generated:
 
     @property
     def sensor(self) -> Sensor:
-        """The generator's."""
+        """The sensor of the generator."""
         return self.generator.sensor
 
     @property
     def fields(self) -> frozenset[str]:
-        """What the model makes beside the points."""
+        """The fields that the scans have besides their points."""
         return self.generator.fields | {"reflectance"}
 
     @property
     def identity(self) -> str:
-        """The checkpoint, the seed, the conditions and how it is sampled."""
+        """The checkpoint, the seed, the sampling options and the conditions as one text."""
         model = self.generator.hash or self.generator.name
         options = {k: v for k, v in sorted(self._sampling.items()) if v is not None}
         conditions = "" if self.condition is None else identity_of(self.condition)
@@ -107,7 +116,7 @@ class Generated:
         return scan
 
     def scans(self, numbers: Sequence[int]) -> list[Scan]:
-        """Several at once, as a GPU wants them."""
+        """Several scans at once, which is faster on a GPU."""
         condition = None if self.condition is None else [self.condition[n % len(self.condition)] for n in numbers]
         return self.generator.scans(self.seed, numbers, condition, **self._sampling)
 

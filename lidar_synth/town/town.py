@@ -1,8 +1,8 @@
-"""The town as a source of scans: ``Town(seed)[i]`` is scan number i, the same whoever asks and in what order.
+"""The town as a source of scans: ``Town(seed)[i]`` is scan number i, in any process and any order of access.
 
-Twenty neighbouring scans share a stretch of road: the ego vehicle drives along it, ``interval`` seconds from
-scan to scan, and everything that stands or moves is where it has to be. Stretches lie a kilometre apart in
-the world frame of the poses, so that nothing that accumulates scans by pose mixes two of them.
+Twenty neighbouring scans share a stretch of road. The ego vehicle drives along it, with ``interval`` seconds from scan
+to scan, among static and moving objects. Stretches lie a kilometre apart in the world frame of the poses, so that
+accumulating scans by pose never mixes two of them.
 """
 
 from collections import OrderedDict
@@ -32,18 +32,27 @@ APART = 1000.0
 
 
 class Town:
-    """An indexable source of synthetic scans with labels, boxes and poses.
+    """An indexable source of ray-cast scans of a procedural town, with labels, boxes and poses.
 
     Args:
-        seed: of the whole town, 0 and up.
-        sensor: whose rays are cast, as ``load_sensor`` takes it.
-        scans: how many scans it holds.
-        interval: seconds between neighbouring scans of a stretch.
-        noise: how imperfect the sensor is.
+        seed: of the whole town, 0 or more.
+        sensor: the sensor whose rays are cast, as ``load_sensor`` takes it.
+        scans: number of scans.
+        interval: seconds between neighbouring scans of a stretch, 0 < interval < 60.
+        noise: the measurement noise of the sensor; by default ``Noise()``.
 
     Raises:
-        ConfigError: on a negative seed or number of scans, an interval that is not positive, an unknown sensor.
-        LibraryError: where embreex is missing.
+        ConfigError: on a negative seed or number of scans, an interval out of range, or an unknown sensor.
+        LibraryError: if embreex is missing.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> town = Town(seed=0, scans=100)
+        >>> scan = town[0]
+        >>> list(scan.fields())
+        ['reflectance', 'label', 'raw_label', 'instance', 'ring']
+        >>> "Car" in scan.boxes.names, scan.pose.shape
+        (True, (4, 4))
     """
 
     def __init__(
@@ -79,14 +88,14 @@ class Town:
 
     @property
     def calibration(self) -> Calibration:
-        """The camera beside the sensor."""
+        """The calibration of the camera next to the sensor."""
         return CAMERA
 
     def __len__(self) -> int:
         return self._scans
 
     def world(self, index: int) -> World:
-        """The stretch of road in which a scan is taken; the last two are kept."""
+        """The stretch of road in which a scan is taken; the last two stay in memory."""
         stretch = index // STRETCH_FRAMES
         if stretch not in self._worlds:
             if len(self._worlds) > 1:
@@ -105,10 +114,10 @@ class Town:
         return Stage(world, movers), pose, rng
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """(376, 1408, 3) uint8 RGB, the picture taken with scan ``index`` by the camera of ``calibration``.
+        """(376, 1408, 3) uint8 RGB, the image that the camera of ``calibration`` takes with scan ``index``.
 
         Raises:
-            IndexError: outside 0 to ``len - 1``.
+            IndexError: on an index outside 0 to ``len - 1``.
         """
         stage, pose, _ = self.moment(self._checked(index))
         stretch, frame = divmod(index, STRETCH_FRAMES)
@@ -124,7 +133,7 @@ class Town:
         """Scan number ``index``.
 
         Raises:
-            IndexError: outside 0 to ``len - 1``.
+            IndexError: on an index outside 0 to ``len - 1``.
         """
         stage, pose, rng = self.moment(self._checked(index))
         world = self.world(index)

@@ -17,7 +17,7 @@ class BatchImage(NamedTuple):
 
     Args:
         range: (B, H, W) float32 metres, 0 = no return.
-        channels: (B, C, H, W) what was carried, 0 where there is no return.
+        channels: (B, C, H, W) further values of the points, 0 where there is no return.
         point: (B, H, W) int64 row of ``points`` that a cell shows, -1 = none.
     """
 
@@ -44,15 +44,27 @@ def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor
 
 
 def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -> BatchImage:
-    """Spherical projection of a batch of clouds; equal to ``project`` of each.
+    """Project a batch of point clouds to range images, each bit for bit as ``project`` does.
 
     Args:
-        points: (N, 3 + C) float32 x, y, z in metres, then C values to carry, all clouds one after another.
+        points: (N, 3 + C) float32 x, y, z in metres, then C further values; all clouds one after another, on any
+            device.
         offsets: (B + 1,) int64, cloud b is ``points[offsets[b]:offsets[b + 1]]``.
-        sensor: whose grid.
+        sensor: the sensor that defines the grid.
 
     Raises:
         DataError: on another dtype or shape, or offsets that do not cover the points.
+
+    Example:
+        >>> import torch
+        >>> from lidar_synth import load_sensor
+        >>> from lidar_synth.geometry.projection import project_batch
+        >>> points = torch.tensor([[10.0, 0.1, -1.0, 0.3], [12.0, 4.0, 0.5, 0.9], [7.0, -2.0, -1.0, 0.2]])
+        >>> images = project_batch(points, torch.tensor([0, 2, 3]), load_sensor("hdl64e_kitti"))  # 2 points, 1 point
+        >>> images.range.shape, images.channels.shape
+        (torch.Size([2, 64, 1024]), torch.Size([2, 1, 64, 1024]))
+        >>> (images.range > 0).sum((1, 2))
+        tensor([2, 1])
     """
     if points.dtype != torch.float32 or points.ndim != 2 or points.shape[1] < 3:
         raise DataError(f"points {tuple(points.shape)} {points.dtype}", "(N, 3 + C) float32: x, y, z in metres, ...")
@@ -74,11 +86,11 @@ def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -
 
 
 def unproject_batch(image: torch.Tensor, sensor: Sensor, rays: Rays = "centre") -> torch.Tensor:
-    """Points of every cell of a batch of range images.
+    """Convert every cell of a batch of range images to a point.
 
     Args:
         image: (B, H, W) float32 metres, 0 = no return.
-        sensor: whose grid.
+        sensor: the sensor that defines the grid.
         rays: through the cells' centres or corners.
 
     Returns:

@@ -57,16 +57,17 @@ def fill_points(
     window: int = 5,
     cutoff: float = 1.0,
 ) -> NDArray[np.uint8]:
-    """Labels per point from labels per cell; a point that its cell does not show asks its neighbours.
+    """Transfer labels from cells to points, as a range-view network needs (after RangeNet++, Milioto et al. 2019).
 
-    A hidden point takes the majority among the k returns of the window nearest to it in range, those farther
-    than ``cutoff`` left out; if that leaves none, the label of the nearest (after RangeNet++, Milioto et al. 2019).
+    A point that its cell shows takes the cell's label. A hidden point takes the majority label of the k returns in
+    the window around its cell whose range is nearest to its own. Returns whose range differs by more than ``cutoff``
+    do not vote; if none is left, the point takes the label of the nearest.
 
     Args:
         labels: (H, W) uint8 per cell.
         image: (H, W) float32 range in metres, 0 = no return.
-        cells: where the scan's N points fall, from ``locate``.
-        k: how many vote, at most 32.
+        cells: the cells of the scan's N points, from ``locate``.
+        k: number of returns that vote, at most 32.
         window: side of the window in cells, odd; columns wrap.
         cutoff: metres.
 
@@ -74,7 +75,16 @@ def fill_points(
         (N,) uint8; 255 = ignore for a point outside the sensor's range limits.
 
     Raises:
-        DataError: on shapes that do not fit, or a k or window that cannot be served.
+        DataError: on shapes that do not match, or an invalid k or window.
+
+    Example:
+        >>> from lidar_synth import Town, project
+        >>> from lidar_synth.geometry.projection import fill_points, locate
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> image, cells = project(scan), locate(scan.points, scan.sensor)
+        >>> label = fill_points(image.label, image.range, cells)
+        >>> label.shape == scan.label.shape, round(float((label == scan.label).mean()), 1)
+        (True, 1.0)
     """
     if not labels.shape == image.shape == cells.point.shape:
         raise DataError(f"labels {labels.shape}, range {image.shape}, cells {cells.point.shape}", "one shape (H, W)")

@@ -48,7 +48,7 @@ def _rows_by_elevation(elevations: NDArray[np.float64], beams: NDArray[np.float3
 
 
 def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation") -> RangeImage:
-    """The scan as a range image with one row per laser: ring by ring, nearest return in a cell.
+    """Unfold a scan to a range image with one row per laser; a cell shows its nearest return.
 
     Args:
         scan: N points in raw ring order, or in any order with ``scan.ring`` known.
@@ -56,10 +56,17 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         anchor: how a ring finds its row, where ``scan.ring`` does not tell it.
 
     Returns:
-        An image on ``sensor.by_beams()``, whose rays point where the lasers do.
+        An image on ``sensor.by_beams()``, whose rays have the elevations of the lasers.
 
     Raises:
         DataError: on more rings than the sensor has lasers: the scan is not in ring order.
+
+    Example:
+        >>> from lidar_synth import open_scans, unfold
+        >>> scan = open_scans("demo_out/town")[0]
+        >>> image = unfold(scan)
+        >>> image.range.shape, image.sensor.name
+        ((64, 1024), 'hdl64e_semantic_kitti/beams')
     """
     lasers = (sensor or scan.sensor).by_beams()
     height, width = lasers.shape

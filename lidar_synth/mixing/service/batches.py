@@ -35,20 +35,24 @@ class Place(NamedTuple):
 
 
 class BatchMixer:
-    """Takes the place of a ``DataLoader`` over a ``MixedScans`` whose generator is on the GPU::
-
-        train = MixedScans(real, load_generator("town", device="cuda"), ratio=0.25)
-        for batch in BatchMixer(train, batch_size=8, num_workers=4):
-            ...
+    """A replacement of ``DataLoader`` for a ``MixedScans`` whose generator is on the GPU.
 
     Args:
-        dataset: what to load. Scans of generators are made here, all other samples by the workers.
-        batch_size: samples of a batch, along the plan.
-        batch_sampler: in the place of ``batch_size``, such as ``dataset.batches(...)`` of one rank.
-        options: others of ``DataLoader``, such as ``num_workers``; ``collate_fn`` is the dataset's ``collate``.
+        dataset: whose samples are loaded. The main process makes the scans of generators, workers all other samples.
+        batch_size: number of samples in a batch, in the order of the plan.
+        batch_sampler: instead of ``batch_size``, such as ``dataset.batches(...)`` of one rank.
+        options: other options of ``DataLoader``, such as ``num_workers``; ``collate_fn`` is ``dataset.collate``.
 
     Raises:
         ConfigError: on both or none of ``batch_size`` and ``batch_sampler``.
+
+    Example:
+        >>> from lidar_synth import BatchMixer, MixedScans, load_generator, open_scans
+        >>> generator = load_generator("town")  # with a GPU: device="cuda"
+        >>> train = MixedScans(open_scans("demo_out/town"), generator, ratio=0.25)
+        >>> domains = [batch["domain"] for batch in BatchMixer(train, batch_size=2, num_workers=0)]
+        >>> [len(d) for d in domains], int(sum(d.sum() for d in domains))
+        ([2, 2], 1)
     """
 
     def __init__(

@@ -1,8 +1,8 @@
-"""A rolling bank: scans made by a process of their own, ahead of demand, and copied out by every reader.
+"""A rolling bank: a process of its own makes scans ahead of demand, and every reader copies them from shared memory.
 
-DataLoader workers cannot use a GPU, and a model in each of them is many too many. Here one spawned process owns the
-model and keeps the scans that will be asked for next in shared memory; under distributed training every rank makes a
-bank of its own, on its own device::
+DataLoader workers cannot use a GPU, and a model in each of them would take too much memory. Here one spawned process
+owns the model and keeps the scans that are needed next in shared memory. Under distributed training every rank makes
+its own bank, on its own device::
 
     synth = RollingBank("town", device=f"cuda:{local_rank}", seed=0)
     train = MixedScans(real, synth, ratio=0.25)
@@ -34,38 +34,46 @@ _PART = 8192  # numbers in one message: less than a socket holds, so that sendin
 class RollingBank:
     """Scans by number from a generator process.
 
-    Scan ``number`` is ``generator.scans(seed, [number])`` as a bank encodes it, in whichever order scans are asked
-    for and by whichever process. Two settings give that up for speed: ``starved="reuse"``, and ``refresh``, with
-    which the scan is a function of number and epoch.
+    Scan ``number`` is ``generator.scans(seed, [number])`` after a bank's encoding, for any process and any order of
+    access. Two settings trade this for speed: ``starved="reuse"``, and ``refresh``, with which the scan is a function
+    of number and epoch.
 
-    Workers get the bank by being started with it, forked or spawned. It ends with ``close()``, with its ``with``
-    block, or with the process that made it, and leaves nothing behind however that one ends.
+    Workers inherit the bank when they start, forked or spawned. The generator process ends with ``close()``, at the
+    end of a ``with`` block, or with the process that made the bank; in each case its shared memory is freed.
 
     Args:
-        model: a shipped model's name or a path to a checkpoint, unconditional.
+        model: the name of a shipped model or the path of a checkpoint; the model must be unconditional.
         seed: of the scans, 0 <= seed < 2^64.
-        slots: scans held in shared memory, 3 to 5 bytes a cell each. More than all workers ask for ahead: workers x
-            ``prefetch_factor`` x batch size x ratio; a scan that is served several times (the plan's ``reuse``) is
-            kept until then only where there is room.
-        starved: what a request does whose scan is not there yet: ``"wait"`` for it, or ``"reuse"`` the held one that
-            was served least.
-        refresh: in (0, 1]: hold a pool of scans and replace this share of it with each epoch; request n gets the
-            scan of the pool whose number is n modulo its size. The next epoch's scans have slots of their own.
-        timeout: seconds that any wait may last: for the model to load, or for one scan.
-        threads: of torch in the generator process; None = torch's own choice.
-        steps, solver: as ``Generator.range_images`` takes them.
-        options: device, dtype, compile and batch, as ``load_generator`` takes them.
+        slots: number of scans in shared memory, 3 to 5 bytes per cell each. It should exceed what all workers request
+            in advance: workers x ``prefetch_factor`` x batch size x ratio. A scan that is needed several times
+            (``reuse``) stays in memory only while there is room.
+        starved: what happens on a request for a scan that is not ready: ``"wait"`` for it, or ``"reuse"`` the scan in
+            memory that was served least often.
+        refresh: share in (0, 1]; None = off. The bank keeps a pool of scans and replaces this share of it with each
+            epoch; request n gets the scan of the pool whose number is n modulo its size. The next epoch's scans have
+            slots of their own.
+        timeout: maximum seconds of any wait, be it for the model to load or for one scan.
+        threads: of torch in the generator process; None = torch's default.
+        steps, solver: as for ``Generator.range_images``.
+        options: device, dtype, compile and batch, as for ``load_generator``.
 
     Attributes:
-        sensor: whose grid the scans have.
-        fields: what they carry beside their points.
-        length: None, for scans without end.
-        identity: what a plan's hash knows the bank by.
+        sensor: the sensor that defines the scans' grid.
+        fields: the fields that the scans have besides their points.
+        length: None, because the scans are endless.
+        identity: the text that stands for the bank in a plan's hash.
 
     Raises:
-        ConfigError: on values that cannot be served.
-        FileError, DataError: where the checkpoint cannot be read.
-        ProcessError: where the generator process does not start, with its reason.
+        ConfigError: on invalid values.
+        FileError, DataError: if the checkpoint cannot be read.
+        ProcessError: if the generator process does not start; the message says why.
+
+    Example:
+        >>> from lidar_synth import RollingBank
+        >>> with RollingBank("town", slots=2, threads=1) as bank:  # with a GPU: device="cuda"
+        ...     scan = bank[7]
+        >>> scan.id, sorted(scan.fields())
+        ('town/0/7', ['confidence', 'label', 'reflectance'])
     """
 
     length: None = None
@@ -101,16 +109,16 @@ class RollingBank:
 
     @property
     def pid(self) -> int:
-        """The number of the generator process."""
+        """The process id of the generator process."""
         return self._client.pid
 
     def __getitem__(self, number: int) -> Scan:
-        """The scan; its ``id`` tells which one it is, with ``starved`` and ``refresh`` too.
+        """The scan; its ``id`` says which one it is, also with ``starved`` and ``refresh``.
 
         Raises:
-            ConfigError: on a number that is none, or a bank that is closed.
-            ProcessError: where the generator process died or gave no scan within ``timeout`` seconds.
-            DataError: where the scan's bytes are not those that were made.
+            ConfigError: on an invalid number, or a closed bank.
+            ProcessError: if the generator process died, or made no scan within ``timeout`` seconds.
+            DataError: if the scan's bytes in shared memory are not those that were written.
         """
         made, arrays = self.read(number)
         return replace(unproject(self._slots.encoding.decode(arrays)), id=f"{self._name}/{made}", domain=SYNTHETIC)
@@ -120,7 +128,7 @@ class RollingBank:
         return self._slots.encoding.decode(self.read(number)[1])
 
     def read(self, number: int) -> tuple[int, dict[str, NDArray[Any]]]:
-        """Which scan answers a request, and a copy of its encoded arrays; raises as ``bank[number]``."""
+        """The number of the scan that serves a request, and its encoded arrays; raises as ``bank[number]``."""
         if not 0 <= number < 2**63:
             raise ConfigError(f"scan {number}", "0 <= number < 2^63")
         slot, made, checksum = self._client.ask(GET, int(number))
@@ -131,21 +139,21 @@ class RollingBank:
                 self._client.tell(GIVE_BACK)
 
     def expect(self, numbers: Sequence[int]) -> None:
-        """Say which scans this process and its workers will ask for next, in order, where it is not 0, 1, 2, ...
+        """Announce the scans that this process and its workers will request next, in order, if not 0, 1, 2, ...
 
-        ``MixedScans`` does so. Under distributed training a rank asks for its share only; what it does not ask for
-        need not be made. Without a word, the bank counts up from the highest number that was asked for.
+        ``MixedScans`` calls this. Under distributed training a rank requests only its share, and its bank makes only
+        these scans. Without a call, the bank counts up from the highest number that was requested.
         """
         for start in range(0, max(len(numbers), 1), _PART):
             part = map(int, numbers[start : start + _PART])
             self._client.ask(EXPECT, start + _PART >= len(numbers), *part)
 
     def set_epoch(self, epoch: int) -> None:
-        """Go on to the scans of this epoch; only ``refresh`` makes a difference between epochs."""
+        """Switch to the scans of this epoch; without ``refresh`` all epochs have the same scans."""
         self._client.ask(SET_EPOCH, epoch)
 
     def counts(self) -> dict[str, int]:
-        """How many scans were made and served so far, and how many requests waited or were served another scan."""
+        """The numbers of scans made and served so far, and of requests that waited or were served another scan."""
         return dict(zip(COUNTERS, self._slots.counters.tolist(), strict=True))
 
     def close(self) -> None:
