@@ -12,6 +12,7 @@ so that it can be sampled from and distilled without training. Frozen CLIP, whic
 is left out: see ``nets.encoders``. Its label maps count "unlabelled" as 0 and the classes from 1; ours are moved.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -32,11 +33,23 @@ from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.models import assemble
 from lidar_synth.models.lidm.diffusion import schedule_times
+from lidar_synth.recordings import KITTI360, KITTI360_SPLITS, Recordings, frames_of, whole
 
 STEPS = 50
 """Of the uniform time grid that the checkpoint names: the peer samples in 50."""
 CAMERA_SIZE = (376, 1408)
 """Rows and columns of KITTI-360's rectified images, which the peer cuts into views."""
+SOURCE = "https://github.com/hancyran/LiDAR-Diffusion"
+IMAGES = "KITTI-360 and KITTI odometry"
+_LABELLED = ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10")
+SEEN = {
+    "SemanticKITTI": frames_of("semantic_kitti", _LABELLED),
+    "KITTI-360": whole(KITTI360, KITTI360_SPLITS["lidm/train"] or ()),
+    IMAGES: whole(KITTI360, KITTI360_SPLITS["lidm/train"] or ())
+    | frames_of("semantic_kitti", (*_LABELLED, *map(str, range(11, 22)))),
+}
+"""What the peer trains on, by the names that a provenance has under ``data`` (its lidm/data/kitti.py). All of its
+autoencoders are trained on range images of both datasets, with the sequences of the odometry benchmark's test set."""
 OFFSET = 1.0001
 """The peer's logarithmic scale is log2(d + 0.0001 + 1)."""
 
@@ -117,16 +130,19 @@ def _parts(
 
 def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> Part:
     """The autoencoder of the peer's configuration, for images of ``size`` rows and columns."""
-    inner = params["ddconfig"]
-    wanted = {"double_z": False, "attn_levels": [], "z_channels": params["embed_dim"], "out_ch": inner["in_channels"]}
+    inner, mask = params["ddconfig"], bool(params.get("use_mask"))
+    wanted = {"double_z": False, "z_channels": params["embed_dim"], "out_ch": inner["in_channels"] + mask}
     odd = {key: inner.get(key) for key, value in wanted.items() if inner.get(key) != value}
-    if odd or params.get("use_mask") or params.get("lib_name") != "lidm":
+    if odd or params.get("lib_name") != "lidm":
         raise DataError(f"{path}: an autoencoder with {odd or dict(params)}", "one of LiDM's published configurations")
+    # A level that there is not is no mistake to the peer.
+    attends = sorted(set(inner["attn_levels"]) & set(range(len(inner["ch_mult"]))))
+    extra: dict[str, Any] = ({"attention_levels": attends} if attends else {}) | ({"mask": True} if mask else {})
     return Part("vqvae", {
         "resolution": list(size), "channels": inner["in_channels"], "latent_channels": params["embed_dim"],
         "codes": params["n_embed"], "width": inner["ch"], "multipliers": list(inner["ch_mult"]),
         "strides": [list(s) for s in inner["strides"]], "blocks": inner["num_res_blocks"],
-    })  # fmt: skip
+    } | extra)  # fmt: skip
 
 
 def unet_part(params: Mapping[str, Any], path: Path | str) -> Part:
@@ -146,7 +162,8 @@ def unet_part(params: Mapping[str, Any], path: Path | str) -> Part:
 def _normalisation(dataset: Mapping[str, Any]) -> Normalisation:
     low, high = dataset["depth_range"]
     scale = float(dataset["depth_scale"])
-    if dataset["log_scale"]:
+    # Older configurations do not name the scale; it was the logarithmic one, log2(range + 1) of 0 to the farthest.
+    if dataset.get("log_scale", scale < 2 * math.log2(high + 1)):
         return Normalisation("log", low, high, scale, OFFSET)
     return Normalisation("linear", low, high, scale)
 
@@ -164,17 +181,35 @@ def _sensor(data: Mapping[str, Any]) -> Sensor:
 
 
 def _semantic_kitti(data: Mapping[str, Any]) -> bool:
-    return "SemanticKITTI" in data["train"]["target"]
+    return _data(data["train"]) == "SemanticKITTI"
+
+
+def _data(train: Mapping[str, Any]) -> str:
+    """The key of ``SEEN`` of a configuration's training data."""
+    if "SemanticKITTI" in train["target"]:
+        return "SemanticKITTI"
+    return IMAGES if "KITTIImage" in train["target"] else "KITTI-360"
+
+
+def seen(data: str, generates: bool) -> Recordings:
+    """The recordings that weights know.
+
+    Args:
+        data: a key of ``SEEN``; of another one nothing is known.
+        generates: a diffusion model; its autoencoder, which its file repeats, knows ``IMAGES``.
+    """
+    return SEEN.get(data, Recordings()) | (SEEN[IMAGES] if generates else Recordings())
 
 
 def _provenance(config: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    data = config["data"]["params"]
+    name = _data(config["data"]["params"]["train"])
     return {
-        "data": "SemanticKITTI" if _semantic_kitti(data) else "KITTI-360",
+        "data": name,
         "data_licence": "CC BY-NC-SA 3.0",
         "split": "lidm/train",
+        "seen": seen(name, generates="ddconfig" not in config["model"]["params"]).to_list(),
         "licence": "as LiDM's repository: MIT",
-        "source": "https://github.com/hancyran/LiDAR-Diffusion",
+        "source": SOURCE,
         "file": path.name,
         "file_sha256": sha256(path),
         "recipe": config["model"],
