@@ -10,13 +10,16 @@ TYPES := $(VENV)/types
 DEMO_OUT ?= demo_out
 SCANS ?= 24
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test test-lowest lint bench clean
 
 demo: $(READY)  ## a small town as a user's dataset: write, read, project, convert, look
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
 
 test: $(READY)  ## all tests
 	$(BIN)/python -m pytest
+
+test-lowest: $(READY)  ## tests of files and banks on the lowest versions of the dependencies; installs them
+	$(BIN)/python tools/test_lowest_versions.py
 
 lint: $(READY)  ## style and types
 	$(BIN)/ruff check .
@@ -29,7 +32,7 @@ bench: $(READY)  ## every table of tools/bench
 	for script in tools/bench/*.py; do case $$script in */timing.py) ;; *) $(BIN)/python $$script || exit 1;; esac; done
 
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) build dist *.egg-info
+	rm -rf $(VENV) $(VENV)-lowest $(DEMO_OUT) build dist *.egg-info
 
 # torch is asked for by itself first, so that its version is settled before anything else can pull another.
 $(READY): pyproject.toml constraints.txt

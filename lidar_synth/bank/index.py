@@ -47,11 +47,13 @@ FORMAT = "lidar-synth-bank/1"
 LAYOUTS = ("plain", "paged")
 INDEX = "index.json"
 
+SCAN_NUMBERS = 20
+"""Bytes of a scan's seed, index and CRC: the fewest that a scan takes."""
+
 REPAIR = "lidar-synth repair BANK makes what is damaged or missing again."
 
 _TEXT = ("format", "model", "checkpoint", "label_policy", "licence", "data_licence", "compression", "layout")
 _DEPTH = 32  # most levels of JSON: each nested one costs Python a call
-_SCAN = 20  # fewest bytes of a scan: its seed, its index and its CRC
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,11 @@ class Facts:
         return facts
 
     def to_attributes(self) -> dict[str, Any]:
-        """Values for HDF5 attributes. Text has a fixed length: what is longer would stand where no checksum is."""
-        return {name: _attribute(value) for name, value in self.to_dict().items()}
+        """Values for HDF5 attributes, small ones first: HDF5 moves the first eight when a ninth comes, and leaves a
+        hole of their size. Text has a fixed length: what is longer would stand where no checksum is.
+        """
+        found = {name: _attribute(value) for name, value in self.to_dict().items()}
+        return dict(sorted(found.items(), key=lambda item: np.asarray(item[1]).nbytes))
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any], where: str) -> "Facts":
@@ -138,7 +143,6 @@ class Facts:
             value = getattr(self, name)
             if not isinstance(value, kind):
                 raise TypeError(f"{name} is {value!r}")
-            str(value).encode()  # half of a surrogate pair is text for JSON, and for nothing else
         if not isinstance(self.condition, dict | None):
             raise TypeError(f"condition is {self.condition!r}")
         if self.compression not in FILTERS or self.layout not in LAYOUTS:
@@ -201,7 +205,7 @@ class Entry:
             raise ValueError(f"numbers of {entry}")
         if not (isinstance(entry.file, str) and isinstance(entry.sha256, str)):
             raise TypeError(f"text of {entry}")
-        if entry.scans * _SCAN > entry.bytes:
+        if entry.scans * SCAN_NUMBERS > entry.bytes:
             raise ValueError(f"{entry.bytes} bytes cannot hold {entry.scans} scans")
         return entry
 
@@ -287,8 +291,11 @@ class Index:
                 tuple(values["repairs"]),
                 tuple(values.get("curation", ())),
             )
-            if values["scans"] != index.scans or not all(isinstance(w, str) for w in index.repairs + index.curation):
-                raise ValueError("scans, repairs or curation")
+            if values["scans"] != index.scans:
+                raise ValueError(f"{values['scans']} scans, but its shards hold {index.scans}")
+            for notes in (values["repairs"], values.get("curation", [])):
+                if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+                    raise TypeError(f"notes {str(notes)[:80]}")
             return index
         except DataError:
             raise
@@ -310,9 +317,10 @@ def _from_json(text: str | bytes) -> Any:
     """Values of a JSON text.
 
     Raises:
-        ValueError, RecursionError: where it is none, or nested too deep.
+        ValueError, RecursionError: where it is none, is nested too deep, or has text that UTF-8 cannot hold.
     """
     values = json.loads(text)
+    json.dumps(values, ensure_ascii=False).encode()  # half of a surrogate pair is text for JSON, and for nothing else
     level = [values]
     for _ in range(_DEPTH):
         level = [
@@ -357,5 +365,7 @@ def _plain(name: str, value: Any) -> Any:
     """The inverse of ``_attribute``."""
     if isinstance(value, float):
         return float(value)
-    text = value if isinstance(value, str) else bytes(value).decode()
+    if not isinstance(value, str | bytes):
+        raise TypeError(f"{name} is no text")
+    text = value if isinstance(value, str) else value.decode()
     return text if name in _TEXT else _from_json(text)

@@ -5,17 +5,19 @@ filters, and give memory to whatever shape is declared. Here a shard has the nam
 in the file itself, with the shapes and types of its facts.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.bank.chunks import FILTERS
+from lidar_synth.bank.index import SCAN_NUMBERS, Facts
 from lidar_synth.bank.storage import Storage, View
+
+T = TypeVar("T")
 
 Arrays = Mapping[str, tuple[tuple[int, int], np.dtype[Any]]]
 """Shape and type of each array of one scan, as ``Encoding.arrays`` gives them."""
@@ -26,7 +28,9 @@ NUMBERS = {"seed": np.dtype("<u8"), "index": np.dtype("<u8"), "crc": np.dtype("<
 CONDITION = "condition"
 
 _ATTRIBUTES, _ATTRIBUTE_SIZE = 64, 1 << 20
-_HEAD = 8 << 10  # bytes of a shard's metadata, without its facts and what each scan adds
+_BASE = 12 << 10  # bytes of a shard's metadata, without facts of more than 4 kB and without the places of its chunks
+_PLACE = 16  # bytes of a chunk's place in the metadata
+_PASSES = 32  # most reads until the metadata are there
 _BLOSC2_ARRAY = 32 << 20  # most bytes of one array that Blosc2 packed: unlike deflate it packs zeros without bound
 
 
@@ -60,23 +64,38 @@ class Layout:
     chunks: dict[str, Chunks]
 
 
-@contextmanager
-def open_hdf5(storage: Storage, facts: int = 0, scans: int = 0, arrays: int = 4) -> Iterator[h5py.File]:
-    """A stored file as HDF5, for its metadata; what is expected to hold that is read at once.
+def metadata_size(facts: Facts, scans: int) -> int:
+    """Bytes that a shard's metadata takes, rounded up. The writer keeps so much together at the beginning of the file;
+    behind it stand facts of more than 4 kB, and then the numbers.
+    """
+    return _BASE + scans * _PLACE * len(facts.encoding.names)
+
+
+def with_hdf5(storage: Storage, facts: Facts | None, scans: int, work: Callable[[h5py.File], T]) -> T:
+    """What ``work`` makes of the metadata and the numbers of a stored file, in one read where they stand together.
 
     Args:
         storage: the file.
-        facts: bytes of the facts.
-        scans, arrays: how many the file holds, and of how many arrays each.
+        facts, scans: what it is expected to hold.
+        work: is called with the open file, several times where the metadata are scattered.
 
     Raises:
-        OSError, RuntimeError: from HDF5, where it is none.
+        OSError, RuntimeError: from HDF5, where it is no such file.
         FileError, DataError: as ``Storage.read``.
     """
-    # A scan adds its numbers, 20 bytes, and 16 bytes to the index of each array's chunks.
-    head = _HEAD + facts + scans * (20 + 16 * arrays)
-    with h5py.File(View(storage, head), "r") as file:
-        yield file
+    head = _BASE if facts is None else metadata_size(facts, scans) + facts.text_size + scans * SCAN_NUMBERS
+    view = View(storage, max(head, storage.window))
+    for _ in range(_PASSES):
+        view.fetch_missing()
+        try:
+            with h5py.File(view, "r") as file:
+                result = work(file)
+        except Exception:
+            if view.missing is None:
+                raise
+        if view.missing is None:
+            return result
+    raise OSError("its metadata are scattered all over the file")
 
 
 def read_attributes(file: h5py.File) -> dict[str, Any]:

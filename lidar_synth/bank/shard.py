@@ -22,12 +22,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.bank.chunks import checksum, filters, unpack
 from lidar_synth.bank.index import FORMAT, REPAIR, Entry, Facts
-from lidar_synth.bank.layout import Layout, open_hdf5, read_attributes, read_layout
+from lidar_synth.bank.layout import Layout, read_attributes, read_layout, with_hdf5
 from lidar_synth.bank.storage import LocalFile, Storage
 from lidar_synth.errors import DataError, LidarSynthError
 
@@ -102,18 +103,27 @@ class ShardReader:
 
     def _open(self, facts: Facts | None, entry: Entry | None) -> tuple[Facts, Entry, Layout]:
         """Facts and entry, by the file's attributes, and where its scans lie."""
-        expected = (facts.text_size, entry.scans if entry else 0, len(facts.encoding.names)) if facts else ()
-        with self._opening(), open_hdf5(self._file, *expected) as file:
+
+        def work(file: h5py.File) -> tuple[Facts, Entry, Layout]:
             with self._reading("its attributes"):
                 attributes = read_attributes(file)
                 numbers = [int(attributes.pop(key, np.uint64(0))) for key in ("seed", "first", "scans")]
             found = Facts.from_attributes(attributes, self.name)
             self._check_facts(found, facts)
-            entry = self._checked_entry(*numbers, entry)
+            held = self._checked_entry(*numbers, entry)
             filters(found.compression)
             with self._reading("its datasets"):
-                layout = read_layout(file, self._file, entry.scans, found.encoding.arrays(), found.compression)
-        return found, entry, layout
+                layout = read_layout(file, self._file, held.scans, found.encoding.arrays(), found.compression)
+            return found, held, layout
+
+        try:
+            return with_hdf5(self._file, facts, entry.scans if entry else 0, work)
+        except LidarSynthError:
+            raise
+        except (OSError, RuntimeError) as error:
+            raise DataError(
+                f"{self.name} is cut, damaged or no HDF5 file ({error})", f"a shard of {FORMAT}", REPAIR
+            ) from error
 
     def _check_facts(self, found: Facts, facts: Facts | None) -> None:
         if facts is not None and facts != found:
@@ -160,17 +170,6 @@ class ShardReader:
 
     def _condition(self, position: int) -> bytes:
         return b"" if self._layout.conditions is None else bytes(self._layout.conditions[position])
-
-    @contextmanager
-    def _opening(self) -> Iterator[None]:
-        try:
-            yield
-        except LidarSynthError:
-            raise
-        except (OSError, RuntimeError) as error:
-            raise DataError(
-                f"{self.name} is cut, damaged or no HDF5 file ({error})", f"a shard of {FORMAT}", REPAIR
-            ) from error
 
     @contextmanager
     def _reading(self, what: str) -> Iterator[None]:

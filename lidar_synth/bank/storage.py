@@ -8,17 +8,17 @@ from typing import Any, Protocol
 
 from lidar_synth.errors import DataError, FileError, LibraryError
 
-_WINDOW = 16 << 10  # bytes read around a place that the head of a file does not hold
-
 
 class Storage(Protocol):
     """One file, of which ranges can be read.
 
     Attributes:
         size: bytes.
+        window: bytes that are read in about the time of one.
     """
 
     size: int
+    window: int
 
     def read(self, offset: int, size: int) -> bytes:
         """``size`` bytes from ``offset``, at least 0.
@@ -38,6 +38,8 @@ class LocalFile:
     Raises:
         FileError: where it cannot be opened.
     """
+
+    window = 1 << 20
 
     def __init__(self, path: Path) -> None:
         self._path, self._descriptor = path, -1
@@ -81,6 +83,8 @@ class RemoteFile:
         LibraryError: where fsspec, or what it needs for such a URL, is not installed.
         FileError: on a kind of URL that fsspec does not know.
     """
+
+    window = 12 << 10
 
     def __init__(self, url: str, size: int = 0) -> None:
         self.url, self.size = url, size
@@ -129,16 +133,28 @@ class RemoteFile:
 
 
 class View(io.RawIOBase):
-    """A stored file as HDF5 takes it: the head is read at once, other places with what stands around them.
+    """What was read of a file, as HDF5 takes files.
+
+    Nothing is read while HDF5 is at work, because it holds a lock then: fetching from a URL is done by other threads,
+    and one of them that happens to free an object of HDF5 waits for that lock. So ``readinto`` notes what is missing
+    and fails, and whoever called HDF5 calls ``fetch_missing`` and starts again.
 
     Args:
         file: to look at.
-        head: bytes from its beginning that are expected to hold most of what will be asked for.
+        head: how many of its first bytes are read at once.
+
+    Attributes:
+        missing: (offset, size) of what was asked for and is not there; None where there was no such thing.
+
+    Raises:
+        FileError, DataError: as ``Storage.read``.
     """
 
     def __init__(self, file: Storage, head: int) -> None:
-        self._file, self._head, self._position = file, min(head, file.size), 0
+        self._file, self._position = file, 0
         self._spans: list[tuple[int, bytes]] = []
+        self.missing: tuple[int, int] | None = None
+        self._fetch(0, head)
 
     def readable(self) -> bool:
         return True
@@ -154,27 +170,33 @@ class View(io.RawIOBase):
         return self._position
 
     def readinto(self, buffer: Any) -> int:
-        """Fill the buffer, as far as the file goes; raises as ``Storage.read``."""
+        """Fill the buffer, as far as the file goes.
+
+        Raises:
+            OSError: where that was not read yet.
+        """
         start, size = self._position, min(len(buffer), max(self._file.size - self._position, 0))
-        buffer[:size] = self._bytes(start, size)
+        for first, content in self._spans:
+            if first <= start and start + size <= first + len(content):
+                buffer[:size] = memoryview(content)[start - first : start - first + size]
+                break
+        else:
+            if size:
+                self.missing = (start, size)
+                raise OSError(f"bytes {start} to {start + size} were not read yet")
         self._position += size
         return size
 
-    def _bytes(self, start: int, size: int) -> bytes:
-        for first, content in self._spans:
-            if first <= start and start + size <= first + len(content):
-                return content[start - first : start - first + size]
-        first, end = self._around(start, size)
-        content = self._file.read(first, end - first)
-        self._spans.append((first, content))
-        return content[start - first : start - first + size]
+    def fetch_missing(self) -> None:
+        """Read what is missing, with what stands around it; raises as the class."""
+        if self.missing is not None:
+            start, size = self.missing
+            margin = max(self._file.window - size, 0) // 2
+            self._fetch(max(start - margin, 0), start + size + margin)
+        self.missing = None
 
-    def _around(self, start: int, size: int) -> tuple[int, int]:
-        """The range to read for one that is asked for."""
-        if not self._spans:
-            return 0, max(self._head, start + size)
-        margin = max(_WINDOW - size, 0) // 2
-        return max(start - margin, 0), min(start + size + margin, self._file.size)
+    def _fetch(self, start: int, end: int) -> None:
+        self._spans.append((start, self._file.read(start, min(end, self._file.size) - start)))
 
 
 def is_url(path: str | Path) -> bool:

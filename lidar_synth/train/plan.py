@@ -10,7 +10,7 @@ from torch import nn
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.files import write_file
+from lidar_synth.files import write_arrays
 from lidar_synth.flow.path import METRICS, velocity_loss
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.flow.timesteps import Selection, select_timesteps
@@ -203,6 +203,6 @@ def _selection(config: DistillConfig, velocity: Any, plan: Plan, accelerator: "A
             velocity, plan.codec().shape, config.intervals, metric=config.recipe.metric, device=accelerator.device,
             condition=conditions, **config.selection.model_dump(),
         )  # fmt: skip
-    write_file(path, lambda file: np.savez(file, **asdict(selection)))
+    write_arrays(path, asdict(selection))
     tqdm.write(f"timesteps {selection.grid}: cost {selection.cost:.4g}, uniform {selection.uniform_cost:.4g}")
     return selection
