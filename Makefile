@@ -10,7 +10,7 @@ TYPES := $(VENV)/types
 DEMO_OUT ?= demo_out
 SCANS ?= 24
 
-.PHONY: demo test quick lint bench clean
+.PHONY: demo test quick test-lowest lint bench clean
 
 demo: $(READY)  ## a small town as a user's dataset: write, read, project, convert, look
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
@@ -20,6 +20,9 @@ test: $(READY)  ## all tests
 
 quick: $(READY)  ## the tests that are not marked slow
 	$(BIN)/python -m pytest -m "not slow"
+
+test-lowest: $(READY)  ## tests of files and banks on the lowest versions of the dependencies; installs them
+	$(BIN)/python tools/test_lowest_versions.py
 
 lint: $(READY)  ## style and types
 	$(BIN)/ruff check .
@@ -32,7 +35,7 @@ bench: $(READY)  ## every table of tools/bench
 	for script in tools/bench/*.py; do case $$script in */timing.py) ;; *) $(BIN)/python $$script || exit 1;; esac; done
 
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) build dist *.egg-info
+	rm -rf $(VENV) $(VENV)-lowest $(DEMO_OUT) build dist *.egg-info
 
 # Python 3.10 has no wheels of some pinned versions: there the newest that fit are taken.
 PINS = $(shell $(PYTHON) -c 'import sys; print("--constraint constraints.txt" * (sys.version_info >= (3, 11)))')

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError, FileError
 
 _BLOCK = 1 << 20  # bytes read at a time
+STRAY = "allow_pickle"
+"""Name of an array that is none: numpy before 2.2 stores the option of that name."""
 
 SKIP_HINT = "Copy the file again, or leave it out with on_bad='skip'."
 
@@ -64,6 +66,20 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise unreadable(path, error) from error
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
+    """Write an ``.npz``, the same by every version of numpy; nothing is pickled.
+
+    Raises:
+        FileError: where it cannot be written.
+        DataError: on an array of Python objects.
+    """
+    values = {name: np.asanyarray(array) for name, array in arrays.items()}
+    if objects := [name for name, array in values.items() if array.dtype.hasobject]:
+        raise DataError(f"arrays {objects} of Python objects for {path}", "numbers, truth values or text")
+    save = np.savez_compressed if compressed else np.savez
+    write_file(path, lambda file: save(file, **values))
 
 
 def sha256(path: Path) -> str:

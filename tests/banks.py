@@ -1,8 +1,10 @@
 """Small banks for tests, with facts that nobody has to bake for."""
 
 import json
+import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +58,14 @@ def write_bank(root: Path, images: Sequence[RangeImage], shard_size: int = 2, **
         entries.append(replace(entry, bytes=path.stat().st_size, sha256=sha256(path)))
     write_bank_files(root, Index((facts,), tuple(entries)))
     return [root / entry.file for entry in entries]
+
+
+def add_stray(path: Path) -> None:
+    """What numpy before 2.2 makes of ``savez(file, allow_pickle=False)``."""
+    content = BytesIO()
+    np.save(content, np.array(False))
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr("allow_pickle.npy", content.getvalue())
 
 
 def write_golden_bank(root: Path) -> None:

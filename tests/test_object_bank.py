@@ -6,6 +6,7 @@ from pathlib import Path
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from banks import add_stray
 from hypothesis import given
 from pasting import assert_nothing_shares_a_ray
 from worlds import CAR, HEIGHT, car, cast
@@ -49,6 +50,12 @@ def test_objects_are_their_instances(scans: list[Scan], bank: ObjectBank) -> Non
         assert (found.box[3:6] >= box[3:6]).all() and (found.box[3:6] - box[3:6]).max() < 0.35
         assert np.isin(found.scan.points[:, 0].round(3), scan.points[instance][:, 0].round(3)).all()
         assert len(found.scan) >= 0.7 * instance.sum()
+
+
+def test_a_bank_with_a_stray_array_is_read(bank: ObjectBank, tmp_path: Path) -> None:
+    bank.save(tmp_path / "objects.npz")
+    add_stray(tmp_path / "objects.npz")
+    assert len(ObjectBank.load(tmp_path / "objects.npz")) == len(bank)
 
 
 def test_a_bank_survives_the_disk(bank: ObjectBank, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from lidar_synth.bank.chunks import checksum, deflate, filters
 from lidar_synth.bank.index import Entry, Facts
+from lidar_synth.bank.layout import metadata_size
 from lidar_synth.errors import DataError, FileError, LibraryError
 from lidar_synth.geometry.scan import RangeImage
 
@@ -57,7 +58,7 @@ class ShardWriter:
         self._pool = ThreadPoolExecutor(threads, "compress")
         self._limit = _PENDING * threads
         with _on_disk(path):
-            self._file = _create(path, facts.layout)
+            self._file = _create(path, facts, entry.scans)
             try:
                 self._declare(facts)
             except BaseException:
@@ -179,8 +180,11 @@ class ShardWriter:
                     self._datasets[name][position] = np.frombuffer(chunk, dtype).reshape(shape)
 
 
-def _create(path: Path, layout: str) -> h5py.File:
-    options = {"fs_strategy": "page", "fs_page_size": _PAGE} if layout == "paged" else {}
+def _create(path: Path, facts: Facts, scans: int) -> h5py.File:
+    # In one block, so that a reader at a distance has all of the metadata with one request.
+    options: dict[str, Any] = {"meta_block_size": metadata_size(facts, scans)}
+    if facts.layout == "paged":
+        options = {"fs_strategy": "page", "fs_page_size": _PAGE}
     return h5py.File(path, "w", libver=(_VERSION, _VERSION), **options)
 
 

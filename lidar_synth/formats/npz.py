@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT, read_file, write_file
+from lidar_synth.files import SKIP_HINT, STRAY, read_file, write_arrays
 from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -48,7 +48,9 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     content = BytesIO(read_file(path))
     try:
         loaded = np.load(content, allow_pickle=False)
-        return {"array": loaded} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
+        if isinstance(loaded, np.ndarray):
+            return {"array": loaded}
+        return {name: loaded[name] for name in loaded.files if name != STRAY}
     except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise DataError(f"{path}: {error}", "arrays written by numpy, none of them pickled", SKIP_HINT) from error
 
@@ -69,7 +71,7 @@ def write_scan(path: Path, scan: Scan) -> None:
         FileError: where it cannot be written.
     """
     arrays = {"points": np.ascontiguousarray(scan.points), **scan.fields(), **_facts(scan)}
-    write_file(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
+    write_arrays(path, arrays)
 
 
 def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | None = None) -> Scan:
@@ -104,7 +106,7 @@ def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -
     """
     facts = {"sensor": np.array(json.dumps(image.sensor.to_dict()))} if scan is None else _facts(scan, image.sensor)
     arrays = {"range": image.range, **image.channels, **facts}
-    write_file(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
+    write_arrays(path, arrays, compressed=True)
 
 
 def decode_range_image(

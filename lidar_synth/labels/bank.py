@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import read_file, write_file
+from lidar_synth.files import STRAY, read_file, write_arrays
 from lidar_synth.geometry.scan import Boxes, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import joined
@@ -130,7 +130,7 @@ class ObjectBank:
         content = BytesIO(read_file(path))
         try:
             with np.load(content, allow_pickle=False) as loaded:
-                arrays: dict[str, Any] = {name: loaded[name] for name in loaded.files}
+                arrays: dict[str, Any] = {name: loaded[name] for name in loaded.files if name != STRAY}
             if str(arrays.pop("format")) != FORMAT:
                 raise ValueError("another format")
             sensor = Sensor.from_dict(json.loads(str(arrays.pop("sensor"))))
@@ -149,7 +149,7 @@ class ObjectBank:
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sensor", "boxes")}
         arrays |= {f"box_{f.name}": np.asarray(getattr(self.boxes, f.name)) for f in fields(Boxes)}
         arrays |= {"format": np.array(FORMAT), "sensor": np.array(json.dumps(self.sensor.to_dict()))}
-        write_file(Path(path), lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
+        write_arrays(Path(path), arrays, compressed=True)
 
     def __len__(self) -> int:
         return len(self.boxes)

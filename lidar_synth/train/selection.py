@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import write_file
+from lidar_synth.files import write_arrays
 from lidar_synth.flow.timesteps import Selection
 from lidar_synth.generate.checkpoint import Header
 from lidar_synth.train.config import DistillConfig
@@ -47,8 +47,7 @@ def save_selection(path: Path, selection: Selection, settings: dict[str, Any]) -
     Raises:
         FileError: where it cannot be written.
     """
-    text = np.array(json.dumps(settings, sort_keys=True))
-    write_file(path, lambda file: np.savez(file, **asdict(selection), settings=text))
+    write_arrays(path, asdict(selection) | {"settings": np.array(json.dumps(settings, sort_keys=True))})
 
 
 def load_selection(path: Path, settings: dict[str, Any]) -> Selection:

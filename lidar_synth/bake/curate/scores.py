@@ -18,7 +18,7 @@ from lidar_synth.bake.curate.features import MEASURES, Features, features
 from lidar_synth.bank import Bank
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.evaluate import jensen_shannon_distance
-from lidar_synth.files import write_file
+from lidar_synth.files import write_arrays
 from lidar_synth.formats.convert import in_processes
 from lidar_synth.formats.npz import read_arrays
 from lidar_synth.geometry.projection import project
@@ -96,7 +96,7 @@ def write_scores(path: Path, scores: Scores) -> None:
         FileError: where it cannot be written.
     """
     arrays = {"bank": np.array(scores.bank), "reference": np.array(scores.reference), "twin": scores.twin}
-    write_file(path, lambda file: np.savez(file, allow_pickle=False, **arrays, **scores.values))
+    write_arrays(path, arrays | scores.values)
 
 
 def read_scores(path: Path) -> Scores:

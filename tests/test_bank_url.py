@@ -1,0 +1,163 @@
+"""Banks at a URL: what is read over a network, and what is said where that fails."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from banks import some_image, write_bank
+from hypothesis import given, settings
+from servers import Served, serve
+from torch.utils.data import DataLoader
+
+import lidar_synth.bank.writer as writer
+from lidar_synth.bank import Bank
+from lidar_synth.bank.shard import _GAP, _side_by_side
+from lidar_synth.bank.storage import LocalFile, View
+from lidar_synth.errors import DataError, FileError
+from lidar_synth.formats import open_scans
+from lidar_synth.geometry.sensor import load_sensor
+
+pytest.importorskip("aiohttp")  # of the extra `remote`, which `dev` has
+
+LARGE = load_sensor("hdl64e_kitti360")  # 64 x 1024: about 200 kB for a scan of noise
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    write_bank(tmp_path / "bank", [some_image(i) for i in range(5)])
+    with serve(tmp_path) as found:
+        yield found
+
+
+@pytest.mark.parametrize("layout", ["plain", "paged", "before"])
+def test_random_scans_cost_little_more_than_their_bytes(
+    tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Index, opened shards and scans together: at most 1.3 times the scans' own bytes, and 4 requests for any scan."""
+    if layout == "before":  # files whose metadata are scattered, as they were written before
+        monkeypatch.setattr(writer, "metadata_size", lambda *_: 2048)
+    images = [some_image(i, LARGE) for i in range(6)]
+    facts = {"layout": "plain" if layout == "before" else layout, "provenance": {"recipe": "x" * 20_000}}
+    write_bank(tmp_path / "bank", [images[i % 6] for i in range(60)], shard_size=20, **facts)
+    here, chosen = Bank(tmp_path / "bank"), np.random.default_rng(0).permutation(60)[:30].tolist()
+    with serve(tmp_path) as served:
+        bank, scans = Bank(f"{served.url}/bank/"), 0
+        for number in chosen:
+            before = len(served.requests)
+            assert np.array_equal(bank.image(number).range, here.image(number).range)
+            scans += sum(map(len, here.shard(number // 20).chunks(number % 20)[0].values()))
+            opened = len(served.requests) - before
+            assert opened <= (7 if layout == "before" else 4)
+        assert served.bytes <= 1.3 * scans
+        assert len(served.requests) <= 4 * len(chosen)
+        assert {name for name, _ in served.requests} == {"index.json", *(entry.file for entry in bank.index.shards)}
+
+
+def test_a_new_shard_takes_two_requests(tmp_path: Path) -> None:
+    write_bank(tmp_path, [some_image(i, LARGE) for i in range(4)], shard_size=1)
+    with serve(tmp_path) as served:
+        bank = Bank(served.url)
+        for number in range(4):
+            bank.image(number)
+        assert [name for name, _ in served.requests[1:]] == [
+            f"shard-{number:05d}.h5" for number in range(4) for _ in range(2)
+        ]
+
+
+def test_scans_of_a_url_are_those_of_the_folder(served: Served, tmp_path: Path) -> None:
+    near, far = open_scans(tmp_path / "bank"), open_scans(f"{served.url}/bank")
+    for a, b in zip(near, far, strict=True):
+        assert a.id == b.id and np.array_equal(a.points, b.points) and np.array_equal(a.label, b.label)
+
+
+def test_forked_workers_read_from_a_url(served: Served) -> None:
+    bank = Bank(f"{served.url}/bank")
+    expected = sum(len(scan) for scan in bank)  # the parent has connections of its own
+    loader = DataLoader(bank, batch_size=None, num_workers=2, multiprocessing_context="fork")  # type: ignore[arg-type]
+    assert sum(len(scan) for scan in loader) == expected
+
+
+def test_a_server_without_ranges_is_refused(served: Served) -> None:
+    served.ranges = False
+    with pytest.raises(FileError, match=r"shard-00000.h5 gave \d+ bytes for a range of \d+; .*a server that serves"):
+        Bank(f"{served.url}/bank").image(0)
+
+
+def test_what_cannot_be_fetched_is_no_damage(served: Served, tmp_path: Path) -> None:
+    """A network that fails does not make anybody repair a bank."""
+    bank = Bank(f"{served.url}/bank")
+    served.broken.add("shard-00000.h5")
+    with pytest.raises(FileError, match="shard-00000.h5 cannot be read .*500"):
+        bank.image(0)
+    assert bank.image(2).mask.any()
+    served.broken.clear()
+    assert bank.image(0).mask.any()
+    served.broken.add("shard-00000.h5")
+    with pytest.raises(FileError, match="shard-00000.h5 cannot be read .*500"):  # of a shard that is open
+        bank.image(1)
+    (tmp_path / "bank" / "shard-00002.h5").unlink()
+    with pytest.raises(FileError, match="shard-00002.h5 cannot be read"):
+        bank.image(4)
+    with pytest.raises(FileError, match=r"elsewhere/index.json cannot be read"):
+        Bank(f"{served.url}/elsewhere")
+
+
+def test_a_cut_shard_at_a_url(served: Served, tmp_path: Path) -> None:
+    path = tmp_path / "bank" / "shard-00001.h5"
+    content = path.read_bytes()
+    for length in (0, 100, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:length])
+        bank = Bank(f"{served.url}/bank")
+        with pytest.raises((FileError, DataError), match="shard-00001.h5"):
+            bank.image(2), bank.image(3)
+
+
+def test_an_index_that_promises_too_much(served: Served, tmp_path: Path) -> None:
+    bank = Bank(f"{served.url}/bank")
+    shards = tuple(replace(entry, bytes=1 << 40, scans=1 << 34) for entry in bank.index.shards)
+    (tmp_path / "bank" / "index.json").write_bytes(replace(bank.index, shards=shards).to_json())
+    with pytest.raises(FileError, match=r"shard-00000.h5 gave \d+ bytes for a range of \d+"):
+        Bank(f"{served.url}/bank").image(0)
+
+
+@settings(max_examples=60)
+@given(
+    size=st.integers(1, 5000),
+    head=st.integers(0, 6000),
+    reads=st.lists(st.tuples(st.integers(0, 5200), st.integers(0, 3000)), max_size=12),
+)
+def test_a_view_is_the_file(
+    tmp_path_factory: pytest.TempPathFactory, size: int, head: int, reads: list[tuple[int, int]]
+) -> None:
+    path = tmp_path_factory.mktemp("view") / "file"
+    content = np.random.default_rng(size).integers(0, 256, size, np.uint8).tobytes()
+    path.write_bytes(content)
+    file = LocalFile(path)
+    file.window = 100
+    view = View(file, head)
+    for offset, length in reads:
+        view.seek(offset)
+        with suppress(OSError):
+            assert view.read(length) == content[offset : offset + length]
+        if view.missing is not None:
+            view.fetch_missing()
+            view.seek(offset)
+            assert view.read(length) == content[offset : offset + length]
+        assert view.missing is None
+    assert view.seek(0, 2) == size and view.seek(-1, 1) == size - 1
+
+
+@given(st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(1, 1 << 18)), max_size=6))
+def test_chunks_side_by_side_are_read_at_once(spans: list[tuple[int, int]]) -> None:
+    places = {str(i): (start, start + size) for i, (start, size) in enumerate(spans)}
+    groups = _side_by_side(places)
+    assert sorted(name for group in groups for name in group) == sorted(places)
+    starts = [min(places[name][0] for name in group) for group in groups]
+    ends = [max(places[name][1] for name in group) for group in groups]
+    assert all(start > end + _GAP for start, end in zip(starts[1:], ends, strict=False))
+    covered = sum(end - start for start, end in zip(starts, ends, strict=True))
+    assert covered <= sum(size for _, size in spans) + _GAP * max(len(spans) - len(groups), 0)

@@ -1,0 +1,40 @@
+"""Files of arrays: the same by every version of numpy, and without code in them."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from banks import add_stray, some_image
+
+from lidar_synth.errors import DataError
+from lidar_synth.files import write_arrays
+from lidar_synth.formats import open_scans
+from lidar_synth.formats.npz import read_arrays, write_range_image, write_scan
+from lidar_synth.geometry.projection import unproject
+from lidar_synth.geometry.scan import Boxes
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_what_is_written_is_what_was_given(tmp_path: Path, compressed: bool) -> None:
+    arrays = {"a": np.arange(6).reshape(2, 3), "text": np.array("x"), "few": (1, 2.5)}
+    write_arrays(tmp_path / "a.npz", arrays, compressed=compressed)
+    with zipfile.ZipFile(tmp_path / "a.npz") as file:
+        assert sorted(file.namelist()) == ["a.npy", "few.npy", "text.npy"]
+    found = read_arrays(tmp_path / "a.npz")
+    assert all(np.array_equal(found[name], values) for name, values in arrays.items())
+    with pytest.raises(DataError, match=r"arrays \['b'\] of Python objects"):
+        write_arrays(tmp_path / "b.npz", {"b": [{}, 1]})
+    assert not (tmp_path / "b.npz").exists()
+
+
+def test_files_with_a_stray_array_are_read(tmp_path: Path) -> None:
+    image = some_image(0)
+    scan = unproject(image)
+    scan.boxes = Boxes(np.array([[5.0, 0, 0, 4, 2, 2, 0]], np.float32), names=("car",))
+    write_range_image(tmp_path / "image" / "a.npz", image, scan)
+    write_scan(tmp_path / "scan" / "a.npz", scan)
+    for path in tmp_path.rglob("*.npz"):
+        add_stray(path)
+    assert len(open_scans(tmp_path / "image")[0]) == len(scan)
+    assert np.array_equal(open_scans(tmp_path / "scan")[0].points, scan.points)
