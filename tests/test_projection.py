@@ -178,8 +178,9 @@ def test_batches_on_any_device_are_the_same_cell_for_cell(sensor: Sensor, device
         assert np.array_equal(xyz[:, image.mask].T, unproject(image).points)
 
 
-def in_file_order(share: float = 0.9, sensor: Sensor = presets()["hdl64e_kitti360"]) -> tuple[Scan, np.ndarray]:
+def in_file_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
     """A scan ring by ring, each counter-clockwise from straight ahead; (N,) the row of each point."""
+    sensor = presets()["hdl64e_kitti360"]
     full, points, rows = image_of(sensor.by_beams(), 5, share=share), [], []
     full.range[full.mask] = np.maximum(full.range[full.mask], 5)  # nearer ones are where crops get hard to tell
     for row in range(sensor.shape[0]):
