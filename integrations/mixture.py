@@ -96,7 +96,8 @@ def mix(real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.ra
     if settings.get("synthetic") is None:
         raise ConfigError("a mixture without synthetic scans", "synthetic: a bank's folder, a checkpoint or a folder")
     options = {key: value for key, value in settings.items() if key != "synthetic"}
-    return MixedScans.wrap(range(real), open_synthetic(settings["synthetic"]), to_sample=to_sample, **options)
+    synthetic = open_synthetic(settings["synthetic"])
+    return MixedScans.wrap(range(real), synthetic, to_sample=to_sample, compare=False, **options)  # numbers, no samples
 
 
 def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:

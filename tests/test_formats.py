@@ -260,7 +260,7 @@ def test_frames_without_a_pose_are_nan_in_semantic_kitti(tmp_path: Path) -> None
     writer.finish()
     lines = np.loadtxt(tmp_path / "sequences" / "05" / "poses.txt")
     assert np.isfinite(lines).all(axis=1).tolist() == [True, False, False, False, True]
-    assert len(np.loadtxt(tmp_path / "sequences" / "05" / "times.txt")) == 5
+    assert not (tmp_path / "sequences" / "05" / "times.txt").exists()  # nobody knows them
     assert [scan.pose is None for scan in SemanticKITTI(tmp_path)] == [False, True, False]
 
 

@@ -205,6 +205,23 @@ def test_boxes_of_two_scans_never_share_a_place() -> None:
     assert mixed.instance.max() == 1
 
 
+def test_boxes_hold_all_returns_of_their_objects(real: list[Scan]) -> None:
+    """The town's boxes are tight and its sensor noisy: a few returns of each scan lie outside by centimetres."""
+    ours, theirs = real
+    tight = [(s.boxes[[i]], s.instance == s.boxes.instance[i]) for s in real for i in range(len(s.boxes))]
+    points = [*[ours.points] * len(ours.boxes), *[theirs.points] * len(theirs.boxes)]
+    assert sum((own & ~box.contain(p)[0]).sum() for (box, own), p in zip(tight, points, strict=True)) > 20
+    for start in range(0, 1024, 128):
+        mixed = swap_sector(ours, theirs, start, 512)
+        assert mixed.boxes is not None and len(mixed.boxes)
+        for number, instance in enumerate(mixed.boxes.instance):
+            assert mixed.boxes[[number]].contain(mixed.points[mixed.instance == instance]).all()
+    before = {tuple(v[[0, 1, 2, 6]]): v[3:6] for s in real for v in s.boxes.values}
+    for value in mixed.boxes.values:
+        assert (value[3:6] - before[tuple(value[[0, 1, 2, 6]])] >= 0).all()
+        assert (value[3:6] - before[tuple(value[[0, 1, 2, 6]])] < 0.3).all(), "no more than noise on either side"
+
+
 def test_bands_alternate_from_top_to_bottom() -> None:
     ours, theirs = cast([car(9, 2)]), cast([], [wall(8, 0, 1.5, 30)])
     for bands, odd in ((2, False), (3, True), (6, False), (64, True)):

@@ -1,5 +1,6 @@
 """Measures of realism against the numbers of both protocols, and by hand."""
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,19 @@ def test_figures_of_features(vectors: Vectors) -> None:
     rng = np.random.RandomState(6003)
     few = squared_mmd(a, b, rng, subsets=10, size=100)
     assert few == pytest.approx(vectors["r2flow/squared_mmd_subsets10_size100"][0], rel=1e-9)
+
+
+def test_squared_mmd_by_hand() -> None:
+    """Kernel (x y + 1)^3. No sample is compared with itself: the unbiased estimator, which can fall below 0."""
+    a, b = np.array([[0.0], [1.0]]), np.array([[1.0], [2.0]])
+    within, across = (1 + 1) / 2 + (27 + 27) / 2, (1 + 1 + 8 + 27) / 4
+    assert squared_mmd(a, b, subsets=3) == pytest.approx(within - 2 * across)
+    assert squared_mmd(a, a, subsets=3) == pytest.approx((1 + 1) - 2 * (1 + 1 + 1 + 8) / 4)  # -3.5
+    everything = np.arange(6.0)[:, None] / 3  # all pairs of disjoint halves of one set: 0 on average
+    halves = [list(chosen) for chosen in combinations(range(6), 3)]
+    pairs = [(h, [i for i in range(6) if i not in h]) for h in halves]
+    three = [squared_mmd(everything[h], everything[rest], subsets=1) for h, rest in pairs]
+    assert np.mean(three) == pytest.approx(0, abs=1e-9)
 
 
 def test_frechet_distance_by_hand() -> None:

@@ -1,5 +1,7 @@
 """Points to range image and back: inverses, invariants, and the same bits on numpy and torch."""
 
+from dataclasses import replace
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from lidar_synth.geometry.projection import (
     locate,
     project,
     project_batch,
+    ring_numbers,
     unfold,
     unproject,
     unproject_batch,
@@ -105,6 +108,25 @@ def test_range_limits_hold_before_the_scatter() -> None:
     assert locate(points, sensor).cell.tolist().count(-1) == 3
 
 
+@pytest.mark.parametrize("kind", sorted(SMALL))
+def test_returns_at_exactly_the_range_limits_are_seen(kind: str) -> None:
+    """Both limits are inclusive, in every way to project; one float32 further they are not."""
+    low, high = np.float32(2.5), np.float32(40)
+    outside = np.nextafter(low, np.float32(0)), np.nextafter(high, np.float32(50))
+    sensor = replace(SMALL[kind], range_min=float(low), range_max=float(high))
+    points = np.zeros((4, 3), np.float32)
+    for i, distance in enumerate((low, high, *outside)):
+        points[i, :2] = [(distance, 0), (0, distance), (-distance, 0), (0, -distance)][i]  # a direction for each
+    scan = Scan(points, np.zeros(4, np.float32), sensor)
+    assert (locate(points, sensor).cell >= 0).tolist() == [True, True, False, False]
+    assert locate(points, sensor).range[:2].tolist() == [low, high]
+    assert sorted(project(scan).range[project(scan).mask].tolist()) == [low, high]
+    ringed = replace(scan, ring=np.zeros(4, np.int16))
+    assert sorted(unfold(ringed).range[unfold(ringed).mask].tolist()) == [low, high]
+    batch = project_batch(torch.from_numpy(points), torch.tensor([0, 4]), sensor)
+    assert sorted(batch.range[batch.range > 0].tolist()) == [low, high]
+
+
 def test_conventions() -> None:
     """Straight ahead is the edge between W/2-1 and W/2, columns run clockwise, the seam is behind, row 0 is up."""
     sensor = SMALL["linear"]
@@ -156,24 +178,82 @@ def test_batches_on_any_device_are_the_same_cell_for_cell(sensor: Sensor, device
         assert np.array_equal(xyz[:, image.mask].T, unproject(image).points)
 
 
-def test_unfolding_puts_each_ring_on_its_beam_even_when_rings_are_missing() -> None:
+def in_file_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
+    """A scan ring by ring, each counter-clockwise from straight ahead; (N,) the row of each point."""
     sensor = presets()["hdl64e_kitti360"]
-    full = image_of(sensor.by_beams(), 5, share=0.9)
-    in_file_order = {"points": [], "row": []}
-    for row in range(64):
-        order = np.argsort(-sensor.column_azimuths() % (2 * np.pi))  # counter-clockwise from straight ahead
+    full, points, rows = image_of(sensor.by_beams(), 5, share=share), [], []
+    full.range[full.mask] = np.maximum(full.range[full.mask], 5)  # nearer ones are where crops get hard to tell
+    for row in range(sensor.shape[0]):
+        order = np.argsort(-sensor.column_azimuths() % (2 * np.pi))
         order = order[full.range[row, order] > 0]
-        in_file_order["points"].append(full.range[row, order, None] * sensor.by_beams().ray_directions()[row, order])
-        in_file_order["row"].append(np.full(len(order), row))
-    points, rows = (np.concatenate(in_file_order[k]) for k in ("points", "row"))
+        points.append(full.range[row, order, None] * sensor.by_beams().ray_directions()[row, order])
+        rows.append(np.full(len(order), row))
+    found = np.concatenate(points).astype(np.float32)
+    return Scan(found, np.linspace(0, 1, len(found), dtype=np.float32), sensor), np.concatenate(rows)
+
+
+def test_unfolding_puts_each_ring_on_its_beam_even_when_rings_are_missing() -> None:
+    whole, rows = in_file_order()
     for kept in (rows >= 0, rows < 39, rows >= 20, (rows < 10) | (rows > 30)):
-        scan = Scan(points[kept].astype(np.float32), np.zeros(kept.sum(), np.float32), sensor)
-        image = unfold(scan)
-        expected = np.where(np.isin(np.arange(64), rows[kept])[:, None], full.range, 0)
-        assert np.allclose(image.range, expected, rtol=3e-7)
+        image = unfold(whole[kept])
+        assert np.array_equal(image.range, unfold(replace(whole, ring=rows.astype(np.int16))[kept]).range)
+        assert np.array_equal(np.flatnonzero(image.mask.any(1)), np.unique(rows[kept]))
         assert np.array_equal(project(unproject(image)).mask, image.mask)
     with pytest.raises(DataError, match=r"rings found for the 64 lasers.*project\(\)"):
-        unfold(scan[np.random.default_rng(0).permutation(len(scan))])
+        unfold(whole[np.random.default_rng(0).permutation(len(whole))])
+
+
+@given(first=st.integers(0, 359), width=st.integers(60, 360), share=st.sampled_from([0.3, 0.95]))
+@settings(max_examples=25)
+def test_a_crop_unfolds_as_its_part_of_the_whole_scan(first: int, width: int, share: float) -> None:
+    whole, rows = in_file_order(share)
+    azimuth = np.degrees(np.arctan2(whole.points[:, 1], whole.points[:, 0]))
+    kept = (azimuth - first) % 360 < width
+    known = replace(whole, ring=rows.astype(np.int16))[kept]
+    image, expected = unfold(whole[kept]), unfold(known)
+    assert np.array_equal(image.range, expected.range)
+    assert np.array_equal(image.reflectance, expected.reflectance)
+
+
+@pytest.mark.parametrize("half", ["left", "right", "rear"])
+def test_half_a_scan_is_not_put_into_one_row(half: str) -> None:
+    """The peers' rule looks for the step from the fourth quadrant to the first, which such a half does not have."""
+    whole, rows = in_file_order()
+    x, y = whole.points[:, 0], whole.points[:, 1]
+    kept = {"left": y > 0, "right": y < 0, "rear": x < 0}[half]
+    assert np.array_equal(ring_numbers(whole.points[kept]), rows[kept])
+
+
+@given(seed=st.integers(0, 10_000), strays=st.integers(1, 3), at_seam=st.booleans())
+@settings(max_examples=25)
+def test_stray_points_make_no_rings_of_their_own(seed: int, strays: int, at_seam: bool) -> None:
+    whole, rows = in_file_order()
+    rng = np.random.default_rng(seed)
+    place = rng.integers(1, len(whole), strays)
+    if at_seam:
+        place = rng.choice(np.flatnonzero(np.diff(rows)) + 1) + rng.integers(-2, 3, strays)
+    order = np.insert(np.arange(len(whole)), place, rng.integers(0, len(whole), strays))
+    ring = ring_numbers(whole.points[order])
+    moved = ring != rows[order]
+    assert ring.max() == 63
+    assert moved.sum() <= 5 * strays, "only the strays, and points that stand between them"
+    assert unfold(whole[order]).mask.any(1).all()
+
+
+def test_points_that_are_in_no_rings_are_refused() -> None:
+    whole, rows = in_file_order()
+    azimuth = np.arctan2(whole.points[:, 1], whole.points[:, 0]) % (2 * np.pi)
+    orders = {
+        "column by column": np.argsort(azimuth, kind="stable"),
+        "clockwise": np.lexsort((-azimuth, rows)),
+        "from the rear on": np.lexsort(((azimuth + np.pi) % (2 * np.pi), rows)),
+        "from the bottom up": np.lexsort((azimuth, -rows)),
+        "a narrow sector": np.flatnonzero(np.abs(azimuth - 2) < 0.05),
+    }
+    for name, order in orders.items():
+        scan = replace(whole[order], id=name)
+        with pytest.raises(DataError, match=f"{name}.*ring by ring, as KITTI stores them"):
+            unfold(scan)
 
 
 def test_a_known_ring_needs_no_order() -> None:

@@ -66,6 +66,15 @@ def test_unfolding_finds_the_beam_of_each_ring_also_in_cut_scans(scans: list[Sca
         assert filled.tolist() == list(range(expected)), scan_id
 
 
+def test_halves_have_the_rings_of_the_whole_scan(scans: list[Scan]) -> None:
+    for scan in (s for s in scans if len(s) > FULL_TURN):
+        ring, (x, y, _) = ring_numbers(scan.points), scan.points.T
+        for kept in (x > 0, x < 0, y > 0, y < 0, x < 5):
+            expected = np.unique(ring[kept], return_inverse=True)[1]
+            assert np.array_equal(ring_numbers(scan.points[kept]), expected), scan.id
+            assert unfold(scan[kept]).mask.any(1).sum() == expected.max() + 1, scan.id
+
+
 def test_the_beam_table_is_where_the_rings_are(scans: list[Scan]) -> None:
     """Median over full scans of each ring's elevation against the preset's ``beams``."""
     sensor: Sensor = load_sensor("hdl64e_kitti360")

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from lidar_synth.cli.town import town as command
+from lidar_synth.cli.view import view
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.formats import KITTI360, KITTIObject, SemanticKITTI, open_scans
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.mixing import MixedScans
 from lidar_synth.town import LAYOUTS, Town, export_town
 from lidar_synth.town.export import _parts
 
@@ -41,6 +43,18 @@ def test_points_come_back_bit_by_bit(written: tuple[str, Path], scans: list[Scan
     for i, scan in enumerate(scans):
         assert np.array_equal(read[i].points, scan.points)
         assert np.array_equal(read[i].reflectance, scan.reflectance)
+
+
+def test_a_town_read_back_is_synthetic_everywhere(written: tuple[str, Path], tmp_path: Path) -> None:
+    root = written[1]
+    read = open_scans(root)
+    assert [scan.domain for scan in read] == [SYNTHETIC] * COUNT and read[0].domain == SYNTHETIC
+    one = next(path for path in sorted(root.rglob("*.bin")) if path.parent.name != "labels")
+    assert open_scans(one)[0].domain == SYNTHETIC
+    view(root, 0, 1, tmp_path / "page.html", None)
+    assert '"domain": 1' in (tmp_path / "page.html").read_text().replace('"domain":1', '"domain": 1')
+    real = MixedScans(read, ratio=0)  # where it stands in for real scans, to a mixture it is
+    assert real[0]["domain"] == REAL
 
 
 def test_labels_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:

@@ -88,7 +88,9 @@ SIGNS: dict[str, Callable[[Path], bool]] = {
     "webdataset": lambda root: root.suffix == TAR or any(root.glob(f"*{TAR}")),
     "png": lambda root: root.suffix == ".png" or any(root.glob("range/*.png")),
     "range": lambda root: _holds_range_images(root),
-    "folder": lambda root: root.suffix in SUFFIXES or any(p.suffix in SUFFIXES for p in root.rglob("*")),
+    "folder": lambda root: (
+        root.suffix.lower() in SUFFIXES or any(p.suffix.lower() in SUFFIXES for p in root.rglob("*"))
+    ),
 }
 """How a layout is recognised, in this order."""
 
@@ -99,6 +101,8 @@ def open_scans(
     sensor: str | Path | Sensor | None = None,
     layout: str | None = None,
     split: str | None = None,
+    fields: int | None = None,
+    reflectance_max: float | None = None,
     on_bad: OnBad = "error",
 ) -> ScanFiles:
     """Open the scans at a path: a dataset's root, a bank, a folder of scans, or one file.
@@ -108,7 +112,10 @@ def open_scans(
         sensor: the sensor that recorded the scans, if it is not the layout's own.
         layout: one of ``READERS``; by default it is recognised from the files.
         split: name of a split, for the layouts that have splits.
-        on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` leaves it out, with a warning.
+        fields: floats per point of plain ``.bin`` files.
+        reflectance_max: the upper end of the reflectance in plain files, such as 255; values are divided by it.
+        on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` leaves it out, with a warning;
+            ``"drop-points"`` leaves out points that are NaN or infinite, and counts them.
 
     Returns:
         An indexable source of ``Scan``.
@@ -116,7 +123,7 @@ def open_scans(
     Raises:
         FileError: if the path does not exist.
         DataError: if no layout is recognised, or there is no scan.
-        ConfigError: on an unknown layout or split, or a split for a layout that has none.
+        ConfigError: on an unknown layout or split, or an option that the layout does not have.
 
     Example:
         >>> from lidar_synth import open_scans
@@ -136,7 +143,15 @@ def open_scans(
     options = {"sensor": sensor, "split": split}
     if split is not None and reader not in (KITTI360, SemanticKITTI, KITTIObject):
         raise ConfigError(f"split {split!r} of {path}", f"no split: layout {name!r} has none")
+    plain = {"fields": fields, "reflectance_max": reflectance_max}
+    if reader is not Folder and any(v is not None for v in plain.values()):
+        wrong = ", ".join(f"{k}={v}" for k, v in plain.items() if v is not None)
+        raise ConfigError(f"{wrong} for {path}", f"neither: the files of layout {name!r} have one form", _AS_FOLDER)
+    options |= plain
     return reader(path, on_bad=on_bad, **{k: v for k, v in options.items() if v is not None})  # type: ignore[arg-type]
+
+
+_AS_FOLDER = "--layout folder (layout='folder') reads the files below as plain ones."
 
 
 def layout_of(path: Path) -> str:

@@ -40,7 +40,7 @@ class Folder(ScanFiles):
 
     Raises:
         FileError: where there is no such path.
-        ConfigError: where files of several kinds are there.
+        ConfigError: where files of several kinds are there, or on fields or a reflectance that no file has.
         DataError: where there is none.
     """
 
@@ -53,33 +53,35 @@ class Folder(ScanFiles):
         reflectance_max: float = 1.0,
         on_bad: OnBad = "error",
     ) -> None:
+        if fields < 4 or not 0 < reflectance_max < np.inf:
+            raise ConfigError(f"fields={fields}, reflectance_max={reflectance_max}", "at least 4, and above 0")
         root = Path(root)
-        self._base, paths = scan_paths(root, SUFFIXES)
-        ids = [path.relative_to(self._base).with_suffix("").as_posix() for path in paths]
-        self._suffix = paths[0].suffix
-        told = told_sensor(paths[0]) if sensor is None and self._suffix == ".npz" else None
+        base, self._paths = scan_paths(root, SUFFIXES)
+        ids = [path.relative_to(base).with_suffix("").as_posix() for path in self._paths]
+        first = self._paths[0]
+        told = told_sensor(first) if sensor is None and first.suffix.lower() == ".npz" else None
         super().__init__(root, ids, sensor or told or "hdl64e_kitti", on_bad)
         self._given = None if sensor is None else load_sensor(sensor)
         self._fields, self._reflectance_max = fields, reflectance_max
 
     def read(self, index: int) -> Scan:
-        name = self.ids[index]
-        scan = self._decode(self._base / f"{name}{self._suffix}")
-        scan.id = name
+        scan = self._decode(self._paths[index])
+        scan.id = self.ids[index]
         return scan
 
     def _decode(self, path: Path) -> Scan:
-        if path.suffix == ".bin":
+        suffix = path.suffix.lower()
+        if suffix == ".bin":
             points = read_points(path, self._fields, self._reflectance_max)
             beside = path.with_suffix(".label")
             labels = read_labels(beside, path, len(points), SEMANTIC_KITTI) if beside.is_file() else {}
             scan = Scan(points[:, :3], points[:, 3], self.sensor, **labels)
-        elif path.suffix == ".npz":
+        elif suffix == ".npz":
             scan = decode_scan(read_arrays(path), str(path), self._given)
             check_scan(scan, str(path))
             return scan
         else:
-            arrays = _columns(path) if path.suffix == ".npy" else read_cloud(path)
+            arrays = _columns(path) if suffix == ".npy" else read_cloud(path)
             scan = Scan(sensor=self.sensor, **arrays)
             check_scan(scan, str(path), self._reflectance_max)
         if self._reflectance_max != 1:
@@ -104,14 +106,14 @@ def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]
         DataError: where there is none.
     """
     if root.is_file():
-        if root.suffix not in suffixes:
+        if root.suffix.lower() not in suffixes:
             raise ConfigError(f"{root} is no scan", f"a file with one of {', '.join(suffixes)}")
         return root.parent, [root]
     if not root.is_dir():
         raise FileError(f"{root} does not exist", "a file or a folder with scans")
-    found = (path for path in root.rglob("*") if path.suffix in suffixes)
+    found = (path for path in root.rglob("*") if path.suffix.lower() in suffixes)
     paths = sorted(p for p in found if not any(part[0] == "." for part in p.relative_to(root).parts))
-    kinds = sorted({path.suffix for path in paths})
+    kinds = sorted({path.suffix.lower() for path in paths})
     if len(kinds) > 1:
         raise ConfigError(f"{root} holds {' and '.join(kinds)} files", "one kind", "Give the folder of one of them.")
     if not paths:

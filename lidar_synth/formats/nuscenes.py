@@ -91,7 +91,7 @@ class NuScenes(ScanFiles):
             id=self.ids[index],
             **labels,
         )
-        kept = np.einsum("ij,ij->i", scan.points, scan.points) >= NEAREST**2
+        kept = ~(np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2)  # NaN is somebody else's to drop
         if not kept.any():
             raise DataError(f"{path}: all {len(scan)} points are nearer than {NEAREST:g} m", "a sweep", SKIP_HINT)
         return scan[kept]

@@ -110,13 +110,13 @@ def _check_whole(path: Path) -> None:
         DataError: where it is cut, or has no header.
     """
     content = read_file(path)
-    found = HEADER_END[path.suffix].search(content)
+    found = HEADER_END[path.suffix.lower()].search(content)
     if found is None:
         raise DataError(f"{path} has no header of a {path.suffix} file", "a PCD or PLY file", SKIP_HINT)
     rows = [line.split() for line in content[: found.end()].decode(errors="replace").splitlines() if line.strip()]
     body = content[found.end() :]
     try:
-        count, width, kind = (_pcd_size if path.suffix == ".pcd" else _ply_size)(rows)
+        count, width, kind = (_pcd_size if path.suffix.lower() == ".pcd" else _ply_size)(rows)
         if kind == "binary_compressed":
             count, width = 1, 8 + int.from_bytes(body[:4], "little")
         held = len(body.splitlines()) if kind == "ascii" else len(body) // width

@@ -3,6 +3,9 @@
 A ``.bin`` has no header, so its size and its values are the only signs that it holds what its name says.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,8 @@ from lidar_synth.geometry.scan import Scan
 
 FARTHEST = 1e5
 """Metres: a coordinate beyond this is not a LiDAR's."""
+
+_bad_points_kept = ContextVar("bad points kept", default=False)
 
 
 def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> NDArray[np.float32]:
@@ -41,7 +46,10 @@ def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> ND
         raise DataError(f"{path} is empty", f"{4 * fields} bytes for each point", SKIP_HINT)
     if size % (4 * fields):
         fits = [n for n in (4, 5, 6) if size % (4 * n) == 0]
-        hint = f"The size fits {fits[0]} floats per point: pass fields={fits[0]} if it holds them. " if fits else ""
+        hint = ""
+        if fits:
+            n = fits[0]
+            hint = f"The size fits {n} floats per point: pass fields={n} (convert --fields {n}) if it holds them. "
         raise DataError(
             f"{path} is {size} bytes long",
             f"a multiple of {4 * fields}: {fields} float32 for each point",
@@ -75,22 +83,57 @@ def check_points(
     Raises:
         DataError: on no points, NaN, infinity, coordinates beyond ``FARTHEST`` or reflectance outside.
     """
+    if _bad_points_kept.get():
+        good = finite(points, reflectance)
+        points, reflectance = points[good], reflectance[good]
     if len(points) == 0:
         raise DataError(f"{where} holds no points", "at least one point", SKIP_HINT)
     # One pass over the memory tells that all is well; which value is at fault is looked for only if it is not.
     flat = points.reshape(-1)
     with np.errstate(over="ignore", invalid="ignore"):
         suspicious = not float(np.dot(flat, flat)) < FARTHEST**2
-    if suspicious:
-        _find_bad_value(points, where)
     low, high = float(reflectance.min()), float(reflectance.max())
+    if suspicious or not np.isfinite(high - low):
+        _find_bad_value(points, reflectance, where)
+    scale = 255 if high <= 255 else 65535
     if not 0 <= low <= high <= reflectance_max:
         raise DataError(
             f"{where}: its reflectance (the fourth value of a point) runs from {low:g} to {high:g}",
             f"values in [0, {reflectance_max:g}]",
-            "Either it holds another number of floats per point (nuScenes: fields=5), or intensities on another scale "
-            "(reflectance_max=255), or it is damaged.",
+            f"Either it holds intensities on another scale (convert --reflectance-max {scale}, in Python "
+            f"reflectance_max={scale}), or another number of floats per point (convert --fields 5, fields=5; nuScenes "
+            "has 5), or it is damaged.",
         )
+
+
+def finite(points: NDArray[np.float32], reflectance: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(N,) which points are finite, with their reflectance."""
+    kept: NDArray[np.bool_] = np.isfinite(points).all(axis=1) & np.isfinite(reflectance)
+    return kept
+
+
+def without_bad_points(scan: Scan) -> Scan:
+    """The scan without its points that are NaN or infinite; their labels and all else that is known of them go too.
+
+    Raises:
+        DataError: where none is left.
+    """
+    good = finite(scan.points, scan.reflectance)
+    if good.all():
+        return scan
+    if not good.any():
+        raise DataError(f"scan {scan.id!r}: all {len(scan)} points are NaN or infinite", "some that are not", SKIP_HINT)
+    return scan[good]
+
+
+@contextmanager
+def bad_points_kept() -> Iterator[None]:
+    """Inside, readers hand out points that are NaN or infinite, for those who drop them."""
+    before = _bad_points_kept.set(True)
+    try:
+        yield
+    finally:
+        _bad_points_kept.reset(before)
 
 
 def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
@@ -104,14 +147,13 @@ def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
         raise DataError(f"{where}: labels {np.unique(scan.label)[-8:].tolist()}", "train ids 0..18, or 255 = ignore")
 
 
-def _find_bad_value(points: NDArray[np.float32], where: str) -> None:
-    finite = np.isfinite(points)
-    if not finite.all():
-        bad = np.flatnonzero(~finite.all(axis=1))
+def _find_bad_value(points: NDArray[np.float32], reflectance: NDArray[np.float32], where: str) -> None:
+    bad = np.flatnonzero(~finite(points, reflectance))
+    if len(bad):
         raise DataError(
             f"{where}: {len(bad)} of {len(points)} points are NaN or infinite, the first is point {bad[0]}",
             "finite float32 values",
-            SKIP_HINT,
+            f"{SKIP_HINT} on_bad='drop-points' (convert --on-bad drop-points) leaves out such points only.",
         )
     farthest = np.abs(points[:, :3]).max()
     if farthest > FARTHEST:

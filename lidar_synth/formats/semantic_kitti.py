@@ -24,6 +24,7 @@ from lidar_synth.files import (
     list_files,
     numbers,
     png_size,
+    read_file,
     read_matrix,
     read_named_matrices,
     write_file,
@@ -48,8 +49,8 @@ SPLITS: dict[str, tuple[str, ...] | None] = {
 KITTI_CAMERA = ideal_camera(718.856, (1241, 376))
 """What ``calib.txt`` describes where no camera is known: the odometry camera's picture, at the sensor."""
 
-PERIOD = 0.1
-"""Seconds between two scans."""
+SIDE_FILES = ("calib.txt", "poses.txt", "times.txt")
+"""What a sequence has beside its scans."""
 
 
 class SemanticKITTI(ScanFiles):
@@ -128,7 +129,8 @@ class SemanticKITTIWriter(Writer):
 
     Sequence and frame of an id ``NN/FFFFFF`` are kept, and those of KITTI-360's drives (drive 0003 is sequence 03);
     other scans go into ``sequence``, numbered by index. ``poses.txt`` has one line for every frame up to the last;
-    a frame whose pose is not known has ``nan`` there.
+    a frame whose pose is not known has ``nan`` there. ``times.txt`` is not written, because a scan knows no time.
+    ``carry`` copies the three files of sequences of SemanticKITTI's, as far as they are there.
 
     Args:
         root: output folder.
@@ -139,6 +141,7 @@ class SemanticKITTIWriter(Writer):
     def __init__(self, root: str | Path, *, sequence: str = "00", calibration: Calibration | None = None) -> None:
         super().__init__(root, calibration=calibration)
         self.sequence = sequence
+        self._carried: set[str] = set()
 
     def path(self, index: int, name: str | None = None) -> Path:
         match = re.fullmatch(r"(?:2013_05_28_drive_00)?(\d\d)(?:_sync)?/(\d+)", name or "")
@@ -147,13 +150,34 @@ class SemanticKITTIWriter(Writer):
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         folder, frame = path.parents[1], path.stem
-        if not (folder / "calib.txt").is_file():
-            write_calibration(folder, camera or KITTI_CAMERA)
-        write_note(folder, int(frame), {"pose": None if scan.pose is None else scan.pose.tolist()})
+        if folder.name not in self._carried:
+            if not (folder / "calib.txt").is_file():
+                write_calibration(folder, camera or KITTI_CAMERA)
+            write_note(folder, int(frame), {"pose": None if scan.pose is None else scan.pose.tolist()})
         if picture is not None:
             write_image(folder / "image_2" / f"{frame}.png", picture)
         write_labels(folder / "labels" / f"{frame}.label", encode_labels(scan, SEMANTIC_KITTI))
         write_points(path, scan)
+
+    def carry(self, source: ScanFiles) -> list[str]:
+        if not isinstance(source, SemanticKITTI):
+            return ["times.txt: when the scans were taken is not known"]
+        places = [(i, *name.split("/")) for i, name in enumerate(source.ids)]
+        missing = []
+        for sequence in sorted({s for _, s, _ in places}):
+            paths = {frame: self.path(i, f"{s}/{frame}") for i, s, frame in places if s == sequence}
+            if any(p.parents[1].name != sequence or int(p.stem) != int(f) for f, p in paths.items() if f.isdigit()):
+                missing.append(f"the calibration, poses and times of sequence {sequence}: its scans get other numbers")
+                continue
+            folder = self.root / "sequences" / sequence
+            self._carried.add(sequence)
+            for name in SIDE_FILES:
+                path = source.root / "sequences" / sequence / name
+                if path.is_file():
+                    write_file(folder / name, read_file(path))
+                else:
+                    missing.append(f"sequences/{sequence}/{name}: {source.root} has none")
+        return missing
 
     def finish(self) -> None:
         for folder in sorted((self.root / "sequences").glob("*")):
@@ -196,8 +220,7 @@ def read_poses(folder: Path, camera: Calibration | None) -> dict[int, NDArray[np
 
 
 def write_poses(folder: Path, camera: Calibration, poses: dict[int, NDArray[np.float64]], frames: int) -> None:
-    """The inverse of ``read_poses``, with ``times.txt``; nothing where no pose is known."""
-    write_file(folder / "times.txt", "".join(f"{PERIOD * f:e}\n" for f in range(frames)).encode())
+    """The inverse of ``read_poses``; nothing where no pose is known."""
     if not poses:
         return
     lines = np.full((frames, 12), np.nan)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files import list_files, read_file, read_text, write_file
 from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan
 
 Image = NDArray[np.uint8]
@@ -81,6 +82,17 @@ class Writer(ABC):
     def complete(self, index: int, name: str | None = None) -> bool:
         """Whether the scan is already there, whole."""
         return self.path(index, name).is_file()
+
+    def carry(self, source: ScanFiles) -> list[str]:
+        """Take over what a source knows beside its scans, before they are written.
+
+        Returns:
+            What the layout has a place for and the source does not tell, in words; it is left out.
+
+        Raises:
+            FileError: where it cannot be read or written.
+        """
+        return []
 
     def finish(self) -> None:  # noqa: B027 - a layout of single files has nothing to gather
         """Write what belongs to the whole folder. Calling it again changes nothing."""

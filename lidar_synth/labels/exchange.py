@@ -16,6 +16,7 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import overlapping
 from lidar_synth.labels.ground import standing
 from lidar_synth.labels.merge import merged
+from lidar_synth.labels.objects import holding
 from lidar_synth.labels.view import refuse_coarser
 
 
@@ -33,7 +34,8 @@ def thinned(scan: Scan, sensor: Sensor) -> Scan:
 def swap_sector(scan: Scan, other: Scan, start: int, width: int) -> Scan:
     """A scan in which some columns are another's.
 
-    Boxes that an edge cuts through leave, with what stands in them; the others hold the returns of their own scan only.
+    Boxes that an edge cuts through leave, with what stands in them; the others hold the returns of their own scan only,
+    and all returns of their instance: they grow by some centimetres where noise or a tilt takes one outside.
 
     Args:
         scan: keeps the remaining columns.
@@ -41,6 +43,7 @@ def swap_sector(scan: Scan, other: Scan, start: int, width: int) -> Scan:
         start: first column of the sector.
         width: columns of the sector, 0..W; they wrap.
     """
+    scan, other = holding(scan), holding(other)
     columns = scan.sensor.columns
     cell, cell_other = (locate(s.points, scan.sensor).cell for s in (scan, other))
     first = _whole(scan, (cell >= 0) & ((cell - start) % columns >= width))

@@ -96,14 +96,26 @@ def instances_of(scan: Scan, least: int = 5) -> list[Object]:
     return found
 
 
+def holding(scan: Scan) -> Scan:
+    """The scan with boxes grown by some centimetres where returns of their instance would lie outside."""
+    if scan.boxes is None or scan.instance is None:
+        return scan
+    values = scan.boxes.values.copy()
+    for number in np.flatnonzero(scan.boxes.instance > 0):
+        values[number] = grown(values[number], scan.points[_instance(scan, scan.boxes[[number]])])
+    return replace(scan, boxes=replace(scan.boxes, values=values))
+
+
+def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
+    """(N,) the points of a box's instance that lie in it or miss it by no more than noise."""
+    wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
+    return np.asarray(Boxes(wide, box.names).contain(scan.points)[0] & (scan.instance == box.instance[0]))
+
+
 def _cut(scan: Scan, box: Boxes) -> Object | None:
     """The object of one box; None where there is nothing in it."""
-    if scan.instance is not None and box.instance[0] > 0:
-        wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
-        inside = Boxes(wide, box.names).contain(scan.points)[0] & (scan.instance == box.instance[0])
-    else:
-        inside = _standing(scan, box)
-    mine = np.flatnonzero(inside)
+    known = scan.instance is not None and box.instance[0] > 0
+    mine = np.flatnonzero(_instance(scan, box) if known else _standing(scan, box))
     return (
         _object(scan, mine, replace(box, values=grown(box.values[0], scan.points[mine])[None])) if len(mine) else None
     )

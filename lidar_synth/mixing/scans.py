@@ -12,6 +12,7 @@ from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.labels import LabelPolicy, make_policy
 from lidar_synth.mixing.batches import MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
+from lidar_synth.mixing.compare import check_alike
 from lidar_synth.mixing.items import to_item
 from lidar_synth.mixing.plan import EpochSize, Mixture, Part, Plan, plan, quotas
 from lidar_synth.mixing.schedules import Schedule, make_schedule
@@ -57,6 +58,7 @@ class MixedScans(Dataset[Any]):
         unlabelled: ``"error"`` refuses a batch without one valid label, ``"allow"`` hands it out, as
             ``labels="none"`` always does.
         real_as_is: real samples are no ``Scan`` but what a trainer wants already; see ``wrap``.
+        compare: compare the first real sample with a synthetic one here, where ``real_as_is``; see ``check_alike``.
 
     Attributes:
         collate: the ``collate_fn``.
@@ -95,6 +97,7 @@ class MixedScans(Dataset[Any]):
         collate: Form | Callable[[Any], Any] = "offsets",
         unlabelled: Unlabelled = "error",
         real_as_is: bool = False,
+        compare: bool = True,
     ) -> None:
         reals = each(real)
         synthetics = [(make_synthetic(source, seed), weight) for source, weight in each(synth)]
@@ -118,6 +121,8 @@ class MixedScans(Dataset[Any]):
         self._epoch = shared_integers(0)
         self._planned: tuple[int, Plan] | None = None
         self.set_epoch(0)
+        if real_as_is and compare:
+            check_alike(self.real, self.synthetic, self._finish)
 
     @classmethod
     def wrap(
@@ -145,7 +150,8 @@ class MixedScans(Dataset[Any]):
                 beforehand, by ``make_policy(..., real=scans)``.
 
         Raises:
-            ConfigError, DataError: as above.
+            ConfigError, DataError: as above; also where a synthetic sample does not have the form of a real one (keys,
+                types, dtypes, ranks, the value of ignored labels), unless ``compare=False``.
 
         Example:
             >>> import torch
@@ -267,7 +273,10 @@ class MixedScans(Dataset[Any]):
         """
         made = self.plan(epoch)
         rng = keyed_rng(self.seed, epoch, position)
-        scan = self._policies[int(made.source[position]) - made.reals](scan, rng)
+        return self._finish(int(made.source[position]) - made.reals, scan, rng)
+
+    def _finish(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
+        scan = self._policies[source](scan, rng)
         if self._augment is not None:
             scan = self._augment(scan, rng)
         return self._to_sample(scan, rng)

@@ -2,8 +2,9 @@
 
 from lidar_synth.geometry.projection.batch import BatchImage, project_batch, unproject_batch
 from lidar_synth.geometry.projection.fill import fill_points
+from lidar_synth.geometry.projection.rings import ring_numbers
 from lidar_synth.geometry.projection.spherical import Cells, carry, locate, project, unproject
-from lidar_synth.geometry.projection.unfold import ring_numbers, unfold
+from lidar_synth.geometry.projection.unfold import unfold
 
 __all__ = [
     "BatchImage",

@@ -1,8 +1,8 @@
 """Scan unfolding: rows from the order in which the laser rings were recorded, not from elevation.
 
 KITTI and KITTI-360 store a scan ring by ring from the top, each ring counter-clockwise from straight
-ahead. A ring ends where the quadrant falls from the fourth back to the first. Elevation would merge rings
-where the lasers are closer than the rows (HDL-64E's upper half) and leave rows empty where they are not.
+ahead; rings.py finds where each begins. Elevation would merge rings where the lasers are closer than the
+rows (HDL-64E's upper half) and leave rows empty where they are not.
 """
 
 from typing import Literal
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.projection.rings import fault_of, ring_numbers
 from lidar_synth.geometry.projection.spherical import carry, locate, nearest_in
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -18,18 +19,6 @@ from lidar_synth.geometry.sensor import Sensor
 Anchor = Literal["elevation", "last"]
 """How rings find their rows: each on the beam of its elevation, or, as the public code of R2Flow does,
 counted from the last ring up (which displaces a scan whose lower rings are cut off)."""
-
-
-def ring_numbers(points: NDArray[np.float32]) -> NDArray[np.int16]:
-    """(N,) ring of each point, 0 = the first in the file, of a scan in raw ring order.
-
-    Args:
-        points: (N, 3) float32 metres, in the order of the file.
-    """
-    ahead, left = points[:, 0] >= 0, points[:, 1] >= 0
-    starts = np.zeros(len(points), bool)
-    starts[1:] = (ahead[:-1] & ~left[:-1]) & (ahead[1:] & left[1:])
-    return np.cumsum(starts, dtype=np.int16)
 
 
 def _rows_by_elevation(elevations: NDArray[np.float64], beams: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -51,7 +40,7 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
     """Unfold a scan to a range image with one row per laser; a cell shows its nearest return.
 
     Args:
-        scan: N points in raw ring order, or in any order with ``scan.ring`` known.
+        scan: N points in raw ring order, or a crop of such a scan; or in any order with ``scan.ring`` known.
         sensor: whose lasers and columns; the scan's own by default.
         anchor: how a ring finds its row, where ``scan.ring`` does not tell it.
 
@@ -59,7 +48,8 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         An image on ``sensor.by_beams()``, whose rays have the elevations of the lasers.
 
     Raises:
-        DataError: on more rings than the sensor has lasers: the scan is not in ring order.
+        DataError: on a scan that is not in ring order: more rings than the sensor has lasers, rings that spread over
+            more than one laser's elevation, or a crop that is too narrow to tell.
 
     Example:
         >>> from lidar_synth import open_scans, unfold
@@ -71,30 +61,33 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
     lasers = (sensor or scan.sensor).by_beams()
     height, width = lasers.shape
     cell, distance, _ = locate(scan.points, lasers)
-    if scan.ring is not None:
-        rows, ring = np.arange(height), scan.ring
-    else:
+    rows, ring = np.arange(height), scan.ring
+    if ring is None:
         ring = ring_numbers(scan.points)
+        if fault := fault_of(scan.points, ring, lasers):
+            raise _not_in_rings(scan, fault)
         rows = _rows_of_rings(scan, ring, distance, lasers, anchor)
-    if len(scan) and (rows.size > height or ring.min() < 0 or ring.max() >= len(rows)):
-        raise DataError(
-            f"scan {scan.id!r}: {int(ring.max()) + 1} rings found for the {height} lasers of {lasers.name!r}",
-            "points ring by ring, as KITTI stores them",
-            "Use project() for a scan in another order, or set scan.ring.",
-        )
+    elif len(scan) and not 0 <= ring.min() <= ring.max() < height:
+        raise _not_in_rings(scan, f"rings {ring.min()} to {ring.max()} for the {height} lasers of {lasers.name!r}")
     cell = np.where(cell < 0, -1, rows[ring] * width + cell % width).astype(np.int32)
     image, index = nearest_in(cell, distance, lasers)
     return RangeImage(image, lasers, carry(scan, index))
 
 
+def _not_in_rings(scan: Scan, found: str) -> DataError:
+    return DataError(
+        f"scan {scan.id!r}: {found}",
+        "points ring by ring, as KITTI stores them",
+        "Use project() for a scan in another order, or set scan.ring.",
+    )
+
+
 def _rows_of_rings(
     scan: Scan, ring: NDArray[np.int16], distance: NDArray[np.float32], lasers: Sensor, anchor: Anchor
 ) -> NDArray[np.int64]:
-    """The row of each ring; all -1 where there are more rings than rows."""
+    """The row of each ring."""
     bounds = np.flatnonzero(np.diff(ring)) + 1
     count = len(bounds) + 1
-    if count > lasers.shape[0]:
-        return np.full(count, -1)
     if anchor == "last":
         return np.arange(count) + lasers.shape[0] - count
     sine = scan.points[:, 2] / np.where(distance > 0, distance, 1)
