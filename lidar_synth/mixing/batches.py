@@ -15,7 +15,7 @@ from torch.utils.data import Sampler
 from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.epochs import REPEATED, Position
 from lidar_synth.mixing.quotas import Mixture
-from lidar_synth.mixing.state import check_unshared, checked_state, make_state, place
+from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state, make_state, place
 
 AHEAD = 1 << 20
 """How many positions a source that works ahead is told at a time."""
@@ -184,7 +184,7 @@ class MixedBatches(Sampler[list[int]]):
             # Not the next epoch yet: whoever resumes here still has to see this one end.
             position = self.dataset.length(epoch)
         else:
-            epoch, position = epoch + 1, 0
+            epoch, position = after_epoch(self.dataset.mixture, epoch)
         return make_state(self.dataset.mixture, epoch, position)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -70,6 +70,15 @@ def make_state(mixture: Mixture, epoch: int, position: int) -> dict[str, Any]:
     }
 
 
+def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
+    """Epoch and position where an epoch is over: the next one's beginning, or its own end where the schedule ends."""
+    try:
+        Plan(mixture, epoch + 1)
+    except ConfigError:
+        return epoch, len(Plan(mixture, epoch))
+    return epoch + 1, 0
+
+
 def checked_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]:
     """Epoch and position of a state.
 

@@ -11,7 +11,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.batches import AHEAD, CutSteps, cut_steps, go_to, rank_share
 from lidar_synth.mixing.epochs import check_pass, shared_integers
 from lidar_synth.mixing.scans import MixedScans
-from lidar_synth.mixing.state import check_unshared, checked_state, make_state, place
+from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state, make_state, place
 
 
 class MixedStream(IterableDataset[Any]):
@@ -191,8 +191,7 @@ class MixedStream(IterableDataset[Any]):
             steps = self._steps(position, self.scans.length(epoch))
             if not 0 <= done <= len(steps):
                 raise ConfigError(f"{done} batches done of {len(steps)}", "a number of batches of this epoch")
-            last = done == len(steps)
-            return (epoch + 1, 0) if last else (epoch, steps[done].start)
+            return (epoch, steps[done].start) if done < len(steps) else after_epoch(self.scans.mixture, epoch)
         position += done * self.batch_size * self.world_size
         while position >= (length := self.scans.length(epoch)):
             epoch, position = epoch + 1, position - length

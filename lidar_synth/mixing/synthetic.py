@@ -53,7 +53,7 @@ class Generated:
         condition: for a conditional model, what conditions scan n: entry n modulo their number of an indexable source,
             such as the real scans (``Generator.scans`` tells what it takes).
         cache: how many of the latest scans each process keeps in memory (about 1 MB each at 64 x 1024), which saves
-            time where one process is asked for a scan again (``reuse``).
+            time where one process is asked for a scan again: with ``reuse``, an epoch later.
         sampling: steps, solver and guidance, as for ``Generator.scans``.
 
     Raises:

@@ -44,8 +44,8 @@ class RollingBank:
         model: a shipped model's name or a path to a checkpoint, unconditional.
         seed: of the scans, 0 <= seed < 2^64.
         slots: scans held in shared memory, 3 to 5 bytes a cell each. More than all workers ask for ahead: workers x
-            ``prefetch_factor`` x batch size x ratio; a scan that is served several times (the plan's ``reuse``) is
-            kept until then only where there is room.
+            ``prefetch_factor`` x batch size x ratio; a scan that comes again in the next epoch (the plan's ``reuse``)
+            is kept until then where there is room for an epoch's scans, and otherwise made again.
         starved: what a request does whose scan is not there yet: ``"wait"`` for it, or ``"reuse"`` the held one that
             was served least.
         refresh: in (0, 1]: hold a pool of scans and replace this share of it with each epoch; request n gets the
