@@ -1,6 +1,7 @@
 """Orders that are computed entry by entry: bijections of any size that follow from their keys alone."""
 
 from collections import Counter
+from itertools import pairwise
 
 import hypothesis.strategies as st
 import numpy as np
@@ -48,7 +49,7 @@ def test_long_orders_leave_no_trace_of_the_entry(size: int) -> None:
     places = [permute(entries, size, 5, 1, number) for number in range(20)]
     joined = np.concatenate(places)
     assert np.allclose(np.bincount(joined * 10 // size, minlength=10), 2000, atol=250)
-    for a, b in zip(places, places[1:], strict=False):
+    for a, b in pairwise(places):
         assert abs(np.corrcoef(a, b)[0, 1]) < 0.15
         assert abs(np.corrcoef(a[1:], a[:-1])[0, 1]) < 0.15
         assert (a == b).sum() < 10

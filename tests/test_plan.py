@@ -205,7 +205,7 @@ def test_a_balanced_plan_spreads_several_synthetic_sources(weights: list[int], b
     sources = tuple(Part(None, float(w)) for w in weights)
     mixed = Mixture((Part(9),), sources, make_schedule(0.5), epoch_size=120, balanced=True)
     source = plan(mixed, epoch).source
-    for start in range(0, 120 - batch + 1):
+    for start in range(120 - batch + 1):
         for number, weight in enumerate(weights, 1):
             given_here = int((source[start : start + batch] == number).sum())
             assert abs(given_here - Fraction(batch * weight, 2 * sum(weights))) < 2 + (len(weights) > 2)

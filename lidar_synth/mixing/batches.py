@@ -44,16 +44,16 @@ class CutSteps(Sequence[range]):
     Args:
         start, end: of the positions.
         size: positions of a step.
-        count: of the steps.
+        total: how many steps.
     """
 
     start: int
     end: int
     size: int
-    count: int
+    total: int
 
     def __len__(self) -> int:
-        return self.count
+        return self.total
 
     @overload
     def __getitem__(self, number: int) -> range: ...
@@ -64,12 +64,12 @@ class CutSteps(Sequence[range]):
     def __getitem__(self, number: int | slice) -> range | Sequence[range]:
         """The positions of a step; the last one takes what is left, also more than its size."""
         if isinstance(number, slice):
-            return [self[i] for i in range(*number.indices(self.count))]
-        if not -self.count <= number < self.count:
-            raise IndexError(f"step {number} of {self.count}")
-        number %= self.count
+            return [self[i] for i in range(*number.indices(self.total))]
+        if not -self.total <= number < self.total:
+            raise IndexError(f"step {number} of {self.total}")
+        number %= self.total
         start = self.start + number * self.size
-        return range(start, self.end if number == self.count - 1 else start + self.size)
+        return range(start, self.end if number == self.total - 1 else start + self.size)
 
 
 def cut_steps(

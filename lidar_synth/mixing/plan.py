@@ -131,12 +131,12 @@ class Plan:
             "epoch_size": mixture.epoch_size,
             "reuse": mixture.reuse,
             "balanced": mixture.balanced,
+            "real": [_facts_of(part) for part in mixture.real],
+            "synthetic": [_facts_of(part) for part in mixture.synthetic],
             "samples": list(self.counts),
             "samples before": list(self.before),
             "synthetic before": str(synthetic_before(mixture, self.epoch)),
             "laps": list(mixture.laps) if mixture.reuse > 1 else [],
-            "real": [_facts_of(part) for part in mixture.real],
-            "synthetic": [_facts_of(part) for part in mixture.synthetic],
         }
 
     @cached_property

@@ -284,7 +284,7 @@ def _tree(weights: tuple[Fraction, ...]) -> _Node | int:
         if len(sources) == 1:
             return sources[0]
         left, right = sources[: len(sources) // 2], sources[len(sources) // 2 :]
-        share = sum(weights[i] for i in left) / sum(weights[i] for i in sources)
+        share = sum((weights[i] for i in left), Fraction(0)) / sum(weights[i] for i in sources)
         p, q = share.limit_denominator(_FINEST).as_integer_ratio()
         return _Node(p, q, grow(left), grow(right))
 

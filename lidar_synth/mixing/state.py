@@ -1,7 +1,7 @@
 """How far a run has come, and where a process stands among others.
 
-A state is ``{"version", "seed", "epoch", "position", "plan", "mixture"}``: the hash of the epoch's plan, and all that the
-plan follows from in readable form, so that a refusal can name the difference.
+A state is ``{"version", "seed", "epoch", "position", "plan", "mixture"}``: the hash of the epoch's plan, and all that
+the plan follows from in readable form, so that a refusal can name the difference.
 """
 
 import os
@@ -110,7 +110,7 @@ def _check_old(state: Mapping[str, Any], position: int) -> None:
     """A state of the first version: it cannot tell its mixture, and its order is no longer made."""
     if position:
         raise ConfigError(
-            f"a state without its plan, {dict(state)}, in the middle of an epoch whose order this version does not make",
+            f"a state without its plan, {dict(state)}, in the middle of an epoch; this version makes another order",
             "a state that this version gave",
             "To begin that epoch anew, set its position to 0; to leave the rest of it out, add 1 to its epoch too.",
         )

@@ -20,8 +20,8 @@ class MixedStream(IterableDataset[Any]):
     Worker w of W gives every W-th batch, so that ``DataLoader(stream, batch_size=B, num_workers=W)`` with the same B
     gives the same batches in the same order for every W. Over all ranks and workers every sample is given once.
 
-    ``set_epoch`` counts from the next pass on: a pass stays in the epoch in which it began, and where persistent workers
-    cannot tell which one that was, it raises.
+    ``set_epoch`` counts from the next pass on: a pass stays in the epoch in which it began, and where persistent
+    workers cannot tell which one that was, it raises.
 
     The state (state.py) says where the batches given so far end. A worker's own state, which torchdata's
     ``StatefulDataLoader`` asks for, adds how many samples it has given since, and fits the same ranks and workers only.
