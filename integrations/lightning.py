@@ -3,10 +3,12 @@
     data = MixedData(train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8, num_workers=4)
     trainer.fit(model, data)
 
-Set ``Trainer(use_distributed_sampler=False, reload_dataloaders_every_n_epochs=0)``: the batch sampler shares the plan
-among ranks itself.
+Set ``Trainer(use_distributed_sampler=False)``: the batch sampler shares the plan among ranks itself. Lightning asks for
+the number of batches once; where a later epoch has more of them (a rising ratio with ``epoch_size="add"``), set
+``reload_dataloaders_every_n_epochs=1`` as well. A checkpoint within an epoch goes on after its last batch.
 """
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +17,8 @@ from torch.utils.data import DataLoader, Dataset
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.geometry.scan import Source
 from lidar_synth.mixing import Collate, Generated, MixedBatches, MixedScans, to_item
+from lidar_synth.mixing.batches import cut_steps
+from lidar_synth.mixing.state import after_epoch, checked_state, make_state
 from lidar_synth.noise import keyed_rng
 
 try:
@@ -55,11 +59,12 @@ class OnDevice(Dataset[Any]):
         return len(self.mixed)
 
     def __getitem__(self, index: int) -> Any:
-        epoch, made = self.mixed.epoch, self.mixed.plan()
-        source = int(made.source[index]) - made.reals
-        if source < 0:
+        epoch = self.mixed.epoch_of(index)
+        made = self.mixed.plan(epoch)
+        source, number = made[index]
+        if source < made.reals:
             return self.mixed.sample(epoch, index)
-        return Pending(epoch, index, source, int(made.index[index]))
+        return Pending(epoch, index, source - made.reals, number)
 
 
 class Items(Dataset[Any]):
@@ -107,13 +112,18 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             )
         self.train, self.val, self.test = train, val, test
         self.batch_size, self.num_workers, self.on_device = batch_size, num_workers, on_device
+        self._resume: dict[str, Any] | None = None
+        self._batches: _Epochs | None = None
 
     def train_dataloader(self) -> Any:
-        """Batches along the plan, shared among ranks."""
-        batches = _Epochs(self, MixedBatches(self.train, self.batch_size))
+        """Batches along the plan, shared among ranks; from where a checkpoint was taken, if one was loaded."""
+        self._batches = _Epochs(self, MixedBatches(self.train, self.batch_size))
+        if self._resume is not None:
+            self._batches.load_state_dict(self._resume)
+            self._resume = None
         dataset: Any = OnDevice(self.train) if self.on_device else self.train
         collate = list if self.on_device else self.train.collate
-        return DataLoader(dataset, batch_sampler=batches, collate_fn=collate, **self._workers())
+        return _Loader(dataset, batch_sampler=self._batches, collate_fn=collate, **self._workers())
 
     def val_dataloader(self) -> Any:
         """Batches of real scans."""
@@ -140,19 +150,22 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         return super().transfer_batch_to_device(self.train.collate(batch), device, dataloader_idx)
 
     def state_dict(self) -> dict[str, Any]:
-        """The seed; Lightning keeps the epoch itself."""
-        return {"seed": self.train.seed}
+        """Where training stands, after the last batch that Lightning counts as processed."""
+        return make_state(self.train.mixture, 0, 0) if self._batches is None else self._batches.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Refuses a checkpoint of another mixture.
+        """Go on where a checkpoint was taken.
 
         Raises:
-            ConfigError: on another seed.
+            ConfigError: on a checkpoint of another mixture; or of the middle of an epoch with batches of another size,
+                which Lightning would miscount.
         """
-        if state_dict.get("seed") != self.train.seed:
-            raise ConfigError(
-                f"a checkpoint of seed {state_dict.get('seed')}", f"seed {self.train.seed} of the mixture"
-            )
+        if set(state_dict) == {"seed"}:  # as before version 2, whose checkpoints did not tell the position
+            state_dict = {"seed": state_dict["seed"], "epoch": 0, "position": 0}
+        checked_state(state_dict, self.train.mixture)
+        self._resume = state_dict
+        if self._batches is not None:
+            self._batches.load_state_dict(state_dict)
 
     def _workers(self) -> dict[str, Any]:
         return {"num_workers": self.num_workers, "persistent_workers": self.num_workers > 0}
@@ -165,15 +178,82 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
 
 
 class _Epochs:
-    """A batch sampler that takes the epoch from Lightning before it begins."""
+    """A batch sampler that takes the epoch from Lightning before it begins, and tells its place as Lightning counts."""
 
     def __init__(self, data: MixedData, batches: MixedBatches) -> None:
         self._data, self._batches = data, batches
+        self._epoch = batches.dataset.epoch  # that began last
+        self._first = 0  # where a state says; Lightning's own count is one behind after the end of an epoch
 
     def __len__(self) -> int:
-        return len(self._batches)
+        """Batches of the whole epoch: Lightning counts on from those that it had before a checkpoint."""
+        try:
+            return len(self._steps(self._current()))
+        except ConfigError:  # after the last epoch of a schedule, when Lightning tidies up
+            return len(self._steps(self._epoch))
 
-    def __iter__(self) -> Any:
-        if self._data.trainer is not None:
-            self._batches.set_epoch(self._data.trainer.current_epoch)
+    def __iter__(self) -> Iterator[list[int]]:
+        self._epoch = self._current()
+        self._batches.set_epoch(self._epoch)
+        self._check_limit()
         return iter(self._batches)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state after the batches that were processed, and how many samples all ranks take at a time."""
+        steps, trainer = self._steps(self._epoch), self._data.trainer
+        done = trainer.fit_loop.epoch_loop.batch_progress.current.processed if trainer else 0
+        mixture = self._batches.dataset.mixture
+        place = (self._epoch, steps[done].start) if done < len(steps) else after_epoch(mixture, self._epoch)
+        return make_state(mixture, *place) | {"step": steps.size}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on there.
+
+        Raises:
+            ConfigError: as ``MixedData.load_state_dict``.
+        """
+        size = self._steps(0).size
+        if state["position"] and state.get("step", size) != size:
+            raise ConfigError(
+                f"a checkpoint from the middle of an epoch, {state['step']} samples a step, for {size} a step",
+                "the batch size and the number of devices that it was taken with",
+                "A checkpoint from the end of an epoch fits any.",
+            )
+        self._batches.load_state_dict(state)
+        self._epoch = self._first = self._batches.dataset.epoch
+
+    def _current(self) -> int:
+        trainer = self._data.trainer
+        return self._batches.dataset.epoch if trainer is None else max(self._first, trainer.current_epoch)
+
+    def _steps(self, epoch: int) -> Any:
+        batches = self._batches
+        return cut_steps(0, batches.dataset.length(epoch), batches.batch_size, batches.world_size)
+
+    def _check_limit(self) -> None:
+        """Lightning keeps the first epoch's number of batches and would leave out what is beyond."""
+        trainer = self._data.trainer
+        if trainer is None or trainer.limit_train_batches != 1.0:
+            return
+        limits = getattr(trainer.fit_loop._combined_loader, "limits", None)
+        if limits and limits[0] < len(self):
+            raise ConfigError(
+                f"epoch {self._epoch} of {len(self)} batches, where Lightning counts on {limits[0]} as in the first",
+                "epochs that do not grow",
+                "Set Trainer(reload_dataloaders_every_n_epochs=1), or epoch_size='replace' or a number of samples.",
+            )
+
+
+class _Loader(DataLoader[Any]):
+    """A ``DataLoader`` with a state, which Lightning asks for."""
+
+    batch_sampler: Any
+
+    def state_dict(self) -> dict[str, Any]:
+        """The batch sampler's."""
+        state: dict[str, Any] = self.batch_sampler.state_dict()
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """The batch sampler's."""
+        self.batch_sampler.load_state_dict(state)

@@ -106,7 +106,8 @@ class Folder:
 
     Attributes:
         mixed: the mixture; its real samples are the numbers of the list's real entries.
-        slots: synthetic samples of an epoch.
+        slots: synthetic samples of the first epoch; a later one may have one fewer, and then gives one of its scans
+            again.
     """
 
     def __init__(self, path: Path, facts: dict[str, Any]) -> None:
@@ -160,18 +161,21 @@ class Folder:
         """
         key = (self.epoch, slot)
         if key not in self._kept:
-            scan = self.mixed.sample(key[0], self._position(*key))
+            scan = self.mixed.sample(*self._position(*key))
             self._kept[key] = scan if self._view is None else in_view(scan, self._view)
             if len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return self._kept[key]
 
-    def _position(self, epoch: int, slot: int) -> int:
-        if self._positions is None or self._positions[0] != epoch:
-            self._positions = (epoch, np.flatnonzero(self.mixed.plan(epoch).domain))
+    def _position(self, epoch: int, slot: int) -> tuple[int, int]:
+        """Epoch and position of a slot: this epoch's, or, where it has no synthetic scan, the latest that has some."""
         if not 0 <= slot < self.slots:
             raise DataError(f"slot {slot} of {self.path}", f"0 to {self.slots - 1}")
-        return int(self._positions[1][slot])
+        while not self.mixed.plan(epoch).synthetics:
+            epoch -= 1
+        if self._positions is None or self._positions[0] != epoch:
+            self._positions = (epoch, np.flatnonzero(self.mixed.plan(epoch).domain))
+        return epoch, int(self._positions[1][slot % len(self._positions[1])])
 
 
 open_folder = cache(Folder.open)

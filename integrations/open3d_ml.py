@@ -106,8 +106,7 @@ def _split_class(stock: Any) -> Any:
 
         def get_attr(self, idx: int) -> dict[str, Any]:
             """Name and path; a synthetic scan's name tells its number, so that no two have the same."""
-            made = self.mixed.plan()
-            number = int(made.index[idx])
+            _, number = self.mixed.plan()[idx]
             if not self.mixed.domain(idx):
                 attr: dict[str, Any] = super().get_attr(number)
                 return attr | {"idx": idx}

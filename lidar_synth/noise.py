@@ -17,6 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError
@@ -25,7 +26,7 @@ _ROUNDS = 10
 _MULTIPLIERS = 0xD2511F53, 0xCD9E8D57
 _KEY_STEPS = 0x9E3779B9, 0xBB67AE85
 _WORD = 0xFFFFFFFF
-_GAUSSIAN, _UNIFORM = 0, 1  # streams
+_GAUSSIAN, _UNIFORM, _KEYS = 0, 1, 2  # streams
 
 
 def gaussian(
@@ -110,6 +111,26 @@ def keyed_rng(*key: int) -> np.random.Generator:
         raise ConfigError(f"the key {key} of a generator", "integers, 0 <= k < 2^64")
     # Two words for each, and their number first: numpy's seed sequence takes (1,) and (1, 0) for the same.
     return np.random.default_rng([len(key), *(word for k in key for word in (k & _WORD, k >> 32))])
+
+
+def key_words(seed: int, index: int, count: int) -> NDArray[np.uint64]:
+    """Keys for functions that are keyed themselves, such as permutations.
+
+    Args:
+        seed: 0 <= seed < 2^64.
+        index: 0 <= index < 2^63.
+        count: how many.
+
+    Returns:
+        (count,) random words of 64 bits, independent of ``gaussian`` and ``uniform`` of the same seed and index.
+
+    Raises:
+        ConfigError: on a seed, an index or a count out of range.
+    """
+    words, size = _words(seed, [index], (2 * count,), "cpu", _KEYS)
+    halves = _samples(words, (size,), size, "cpu").numpy().astype(np.uint64)[0]
+    keys: NDArray[np.uint64] = halves[0::2] | halves[1::2] << np.uint64(32)
+    return keys
 
 
 def philox(counter: Tensor, seed: int) -> Tensor:

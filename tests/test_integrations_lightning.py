@@ -1,6 +1,7 @@
 """The Lightning data module in Lightning's own trainer; skipped where it is not installed."""
 
 from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,9 +13,11 @@ import lidar_synth.integrations.lightning as module
 import lightning
 import torch
 from mixtures import Endless, Scans
+from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.mixing import Generated, MixedScans
+from lidar_synth.mixing.state import make_state
 
 REAL = 9
 
@@ -103,6 +106,120 @@ def test_a_checkpoint_of_another_mixture_is_refused() -> None:
     data.load_state_dict(data.state_dict())
     with pytest.raises(ConfigError, match="seed 2"):
         data.load_state_dict({"seed": 2})
+    with pytest.raises(ConfigError, match="ratio 1/4, here 1/2"):
+        module.MixedData(MixedScans(Scans("r", REAL), Endless(), 0.5, seed=1)).load_state_dict(data.state_dict())
+    with pytest.warns(UserWarning, match="without its plan"):
+        data.load_state_dict({"seed": 1})  # as checkpoints were before they told the position
+
+
+class Stop(Exception):
+    """A run that is interrupted."""
+
+
+class Stopping(Model):
+    """Is interrupted in the training step of a batch."""
+
+    def __init__(self, epoch: int, batch: int) -> None:
+        super().__init__()
+        self.stop = (epoch, batch)
+
+    def training_step(self, batch: Any, index: int) -> Any:
+        if (self.current_epoch, index) == self.stop:
+            raise Stop
+        return super().training_step(batch, index)
+
+
+def trainer(root: Path, epochs: int = 3, **options: Any) -> Any:
+    return lightning.Trainer(
+        max_epochs=epochs, accelerator="cpu", logger=False, enable_progress_bar=False, default_root_dir=root,
+        enable_model_summary=False, use_distributed_sampler=False, num_sanity_val_steps=0, **options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("how", ["step", "exception", "epoch"])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_checkpoint_goes_on_after_its_last_batch(workers: int, how: str, tmp_path: Path) -> None:
+    """Taken after a training step, on an exception in the next one, or at an epoch's end."""
+    callbacks = lightning.pytorch.callbacks
+    callback = {
+        "step": callbacks.ModelCheckpoint(tmp_path, "step", every_n_train_steps=1, save_top_k=1, monitor=None),
+        "exception": callbacks.OnExceptionCheckpoint(tmp_path, "exception"),
+        "epoch": callbacks.ModelCheckpoint(tmp_path, "epoch"),
+    }[how]
+
+    def data() -> Any:
+        mixed = MixedScans(Scans("r", 10), Endless(), ratio=0.25, seed=1)  # 14, 13, 13 samples
+        return module.MixedData(mixed, batch_size=3, num_workers=workers)
+
+    whole = Model()
+    trainer(tmp_path, enable_checkpointing=False).fit(whole, data())
+    first = Stopping(1, 2)
+    with pytest.raises(Stop):
+        trainer(tmp_path, callbacks=[callback]).fit(first, data())
+    rest = Model()
+    trainer(tmp_path, enable_checkpointing=False).fit(rest, data(), ckpt_path=tmp_path / f"{how}.ckpt")
+    kept = [sample for sample in first.seen if how != "epoch" or sample[0] == 0]
+    assert kept + rest.seen == whole.seen
+
+
+def test_a_checkpoint_within_an_epoch_needs_steps_of_its_size() -> None:
+    data = module.MixedData(MixedScans(Scans("r", REAL), Endless()), batch_size=2)
+    state = make_state(data.train.mixture, 0, 4) | {"step": 4}
+    data.load_state_dict(state)
+    with pytest.raises(ConfigError, match="4 samples a step, for 2 a step.*from the end of an epoch fits any"):
+        data.train_dataloader()
+    data.load_state_dict(make_state(data.train.mixture, 1, 0) | {"step": 4})
+    data.train_dataloader()
+
+
+def test_epochs_that_grow_are_not_cut_short(tmp_path: Path) -> None:
+    mixed = MixedScans(Scans("r", 8), Endless(), ratio=[0.0, 0.5])
+    data = module.MixedData(mixed, batch_size=4)
+    with pytest.raises(ConfigError, match="epoch 1 of 4 batches, where Lightning counts on 2.*reload_dataloaders"):
+        trainer(tmp_path, 2, enable_checkpointing=False).fit(Model(), data)
+    model = Model()
+    trainer(tmp_path, 2, enable_checkpointing=False, reload_dataloaders_every_n_epochs=1).fit(model, data)
+    assert Counter(epoch for epoch, *_ in model.seen) == {0: 8, 1: 16}
+
+
+class Shared(Model):
+    """Two processes that gather what they were given."""
+
+    def __init__(self, out: Path) -> None:
+        super().__init__()
+        self.out = out
+
+    def on_train_epoch_end(self) -> None:
+        path = self.out / f"{self.current_epoch}-{self.global_rank}.txt"
+        path.write_text("\n".join(name for epoch, _, name in self.seen if epoch == self.current_epoch))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("own", [True, False])
+def test_two_processes_see_every_sample(own: bool, tmp_path: Path) -> None:
+    """With the module's own sharing, and with Lightning's ``DistributedSampler`` over a plain loader."""
+    mixed = MixedScans(Scans("r", 10), Endless(), ratio=0.25, seed=1)
+    data: Any = module.MixedData(mixed, batch_size=3) if own else DataLoader(mixed, 3, collate_fn=mixed.collate)
+    lightning.Trainer(
+        max_epochs=2, accelerator="cpu", devices=2, strategy="ddp_fork", logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=not own,
+    ).fit(Shared(tmp_path), data)  # fmt: skip
+    for epoch in (0, 1):
+        seen = [name for rank in (0, 1) for name in (tmp_path / f"{epoch}-{rank}.txt").read_text().split()]
+        made = mixed.plan(epoch if own else 0)  # nobody tells a plain dataset the epoch
+        wanted = [f"{'s' if d else 'r'}{i}" for d, i in zip(made.domain, made.index, strict=True)]
+        assert sorted(seen) == sorted(wanted)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_lightning_does_not_share_once_more(tmp_path: Path) -> None:
+    data = module.MixedData(MixedScans(Scans("r", 10), Endless()), batch_size=3)
+    both = lightning.Trainer(
+        max_epochs=1, accelerator="cpu", devices=2, strategy="ddp_fork", logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    with pytest.raises(Exception, match="use_distributed_sampler=False"):
+        both.fit(Model(), data)
 
 
 @pytest.mark.parametrize("version", module.STOLEN)

@@ -24,6 +24,7 @@ from lidar_synth.generate.generator import Generator, load_generator
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.mixing import Generated, MixedScans, Sources, make_synthetic
+from lidar_synth.mixing.state import make_state
 from lidar_synth.noise import keyed_rng
 
 WORKERS = [0, 1, 2, 4]
@@ -55,7 +56,7 @@ def test_the_items_of_an_epoch() -> None:
     assert len(train) == 15
     items = [train[i] for i in range(15)]
     assert len({tuple(item) for item in items}) == 1
-    assert sorted(i["id"] for i in items) == sorted([*real, "s0", "s0", "s1", "s1", "s2", "s2"])
+    assert sorted(i["id"] for i in items) == sorted([*real, *(f"s{i}" for i in range(6))])
     for i, item in enumerate(items):
         assert item["domain"] == train.domain(i) == (item["id"][0] == "s")
         if item["domain"] == 0:
@@ -63,10 +64,11 @@ def test_the_items_of_an_epoch() -> None:
             assert item["points"].numpy().tobytes() == np.c_[scan.points, scan.reflectance].tobytes()
             assert np.array_equal(item["label"], scan.label)
             assert np.array_equal(item["confidence"], scan.label != IGNORE)
-    twice = [item["points"] for item in items if item["id"] == "s1"]
-    assert not torch.equal(*twice)  # a scan that is given again is augmented anew
     assert train[-1]["id"] == items[-1]["id"]
     assert [item["id"] for item in train] == [item["id"] for item in items]  # iterating ends
+    train.set_epoch(1)
+    twice = [item["points"] for item in (*items, *train) if item["id"] == "s1"]
+    assert not torch.equal(*twice)  # a scan that is given again is augmented anew
 
 
 def test_what_is_drawn_for_a_sample_follows_from_seed_epoch_and_position() -> None:
@@ -151,7 +153,7 @@ def test_going_on_with_other_ranks_and_workers_gives_the_rest(ranks: int, done: 
             return
         seen += [every[i] for batch in list(sampler)[:done] for i in batch]
         state = sampler.state_dict(done)
-    assert set(state) == {"seed", "epoch", "position"}
+    assert set(state) == {"version", "seed", "epoch", "position", "plan", "mixture"}
     for later in (1, 2, 3):
         rest = []
         for rank in range(later):
@@ -172,17 +174,17 @@ def test_a_state_names_the_next_step_and_then_the_next_epoch() -> None:
     train = mixed()
     sampler = train.batches(4, rank=0, world_size=1)
     drawn = iter(sampler)
-    assert sampler.state_dict() == {"seed": 0, "epoch": 0, "position": 0}
+    assert sampler.state_dict() == make_state(train.mixture, 0, 0)
     next(drawn)
-    assert sampler.state_dict() == {"seed": 0, "epoch": 0, "position": 4}
+    assert sampler.state_dict() == make_state(train.mixture, 0, 4)
     assert len(list(drawn)) == 3
-    assert sampler.state_dict() == {"seed": 0, "epoch": 0, "position": 15}
-    assert sampler.state_dict(4) == {"seed": 0, "epoch": 1, "position": 0}
-    sampler.load_state_dict({"seed": 0, "epoch": 2, "position": 8})
+    assert sampler.state_dict() == make_state(train.mixture, 0, 15)
+    assert sampler.state_dict(4) == make_state(train.mixture, 1, 0)
+    sampler.load_state_dict(make_state(train.mixture, 2, 8))
     assert list(sampler) == [[8, 9, 10, 11], [12, 13, 14]]
-    assert sampler.state_dict() == {"seed": 0, "epoch": 2, "position": 15}
+    assert sampler.state_dict() == make_state(train.mixture, 2, 15)
     train.set_epoch(3)
-    assert sampler.state_dict() == {"seed": 0, "epoch": 3, "position": 0}
+    assert sampler.state_dict() == make_state(train.mixture, 3, 0)
     assert len(sampler) == 4
     assert len(train.batches(4, drop_last=True)) == 3
 

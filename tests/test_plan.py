@@ -1,8 +1,9 @@
 """The plan: exact counts, running indices, and an order that depends on seed and epoch alone."""
 
+import tracemalloc
 from collections import Counter
 from fractions import Fraction
-from math import floor
+from math import ceil
 
 import hypothesis.strategies as st
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import assume, given, settings
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.mixing import Linear, Mixture, Part, Plan, make_schedule, plan
 from lidar_synth.mixing.batches import cut_steps, rank_share
-from lidar_synth.mixing.plan import largest_remainders, quotas, running_counts
+from lidar_synth.mixing.quotas import deal, exact_synthetic, quotas, running_counts, split
 from lidar_synth.mixing.schedules import Schedule, share_of
 
 ENDLESS = Part(None, identity="model")
@@ -30,15 +31,15 @@ def rows(made: Plan) -> list[str]:
 def test_the_order_is_what_it_always_was() -> None:
     """Literally: a run that is resumed with a later version has to find the rest of its epoch."""
     assert [rows(plan(mixture(), epoch)) for epoch in range(3)] == [
-        ["s1", "s0", "r3", "r1", "r0", "r2", "r4", "r5"],
-        ["r3", "r5", "s3", "r0", "r2", "r4", "s2", "r1"],
-        ["r5", "r1", "s5", "r0", "r4", "s4", "r3", "r2"],
+        ["r1", "r5", "r2", "r3", "s0", "s1", "r4", "r0"],
+        ["r2", "r4", "r0", "s3", "r1", "r5", "r3", "s2"],
+        ["r0", "r4", "r3", "r5", "r2", "s4", "r1", "s5"],
     ]
-    assert plan(mixture(), 2).hash == "c56c5efc5e92c95883880be73d6c59cd0ebfcdc6ffe7080d56e2e07c1809c1c7"
-    assert rows(plan(mixture(balanced=True), 0)) == ["r3", "s1", "r1", "r0", "r2", "s0", "r4", "r5"]
+    assert plan(mixture(), 2).hash == "da107b92653538fe9b6b1d5962019e9f6b0890443e66a738e8a9f71af8485751"
+    assert rows(plan(mixture(balanced=True), 0)) == ["s1", "r5", "r3", "r2", "s0", "r1", "r0", "r4"]
     two = Mixture((Part(3), Part(2)), (Part(None), Part(4)), make_schedule(0.5), seed=7, epoch_size="replace")
     made = plan(two, 1)
-    assert list(zip(made.source.tolist(), made.index.tolist(), strict=True)) == [(2, 2), (0, 0), (3, 1), (2, 3), (1, 0)]
+    assert list(zip(made.source.tolist(), made.index.tolist(), strict=True)) == [(2, 2), (1, 1), (0, 2), (3, 1), (0, 1)]
 
 
 @settings(max_examples=60)
@@ -46,17 +47,79 @@ def test_the_order_is_what_it_always_was() -> None:
     real=st.integers(1, 40), hundredths=st.integers(0, 100), seed=st.integers(0, 2**64 - 1),
     epoch=st.integers(0, 10**6), size=st.sampled_from(["add", "replace", 1, 7, 50]), balanced=st.booleans(),
 )  # fmt: skip
-def test_counts_are_exact(real: int, hundredths: int, seed: int, epoch: int, size: str | int, balanced: bool) -> None:
+def test_counts_are_exact_over_epochs(
+    real: int, hundredths: int, seed: int, epoch: int, size: str | int, balanced: bool
+) -> None:
     share = Fraction(hundredths, 100)
     assume(share < 1 or size != "add")
-    made = plan(mixture(real, hundredths / 100, seed=seed, epoch_size=size, balanced=balanced), epoch)
-    synthetic = int(made.domain.sum())
+    mixed = mixture(real, hundredths / 100, seed=seed, epoch_size=size, balanced=balanced)
+    made = plan(mixed, epoch)
+    assert (int(made.domain.sum()), len(made)) == (made.synthetics, sum(made.counts))
     if size == "add":
         assert sorted(made.index[~made.domain]) == list(range(real))
-        assert abs(synthetic - real * share / (1 - share)) <= Fraction(1, 2)
+        exact = real * share / (1 - share)
     else:
         assert len(made) == (real if size == "replace" else size)
-        assert synthetic == floor(len(made) * share + Fraction(1, 2))
+        exact = len(made) * share
+    assert abs(made.synthetics - exact) < 1
+    assert sum(running_counts(mixed, epoch)[1:]) == ceil(epoch * exact)
+
+
+WEIGHTS = st.lists(st.sampled_from([None, 1, 9, 2.5, 100]), min_size=1, max_size=4)
+
+
+@settings(max_examples=40)
+@given(
+    WEIGHTS, WEIGHTS, st.sampled_from([0.01, 0.1, 0.25, 1 / 3, 0.5, 0.8]), st.sampled_from(["replace", 3, 40]),
+    st.booleans(),
+)  # fmt: skip
+def test_every_source_gets_its_share_over_epochs(
+    real: list[float | None], synthetic: list[float | None], ratio: float, size: str | int, balanced: bool
+) -> None:
+    """After any number of epochs, to within one sample; what a plan gives is what is counted."""
+    parts = tuple(Part(3 + i, w) for i, w in enumerate(real)), tuple(Part(None, w) for w in synthetic)
+    mixed = Mixture(*parts, make_schedule(ratio), epoch_size=size, balanced=balanced)  # type: ignore[arg-type]
+    given_so_far = np.zeros(len(real + synthetic), int)
+    exact = Fraction(0)
+    for epoch in range(12):
+        made = plan(mixed, epoch)
+        assert np.bincount(made.source, minlength=len(given_so_far)).tolist() == list(made.counts)
+        given_so_far += made.counts
+        exact += exact_synthetic(mixed, epoch)
+        kinds = (mixed.real_weights, given_so_far[: len(real)]), (mixed.synthetic_weights, given_so_far[len(real) :])
+        assert abs(sum(kinds[1][1]) - exact) < 1
+        for weights, counts in kinds:
+            for weight, count in zip(weights, counts, strict=True):
+                assert abs(count - sum(counts) * weight / sum(weights)) < 1
+
+
+def test_rare_sources_and_small_ratios_get_their_turn() -> None:
+    mixed = Mixture((Part(4),), (Part(None, 9.0), Part(None, 1.0)), make_schedule(0.5))
+    assert running_counts(mixed, 50) == (200, 180, 20)
+    assert [quotas(mixture(4, 0.1), epoch) for epoch in range(5)] == [(4, 1), (4, 0), (4, 1), (4, 0), (4, 1)]
+    assert running_counts(mixture(4, 0.1), 900) == (3600, 400)
+
+
+def test_the_first_epoch_of_one_ratio_is_the_longest() -> None:
+    """A ``DistributedSampler`` or a trainer that asks for the length once never leaves a sample out."""
+    for real in range(1, 30):
+        for ratio in (0.1, 0.25, 1 / 3, 0.37):
+            lengths = [sum(quotas(mixture(real, ratio), epoch)) for epoch in range(12)]
+            assert max(lengths) == lengths[0] <= min(lengths) + 1
+
+
+@settings(max_examples=60)
+@given(st.lists(st.fractions("1/20", 50, max_denominator=20), min_size=1, max_size=9), st.integers(0, 10**12))
+def test_samples_are_dealt_one_by_one(weights: list[Fraction], first: int) -> None:
+    counts = [np.array(split(weights, first + i)) for i in range(20)]
+    sources, numbers = deal(weights, np.arange(first, first + 19))
+    for i, (source, number) in enumerate(zip(sources, numbers, strict=True)):
+        assert counts[i].sum() == first + i
+        assert number == counts[i][source]
+        assert (counts[i + 1] - counts[i]).tolist() == [int(j == source) for j in range(len(weights))]
+    for i, count in enumerate(counts):
+        for weight, own in zip(weights, count, strict=True):
+            assert abs(int(own) - (first + i) * weight / sum(weights)) < (1 if len(weights) <= 4 else 2)
 
 
 @settings(max_examples=30)
@@ -75,35 +138,83 @@ def test_running_indices(real: int, ratio: float, size: str | int) -> None:
         assert max(given_reals.values()) - min(given_reals.values()) <= 1
 
 
-def test_reuse_divides_and_a_bank_begins_again() -> None:
-    counts: Counter[int] = Counter()
-    for epoch in range(4):
-        made = plan(mixture(9, 0.5, reuse=3), epoch)
-        counts.update(made.index[made.domain].tolist())
-    assert counts == dict.fromkeys(range(12), 3)
-    bank = Mixture((Part(6),), (Part(4),), make_schedule(0.5), reuse=2)
+@settings(max_examples=40)
+@given(
+    st.integers(2, 5), st.integers(1, 30), st.sampled_from([0.1, 0.25, 1 / 3, 0.5]), WEIGHTS, st.booleans(),
+    st.sampled_from([False, True]),
+)  # fmt: skip
+def test_reuse_is_spread_over_epochs(
+    reuse: int, real: int, ratio: float, weights: list[float | None], balanced: bool, rising: bool
+) -> None:
+    """No epoch has a scan twice, and in the long run each is given ``reuse`` times."""
+    schedule = make_schedule(Linear(0.0, ratio, 3) if rising else ratio)
+    sources = tuple(Part(None, w) for w in weights)
+    mixed = Mixture((Part(real),), sources, schedule, reuse=reuse, balanced=balanced)
+    counts: Counter[tuple[int, int]] = Counter()
+    for epoch in range(4 * reuse):
+        made = plan(mixed, epoch)
+        here = list(zip(made.source[made.domain].tolist(), made.index[made.domain].tolist(), strict=True))
+        assert len(set(here)) == len(here)
+        counts.update(here)
+    assert max(counts.values(), default=0) <= reuse
+    for source, lap in enumerate(mixed.laps, 1):
+        whole = running_counts(mixed, 4 * reuse)[source] // (reuse * lap) * lap
+        assert all(counts[source, scan] == reuse for scan in range(whole))
+
+
+def test_a_bank_begins_again() -> None:
+    bank = Mixture((Part(6),), (Part(4),), make_schedule(0.4))
     indices = [sorted(plan(bank, e).index[plan(bank, e).domain].tolist()) for e in range(3)]
-    assert indices == [[0, 0, 1, 1, 2, 2], [0, 0, 1, 1, 3, 3], [0, 0, 2, 2, 3, 3]]
+    assert indices == [[0, 1, 2, 3]] * 3
+    few = Mixture((Part(6),), (Part(4),), make_schedule(0.5), reuse=2)
+    indices = [sorted(plan(few, e).index[plan(few, e).domain].tolist()) for e in range(3)]
+    assert indices == [[0, 0, 1, 1, 2, 3], [0, 0, 1, 1, 2, 3], [0, 1, 2, 2, 3, 3]]
 
 
-def test_weights_are_kept_by_largest_remainders() -> None:
-    assert largest_remainders(10, [Fraction(1), Fraction(1), Fraction(1)]) == (4, 3, 3)
-    assert largest_remainders(7, [Fraction(5), Fraction(3), Fraction(1)]) == (4, 2, 1)
-    assert largest_remainders(0, []) == ()
+def test_weights_are_kept() -> None:
+    assert split([Fraction(1), Fraction(1), Fraction(1)], 10) == (3, 4, 3)
+    assert split([Fraction(5), Fraction(3), Fraction(1)], 9) == (5, 3, 1)
+    assert split([], 0) == ()
     parts = (Part(10, 1.0), Part(30, 3.0)), (Part(None, 1.0), Part(None, 2.0), Part(5, 1.0))
-    assert quotas(Mixture(*parts, make_schedule(0.4), epoch_size=50), 3) == (8, 22, 5, 10, 5)
+    weighted = Mixture(*parts, make_schedule(0.4), epoch_size=50)
+    assert running_counts(weighted, 4) == (30, 90, 20, 40, 20)
     unweighted = Mixture((Part(10), Part(30)), (ENDLESS, Part(5)), make_schedule(0.4), epoch_size=50)
-    assert quotas(unweighted, 0) == (8, 22, 10, 10)
+    assert running_counts(unweighted, 4) == (30, 90, 40, 40)
 
 
 @settings(max_examples=60)
-@given(st.integers(8, 200), st.fractions(0, 1, max_denominator=20), st.integers(1, 12))
-def test_a_balanced_plan_is_exact_in_every_batch(total: int, share: Fraction, batch: int) -> None:
-    domain = plan(mixture(5, float(share), epoch_size=total, balanced=True), 4).domain
-    for start in range(0, total - batch + 1, batch):
+@given(
+    st.integers(8, 200), st.fractions(0, 1, max_denominator=20), st.integers(1, 12), st.integers(0, 50),
+    st.sampled_from(["add", "replace", "number"]),
+)  # fmt: skip
+def test_a_balanced_plan_is_exact_in_every_batch(
+    total: int, share: Fraction, batch: int, epoch: int, size: str
+) -> None:
+    assume(share < 1 or size != "add")
+    length = total if size == "number" else size
+    domain = plan(mixture(total, float(share), epoch_size=length, balanced=True), epoch).domain
+    for start in range(len(domain) - batch + 1):
         difference = int(domain[start : start + batch].sum()) - batch * share
         assert abs(difference) < 1
         assert (batch * share).denominator > 1 or difference == 0
+
+
+@settings(max_examples=40)
+@given(st.lists(st.integers(1, 9), min_size=2, max_size=4), st.integers(1, 12), st.integers(0, 20))
+def test_a_balanced_plan_spreads_several_synthetic_sources(weights: list[int], batch: int, epoch: int) -> None:
+    sources = tuple(Part(None, float(w)) for w in weights)
+    mixed = Mixture((Part(9),), sources, make_schedule(0.5), epoch_size=120, balanced=True)
+    source = plan(mixed, epoch).source
+    for start in range(120 - batch + 1):
+        for number, weight in enumerate(weights, 1):
+            given_here = int((source[start : start + batch] == number).sum())
+            assert abs(given_here - Fraction(batch * weight, 2 * sum(weights))) < 2 + (len(weights) > 2)
+
+
+def test_equal_synthetic_sources_alternate_in_every_batch() -> None:
+    mixed = Mixture((Part(40),), (ENDLESS, ENDLESS), make_schedule(0.5), balanced=True)
+    batches = plan(mixed, 1).source.reshape(-1, 4)
+    assert [np.bincount(batch, minlength=3).tolist() for batch in batches] == [[2, 1, 1]] * 20
 
 
 SCHEDULES: list[tuple[object, list[float]]] = [
@@ -134,13 +245,15 @@ def test_a_late_epoch_costs_no_more_than_the_first() -> None:
             calls.append(epoch)
             return super().__call__(epoch)
 
-    assert running_counts(mixture(3, Counted(0.0, 0.5, 4)), 10**9) == (3 * 10**9, 1 + 2 + 3 * (10**9 - 3))
-    assert len(calls) < 10
+    mixed = mixture(3, Counted(0.0, 0.5, 4))
+    # 0, 3/5 and 3/2 samples, then 3 an epoch
+    assert running_counts(mixed, 10**9) == (3 * 10**9, ceil(Fraction(21, 10)) + 3 * (10**9 - 3))
+    assert len(calls) < 20
 
 
 def test_a_tenth_is_a_tenth() -> None:
     assert share_of(make_schedule(0.1), 0) == Fraction(1, 10)
-    assert quotas(mixture(1, 0.1, epoch_size=5), 0) == (4, 1)  # half of one counts as one
+    assert running_counts(mixture(1, 0.1, epoch_size=5), 20) == (90, 10)
 
 
 def test_the_hash_tells_plans_apart() -> None:
@@ -213,3 +326,20 @@ def test_synthetic_only_and_real_only() -> None:
     only = Mixture((), (ENDLESS,), make_schedule(1), epoch_size=5)
     assert sorted(plan(only, 1).index.tolist()) == [5, 6, 7, 8, 9]
     assert plan(Mixture((Part(4),), (), make_schedule(0)), 0).domain.tolist() == [False] * 4
+
+
+def test_a_plan_of_any_length_takes_the_same_memory() -> None:
+    tracemalloc.start()
+    try:
+        for balanced in (False, True):
+            mixed = Mixture(
+                (Part(10**8),), (ENDLESS, ENDLESS), make_schedule(0.25), reuse=2, epoch_size=10**8, balanced=balanced
+            )
+            made = plan(mixed, 3)
+            asked = np.random.default_rng(0).integers(0, len(made), 200)
+            found = [made[int(position)] for position in asked]
+            assert found == list(zip(*(x.tolist() for x in made.at(asked)), strict=True))
+            assert len(made.hash) == 64
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()

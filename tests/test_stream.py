@@ -15,6 +15,7 @@ import lidar_synth.mixing.stream as module
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans, MixedStream
+from lidar_synth.mixing.state import make_state
 
 WORKERS = [0, 1, 2, 4]
 
@@ -30,6 +31,11 @@ def mixed(real: int = 9, **options: Any) -> MixedScans:
     return MixedScans(
         Scans("r", real), Endless(), 0.4, to_sample=lambda scan, rng: f"{scan.id}/{rng.random()}", **options
     )
+
+
+def state(epoch: int, position: int) -> dict[str, Any]:
+    """The state at a position of ``mixed()``."""
+    return make_state(mixed().mixture, epoch, position)
 
 
 def sequence(epochs: int = 6) -> list[str]:
@@ -87,8 +93,8 @@ def test_the_last_samples_may_be_left_out() -> None:
 def test_what_is_left_stays_a_batch_of_its_own() -> None:
     given = [MixedStream(mixed(), batch_size=7, endless=False, rank=rank, world_size=2) for rank in range(2)]
     assert [[len(batch) for batch in load(stream, 0)] for stream in given] == [[7, 1], [7]]
-    assert given[0].state_dict(1) == {"seed": 0, "epoch": 0, "position": 14}
-    assert given[0].state_dict(2) == {"seed": 0, "epoch": 1, "position": 0}
+    assert given[0].state_dict(1) == state(0, 14)
+    assert given[0].state_dict(2) == state(1, 0)
 
 
 @pytest.mark.parametrize("endless", [False, True])
@@ -107,7 +113,7 @@ def test_a_state_fits_any_number_of_ranks_and_workers(
         seen += [x for batch in batches for x in batch]
         states.append(stream.state_dict(done))
     assert states == [states[0]] * before[0]
-    assert set(states[0]) == {"seed", "epoch", "position"}
+    assert set(states[0]) == {"version", "seed", "epoch", "position", "plan", "mixture"}
     rest = []
     for rank in range(after[0]):
         stream = MixedStream(mixed(), batch_size=3, endless=endless, rank=rank, world_size=after[0])
@@ -126,30 +132,30 @@ def test_without_workers_the_stream_knows_where_it_is(given: int, endless: bool)
     stream = MixedStream(mixed(), batch_size=4, endless=endless)
     iterator = iter(stream)
     seen = list(islice(iterator, given))
-    state = stream.state_dict()
+    after = stream.state_dict()
     again = MixedStream(mixed(), batch_size=4, endless=endless)
-    again.load_state_dict(state)
+    again.load_state_dict(after)
     assert seen + list(islice(again, 15 - given)) == sequence()[:15]
-    assert ("given" in state) == (given % 4 > 0)
+    assert ("given" in after) == (given % 4 > 0)
 
 
 def test_after_the_end_comes_the_next_epoch() -> None:
     stream = MixedStream(mixed(), batch_size=4, endless=False)
     assert len(list(stream)) == 15
-    assert stream.state_dict(4) == {"seed": 0, "epoch": 1, "position": 0}
-    assert stream.state_dict() == {"seed": 0, "epoch": 0, "position": 15}
+    assert stream.state_dict(4) == state(1, 0)
+    assert stream.state_dict() == state(0, 15)
     assert list(stream) == sequence()[:15]  # until set_epoch says otherwise
-    stream.load_state_dict({"seed": 0, "epoch": 1, "position": 5})
+    stream.load_state_dict(state(1, 5))
     stream.set_epoch(1)
     assert list(stream) == sequence()[20:30]
     stream.scans.set_epoch(2)
-    assert stream.state_dict() == {"seed": 0, "epoch": 2, "position": 0}
+    assert stream.state_dict() == state(2, 0)
     assert list(stream) == sequence()[30:45]
 
 
 def test_an_epochs_end_that_is_loaded_after_the_next_has_begun() -> None:
     """As ``StatefulDataLoader`` does it, which loads when it begins to iterate."""
-    end = {"seed": 0, "epoch": 0, "position": 15}
+    end = state(0, 15)
     for make in (lambda: MixedStream(mixed(), batch_size=4, endless=False), lambda: mixed().batches(4)):
         resumed = make()
         resumed.load_state_dict(end)
@@ -157,7 +163,7 @@ def test_an_epochs_end_that_is_loaded_after_the_next_has_begun() -> None:
         resumed = make()
         resumed.set_epoch(1)
         resumed.load_state_dict(end)
-        assert resumed.state_dict() == {"seed": 0, "epoch": 1, "position": 0}
+        assert resumed.state_dict() == state(1, 0)
         assert len(list(resumed)) == (15 if isinstance(resumed, MixedStream) else 4)
 
 
@@ -166,9 +172,9 @@ def test_a_workers_state_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch
     stream.set_epoch(3)
     monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=1, num_workers=2))
     list(stream)
-    state = stream.state_dict()
+    after = stream.state_dict()
     stream.set_epoch(4)
-    stream.load_state_dict(state)
+    stream.load_state_dict(after)
     assert list(stream) == []
     assert stream.scans.epoch == 4
     assert list(stream) == sequence()[64:68] + sequence()[72:75]
@@ -178,14 +184,14 @@ def test_persistent_workers_hear_of_a_state() -> None:
     stream = MixedStream(mixed(), batch_size=4, endless=False)
     loader = load(stream, 2, persistent_workers=True)
     assert len(list(loader)) == 4
-    stream.load_state_dict({"seed": 0, "epoch": 2, "position": 7})
+    stream.load_state_dict(state(2, 7))
     assert list(loader) == cut(sequence()[37:45], 4)
 
 
 class Worker:
     """A worker as ``StatefulDataLoader`` drives it: a copy of the dataset whose state is taken after each batch."""
 
-    def __init__(self, stream: MixedStream, id: int, workers: int, state: dict[str, int] | None) -> None:
+    def __init__(self, stream: MixedStream, id: int, workers: int, state: dict[str, Any] | None) -> None:
         self.info = SimpleNamespace(id=id, num_workers=workers)
         self.stream = copy.deepcopy(stream)
         with self:
@@ -252,9 +258,9 @@ def test_torchdata(workers: int, done: int, endless: bool) -> None:
     for make in (streamed, sampled):
         loader = make()
         seen = list(islice(loader, done))
-        state = loader.state_dict()
+        after = loader.state_dict()
         again = make()
-        again.load_state_dict(state)
+        again.load_state_dict(after)
         count = 10 - done if endless and make is streamed else None
         total = 40 if count else 15
         assert seen + list(islice(again, count)) == cut(sequence()[:total], 4)
@@ -269,9 +275,9 @@ def test_what_a_stream_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match="the state of seed 3"):
         stream.load_state_dict({"seed": 3, "epoch": 0, "position": 0})
     next(iter(stream))
-    state = stream.state_dict()
+    after = stream.state_dict()
     monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=0, num_workers=2))
-    stream.load_state_dict(state)
+    stream.load_state_dict(after)
     with pytest.raises(ConfigError, match=r"'workers': 1.*'workers': 2.*state_dict\(done=...\)"):
         iter(stream)
 

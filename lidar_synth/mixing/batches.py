@@ -5,21 +5,27 @@ number of ranks and workers that go on with it.
 """
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain
-from typing import Any, Protocol
+from typing import Any, Protocol, overload
 
 from torch.utils.data import Sampler
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.mixing.state import checked_state, place
+from lidar_synth.mixing.epochs import REPEATED, Position
+from lidar_synth.mixing.quotas import Mixture
+from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state, make_state, place
+
+AHEAD = 1 << 20
+"""How many positions a source that works ahead is told at a time."""
 
 
 class Epochs(Protocol):
     """What a batch sampler needs to know of a dataset."""
 
     @property
-    def seed(self) -> int: ...
+    def mixture(self) -> Mixture: ...
 
     @property
     def epoch(self) -> int: ...
@@ -30,12 +36,45 @@ class Epochs(Protocol):
 
     def length(self, epoch: int) -> int: ...
 
-    def __len__(self) -> int: ...
+
+@dataclass(frozen=True)
+class CutSteps(Sequence[range]):
+    """The positions of steps one after another, each computed when it is asked for; see ``cut_steps``.
+
+    Args:
+        start, end: of the positions.
+        size: positions of a step.
+        total: how many steps.
+    """
+
+    start: int
+    end: int
+    size: int
+    total: int
+
+    def __len__(self) -> int:
+        return self.total
+
+    @overload
+    def __getitem__(self, number: int) -> range: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> Sequence[range]: ...
+
+    def __getitem__(self, number: int | slice) -> range | Sequence[range]:
+        """The positions of a step; the last one takes what is left, also more than its size."""
+        if isinstance(number, slice):
+            return [self[i] for i in range(*number.indices(self.total))]
+        if not -self.total <= number < self.total:
+            raise IndexError(f"step {number} of {self.total}")
+        number %= self.total
+        start = self.start + number * self.size
+        return range(start, self.end if number == self.total - 1 else start + self.size)
 
 
 def cut_steps(
     start: int, end: int, batch_size: int, world_size: int = 1, drop_last: bool = False, join: bool = True
-) -> list[range]:
+) -> CutSteps:
     """The positions start .. end - 1 in steps of all ranks together.
 
     Each step holds ``batch_size`` samples for each rank; what is left at the end makes a smaller step, or, where that
@@ -43,14 +82,11 @@ def cut_steps(
     them waits for ever for another. With ``drop_last`` what is left is left out; without ``join`` it joins nothing.
     """
     size = batch_size * world_size
-    whole = max(end - start, 0) // size
-    steps = [range(start + i * size, start + (i + 1) * size) for i in range(whole)]
-    rest = range(start + whole * size, end)
-    if drop_last or not rest:
-        return steps
-    if join and steps and len(rest) < world_size:
-        return [*steps[:-1], range(steps[-1].start, end)]
-    return [*steps, rest]
+    whole, rest = divmod(max(end - start, 0), size)
+    if drop_last:
+        return CutSteps(start, start + whole * size, size, whole)
+    joins = join and whole > 0 and rest < world_size
+    return CutSteps(start, end, size, whole + (rest > 0 and not joins))
 
 
 def rank_share(step: range, rank: int, world_size: int) -> range:
@@ -74,8 +110,9 @@ def go_to(dataset: Epochs, epoch: int, position: int) -> None:
 class MixedBatches(Sampler[list[int]]):
     """A batch sampler along the plan, for one rank or several, that can go on from any step.
 
-    Give it to a ``DataLoader`` as ``batch_sampler``. Over all ranks every position is given once. Where a library
-    divides batch samplers among ranks itself (Accelerate's ``prepare``), use ``rank=0, world_size=1``.
+    Give it to a ``DataLoader`` as ``batch_sampler``. Over all ranks every position is given once. Its positions carry
+    the epoch in which iterating began, so that ``set_epoch`` may come at any time: it counts from the next pass on.
+    Where a library divides batch samplers among ranks itself (Accelerate's ``prepare``), use ``rank=0, world_size=1``.
 
     Args:
         dataset: a ``MixedScans``.
@@ -84,7 +121,8 @@ class MixedBatches(Sampler[list[int]]):
         drop_last: leave out what does not fill a batch on every rank.
 
     Raises:
-        ConfigError: on a batch size below 1 or a rank out of range.
+        ConfigError: on a batch size below 1 or a rank out of range; on iterating with ranks by default where an
+            ``Accelerator`` is set up for several processes.
     """
 
     def __init__(
@@ -100,29 +138,33 @@ class MixedBatches(Sampler[list[int]]):
             raise ConfigError(f"batch_size={batch_size}", "at least 1")
         self.dataset, self.batch_size, self.drop_last = dataset, batch_size, drop_last
         self.rank, self.world_size = place(rank, world_size)
+        self._by_default = rank is None
         self._start = (0, 0)  # epoch and position where a state said to go on
         self._drawn = (0, 0)  # epoch, and batches taken of it
+        self._passed: tuple[int, int] | None = None  # epoch and position where the latest whole pass began
+        self._warned = False
 
     def __len__(self) -> int:
         """Batches that iterating gives."""
+        self._check()
         return len(self._steps())
 
     def __iter__(self) -> Iterator[list[int]]:
+        self._check()
         steps, epoch = self._steps(), self.dataset.epoch
         if steps and len(steps[-1]) < self.world_size:
             warnings.warn(f"{len(steps[-1])} samples left for {self.world_size} ranks: some get none", stacklevel=2)
-        shares = [rank_share(step, self.rank, self.world_size) for step in steps]
-        self.dataset.expect(epoch, chain.from_iterable(shares))
-        for number, share in enumerate(filter(len, shares), 1):
-            self._drawn = (epoch, number)
-            yield list(share)
+        if self._passed == (epoch, steps.start) and not self._warned:
+            self._warned = True
+            warnings.warn(REPEATED.format(epoch), stacklevel=2)
+        return self._batches(epoch, steps)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch, before iterating; see ``MixedScans.set_epoch``."""
         self.dataset.set_epoch(epoch)
 
-    def state_dict(self, done: int | None = None) -> dict[str, int]:
-        """{seed, epoch, position}: where to go on, whatever the number of ranks and workers then.
+    def state_dict(self, done: int | None = None) -> dict[str, Any]:
+        """Where to go on, whatever the number of ranks and workers then; see ``lidar_synth.mixing.state``.
 
         Args:
             done: batches that this rank has trained on since it began to iterate. By default those that were taken
@@ -140,21 +182,39 @@ class MixedBatches(Sampler[list[int]]):
             position = steps[number].start
         elif done is None:
             # Not the next epoch yet: whoever resumes here still has to see this one end.
-            position = len(self.dataset)
+            position = self.dataset.length(epoch)
         else:
-            epoch, position = epoch + 1, 0
-        return {"seed": self.dataset.seed, "epoch": epoch, "position": position}
+            epoch, position = after_epoch(self.dataset.mixture, epoch)
+        return make_state(self.dataset.mixture, epoch, position)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on where a state says; the dataset's epoch is set too. Another epoch begins at its beginning.
 
         Raises:
-            ConfigError: on a state that is none, or another seed's.
+            ConfigError: on a state that is none, or of another mixture.
         """
-        self._start = checked_state(state, self.dataset.seed)
-        self._drawn = (0, 0)
+        self._start = checked_state(state, self.dataset.mixture)
+        self._drawn, self._passed = (0, 0), None
         go_to(self.dataset, *self._start)
 
-    def _steps(self) -> list[range]:
-        start = self._start[1] if self._start[0] == self.dataset.epoch else 0
-        return cut_steps(start, len(self.dataset), self.batch_size, self.world_size, self.drop_last)
+    def _batches(self, epoch: int, steps: CutSteps) -> Iterator[list[int]]:
+        told, number = 0, 0
+        for done, step in enumerate(steps):
+            if done * steps.size >= told:
+                rest = (rank_share(steps[i], self.rank, self.world_size) for i in range(done, len(steps)))
+                self.dataset.expect(epoch, chain.from_iterable(rest))
+                told = done * steps.size + AHEAD * self.world_size // 2
+            if share := rank_share(step, self.rank, self.world_size):
+                number += 1
+                self._drawn = (epoch, number)
+                yield [Position(position, epoch) for position in share]
+        self._passed = (epoch, steps.start)
+
+    def _check(self) -> None:
+        if self._by_default:
+            check_unshared("train.batches(...)", self.rank, self.world_size)
+
+    def _steps(self) -> CutSteps:
+        epoch = self.dataset.epoch
+        start = self._start[1] if self._start[0] == epoch else 0
+        return cut_steps(start, self.dataset.length(epoch), self.batch_size, self.world_size, self.drop_last)

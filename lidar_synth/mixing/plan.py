@@ -1,138 +1,43 @@
 """Which sample stands where: the plan of an epoch as a pure function of the mixture and the epoch.
 
-Nothing is drawn at random along the way. Quotas are exact (Hamilton's method of largest remainders) and the order is
-a permutation keyed by (seed, epoch), so that workers, ranks, batch size and resumption cannot change what is given.
+Nothing is drawn at random along the way and nothing is stored: what stands at a position is computed from the position,
+so that a plan of any length takes the same memory, and workers, ranks, batch size and resumption cannot change it.
 
-Two running counts over the epochs make local indices. Real scans follow one another through endless permutations of
-their source: after any number of epochs each was given equally often, up to one. Synthetic scans are counted up, so
-that they are fresh; with ``reuse = k``, ``k`` counts in a row fall on one scan.
+A position leads to a *rank* by an order keyed by (seed, epoch); ranks are divided among the sources in turn, by their
+quotas (quotas.py). Within its source, a sample's running number counts over all epochs. Real scans follow one another
+through endless permutations of their source: after any number of epochs each was given equally often, up to one.
+Synthetic scans are counted up, so that they are fresh. With ``reuse = k`` they come in laps, as long as an epoch at its
+most, and every lap is given k times before the next: the k times fall into k epochs.
 """
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
-from math import floor
-from typing import Literal
+from functools import cached_property
+from math import ceil, floor
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.mixing.schedules import Schedule, settled, share_of
-from lidar_synth.noise import uniform
+from lidar_synth.mixing.permutation import permute
+from lidar_synth.mixing.quotas import Mixture, Part, deal, quotas, running_counts, synthetic_before
+from lidar_synth.mixing.schedules import share_of
 
-VERSION = "lidar-synth-plan/1"
+VERSION = "lidar-synth-plan/2"
 """Part of every plan's hash; changes when the same mixture gives another order."""
 
-EpochSize = Literal["add", "replace"] | int
-"""How long an epoch is: ``"add"`` gives every real scan once and adds synthetic ones until the ratio holds;
-``"replace"`` keeps the number of real scans as the length and gives synthetic ones in the place of some; a number is
-the length."""
-
-_DOMAINS, _REALS, _SYNTHETICS, _SOURCES = range(4)  # streams of random numbers; each source has one of its own
-_STREAM = 1 << 48  # what keeps them apart: far more than the epochs of a run
-
-
-@dataclass(frozen=True)
-class Part:
-    """A source of scans as the plan sees it.
-
-    Args:
-        length: how many scans there are; None = endless.
-        weight: its share among the sources of its kind is proportional to this; None = by its length (real) or
-            the same for each (synthetic).
-        identity: what tells it from other sources; goes into the plan's hash.
-    """
-
-    length: int | None
-    weight: float | None = None
-    identity: str = ""
-
-
-@dataclass(frozen=True)
-class Mixture:
-    """What a plan is made of.
-
-    Args:
-        real: sources of real scans.
-        synthetic: sources of synthetic scans.
-        ratio: the share of synthetic samples by epoch.
-        seed: of the order, 0 <= seed < 2^64.
-        epoch_size: see ``EpochSize``.
-        reuse: how often a synthetic scan is given.
-        balanced: spread synthetic samples evenly, so that any B samples in a row hold B times the ratio of them, up
-            to one, and exactly where that is a whole number; otherwise they are shuffled over the epoch.
-
-    Raises:
-        ConfigError: on values that no epoch can be planned with.
-        DataError: on a real source without scans.
-    """
-
-    real: tuple[Part, ...]
-    synthetic: tuple[Part, ...]
-    ratio: Schedule
-    seed: int = 0
-    epoch_size: EpochSize = "add"
-    reuse: int = 1
-    balanced: bool = False
-
-    def __post_init__(self) -> None:
-        size = self.epoch_size
-        if size not in ("add", "replace") and not (isinstance(size, int) and not isinstance(size, bool) and size > 0):
-            raise ConfigError(f"epoch_size={size!r}", "'add', 'replace' or a number of samples")
-        if self.reuse < 1:
-            raise ConfigError(f"reuse={self.reuse}", "how often a synthetic scan is given, at least 1")
-        if not 0 <= self.seed < 2**64:
-            raise ConfigError(f"seed {self.seed}", "0 <= seed < 2^64")
-        for part in self.real + self.synthetic:
-            if part.length == 0:
-                raise DataError(f"a source without scans ({part.identity})", "at least one scan")
-            if part.weight is not None and not 0 < part.weight < float("inf"):
-                raise ConfigError(f"weight {part.weight} of a source", "a positive number")
-        if size == "add" and any(part.weight is not None for part in self.real):
-            raise ConfigError(
-                "weights of real sources with epoch_size='add', which gives every real scan once",
-                "no weights, or another epoch_size",
-                "Use epoch_size='replace' or a number of samples.",
-            )
-        quotas(self, 0)
-
-    @property
-    def real_length(self) -> int:
-        """Scans of all real sources together."""
-        return sum(part.length or 0 for part in self.real)
+_ORDER, _REALS, _SOURCES = range(3)  # streams of the permutations; each source has one of its own
+_BLOCK = 256  # positions that are computed together: most are asked for one after another
+_BLOCKS = 8  # blocks that are kept
 
 
 @dataclass(frozen=True)
 class Plan:
     """An epoch: what stands at each of its N positions.
 
-    Args:
-        source: (N,) int32, number of the source: the real ones in order, then the synthetic ones.
-        index: (N,) int64, local index in that source.
-        reals: how many real sources there are.
-        hash: sha256 of all this and of the sources' identities, in hexadecimal.
-    """
-
-    source: NDArray[np.int32]
-    index: NDArray[np.int64]
-    reals: int
-    hash: str
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    @property
-    def domain(self) -> NDArray[np.bool_]:
-        """(N,) where a synthetic sample stands."""
-        synthetic: NDArray[np.bool_] = self.source >= self.reals
-        return synthetic
-
-
-def plan(mixture: Mixture, epoch: int) -> Plan:
-    """The plan of an epoch.
+    ``plan[position]`` is the number of the source (the real ones in order, then the synthetic ones) and the local index
+    in it. ``plan.at(positions)`` gives both for many at once.
 
     Args:
         mixture: of sources.
@@ -141,124 +46,167 @@ def plan(mixture: Mixture, epoch: int) -> Plan:
     Raises:
         ConfigError: on an epoch for which there is no ratio, or none that the sources can serve.
     """
-    counts, before = quotas(mixture, epoch), running_counts(mixture, epoch)
-    reals, total = len(mixture.real), sum(counts)
-    synthetic = _domains(mixture, epoch, total, sum(counts[reals:]))
-    source, index = np.empty(total, np.int32), np.empty(total, np.int64)
-    for where, first, last, stream in (~synthetic, 0, reals, _REALS), (synthetic, reals, len(counts), _SYNTHETICS):
-        dealt = np.repeat(np.arange(first, last, dtype=np.int32), np.array(counts[first:last], np.int64))
-        source[where] = dealt[_permutation(mixture.seed, stream, epoch, len(dealt))]
-    for number, part in enumerate(mixture.real + mixture.synthetic):
-        numbers = before[number] + np.arange(counts[number], dtype=np.int64)
-        stream = _SOURCES + number
-        if number < reals:
-            local = _through_permutations(mixture.seed, stream, numbers, part.length or 0)
-        else:
-            local = numbers[_permutation(mixture.seed, stream, epoch, len(numbers))] // mixture.reuse
-            local = local if part.length is None else local % part.length
-        index[source == number] = local
-    return Plan(source, index, reals, _hash(mixture, source, index))
+
+    mixture: Mixture
+    epoch: int
+
+    def __post_init__(self) -> None:
+        self.counts  # noqa: B018 - raises where the epoch cannot be planned
+
+    @cached_property
+    def counts(self) -> tuple[int, ...]:
+        """Samples of each source."""
+        return quotas(self.mixture, self.epoch)
+
+    @cached_property
+    def before(self) -> tuple[int, ...]:
+        """Samples of each source in all earlier epochs together."""
+        return running_counts(self.mixture, self.epoch)
+
+    @property
+    def reals(self) -> int:
+        """How many real sources there are."""
+        return len(self.mixture.real)
+
+    @property
+    def synthetics(self) -> int:
+        """How many samples are synthetic."""
+        return sum(self.counts[self.reals :])
+
+    def __len__(self) -> int:
+        return self._total
+
+    def __getitem__(self, position: int) -> tuple[int, int]:
+        """Source and local index.
+
+        Raises:
+            IndexError: where the epoch has no such position.
+        """
+        if not 0 <= position < len(self):
+            raise IndexError(f"position {position} of {len(self)}")
+        block, offset = divmod(int(position), _BLOCK)
+        if (found := self._kept.get(block)) is None:
+            found = self.at(np.arange(block * _BLOCK, min((block + 1) * _BLOCK, len(self))))
+            if len(self._kept) >= _BLOCKS:
+                self._kept.clear()
+            self._kept[block] = found
+        return int(found[0][offset]), int(found[1][offset])
+
+    def at(self, positions: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Sources and local indices of (N,) positions, 0 <= position < length; (N,) each."""
+        rank = self._balanced(positions) if self.mixture.balanced else self._shuffled(positions)
+        source = np.searchsorted(np.cumsum(self.counts), rank, side="right")
+        number = (np.array(self.before, np.int64) - self._starts)[source] + rank
+        index = np.empty_like(number)
+        for each in np.unique(source).tolist():
+            here = source == each
+            index[here] = self._local(each, number[here])
+        return source, index
+
+    @property
+    def source(self) -> NDArray[np.int64]:
+        """(N,) the source of every position; this and the next two are computed when they are asked for."""
+        return self.at(np.arange(len(self)))[0]
+
+    @property
+    def index(self) -> NDArray[np.int64]:
+        """(N,) the local index of every position."""
+        return self.at(np.arange(len(self)))[1]
+
+    @property
+    def domain(self) -> NDArray[np.bool_]:
+        """(N,) where a synthetic sample stands."""
+        synthetic: NDArray[np.bool_] = self.source >= self.reals
+        return synthetic
+
+    @cached_property
+    def facts(self) -> dict[str, Any]:
+        """All that the plan follows from, in values that JSON knows."""
+        mixture = self.mixture
+        return {
+            "order": VERSION,
+            "seed": mixture.seed,
+            "epoch": self.epoch,
+            "ratio": str(share_of(mixture.ratio, self.epoch)),
+            "epoch_size": mixture.epoch_size,
+            "reuse": mixture.reuse,
+            "balanced": mixture.balanced,
+            "real": [_facts_of(part) for part in mixture.real],
+            "synthetic": [_facts_of(part) for part in mixture.synthetic],
+            "samples": list(self.counts),
+            "samples before": list(self.before),
+            "synthetic before": str(synthetic_before(mixture, self.epoch)),
+            "laps": list(mixture.laps) if mixture.reuse > 1 else [],
+        }
+
+    @cached_property
+    def hash(self) -> str:
+        """sha256 of ``facts``, in hexadecimal."""
+        return hashlib.sha256(json.dumps(self.facts, sort_keys=True).encode()).hexdigest()
+
+    @cached_property
+    def _total(self) -> int:
+        return sum(self.counts)
+
+    @cached_property
+    def _starts(self) -> NDArray[np.int64]:
+        """The first rank of each source."""
+        starts: NDArray[np.int64] = np.cumsum((0, *self.counts[:-1]), dtype=np.int64)
+        return starts
+
+    @cached_property
+    def _kept(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        return {}
+
+    def _shuffled(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+        return permute(positions, len(self), self.mixture.seed, _ORDER, self.epoch)
+
+    def _balanced(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Ranks where synthetic samples are spread evenly, and the sources among them."""
+        before, after = self._synthetic_up_to(positions), self._synthetic_up_to(positions + 1)
+        synthetic, seed = after > before, self.mixture.seed
+        rank = np.empty(len(positions), np.int64)
+        real = (positions - before)[~synthetic]
+        rank[~synthetic] = permute(real, len(self) - self.synthetics, seed, _REALS, self.epoch)
+        if synthetic.any():
+            earlier = sum(self.before[self.reals :])
+            source, number = deal(self.mixture.synthetic_weights, before[synthetic] + earlier)
+            dealt = np.empty(len(source), np.int64)
+            for each, start in enumerate(self._starts.tolist()[self.reals :]):
+                here, total = source == each, self.reals + each
+                own = number[here] - self.before[total]
+                dealt[here] = start + permute(own, self.counts[total], seed, _SOURCES + total, self.epoch)
+            rank[synthetic] = dealt
+        return rank
+
+    def _synthetic_up_to(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+        """How many of the first samples of the epoch are synthetic: the exact number over all epochs, rounded up.
+
+        At the epoch's end this is its quota: where n synthetic samples were asked for and n + d given, the exact
+        number there is between those at the epoch's beginning and end, each rounded up with less than 1 to spare.
+        """
+        p, q = share_of(self.mixture.ratio, self.epoch).as_integer_ratio()
+        exact = synthetic_before(self.mixture, self.epoch)
+        ahead = floor((ceil(exact) - exact) * q)  # what was rounded up so far, in units of 1 / q
+        return -((ahead - positions * p) // q)
+
+    def _local(self, source: int, number: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The scans of a source's running numbers."""
+        mixture = self.mixture
+        if source < self.reals:
+            length = mixture.real[source].length or 0
+            return permute(number % length, length, mixture.seed, _SOURCES + source, number // length)
+        part = mixture.synthetic[source - self.reals]
+        if mixture.reuse > 1:
+            lap = mixture.laps[source - self.reals]
+            number = number // (mixture.reuse * lap) * lap + number % lap
+        return number if part.length is None else number % part.length
 
 
-def quotas(mixture: Mixture, epoch: int) -> tuple[int, ...]:
-    """How many samples of each source an epoch gives, real sources first; their sum is its length.
-
-    Raises:
-        ConfigError: where the ratio cannot be kept with these sources.
-        DataError: where there are no real scans to keep it.
-    """
-    share, size = share_of(mixture.ratio, epoch), mixture.epoch_size
-    real = mixture.real_length
-    if share > 0 and not mixture.synthetic:
-        raise ConfigError(f"ratio {float(share):g} in epoch {epoch} without a synthetic source", "one, or ratio 0")
-    if not real and (share < 1 or not isinstance(size, int)):
-        raise DataError(
-            f"no real scans, with ratio {float(share):g} and epoch_size={size!r}",
-            "a real source with scans",
-            "For synthetic scans only, use ratio=1 and give epoch_size the number of samples.",
-        )
-    if size == "add":
-        if share == 1:
-            raise ConfigError(
-                f"ratio 1 in epoch {epoch} with epoch_size='add', which keeps every real scan",
-                "a ratio below 1",
-                "Use epoch_size='replace' or a number of samples.",
-            )
-        lengths = tuple(part.length or 0 for part in mixture.real)
-        return lengths + _shared_out(mixture.synthetic, _rounded(real * share / (1 - share)), _alike)
-    total = real if size == "replace" else int(size)
-    synthetic = _rounded(total * share)
-    by_length = _shared_out(mixture.real, total - synthetic, lambda part: float(part.length or 0))
-    return by_length + _shared_out(mixture.synthetic, synthetic, _alike)
+def plan(mixture: Mixture, epoch: int) -> Plan:
+    """The plan of an epoch; see ``Plan``."""
+    return Plan(mixture, epoch)
 
 
-def running_counts(mixture: Mixture, epoch: int) -> tuple[int, ...]:
-    """How many samples of each source all epochs before this one give together."""
-    same_from = settled(mixture.ratio)
-    changing = epoch if same_from is None else min(epoch, same_from)
-    sums = [0] * len(mixture.real + mixture.synthetic)
-    for earlier in range(changing):
-        sums = [a + b for a, b in zip(sums, quotas(mixture, earlier), strict=True)]
-    if epoch > changing:
-        sums = [a + (epoch - changing) * b for a, b in zip(sums, quotas(mixture, changing), strict=True)]
-    return tuple(sums)
-
-
-def largest_remainders(total: int, weights: Sequence[Fraction]) -> tuple[int, ...]:
-    """Whole numbers in proportion to weights whose sum is ``total``; among equal remainders, the first wins."""
-    exact = [total * w / sum(weights) for w in weights]  # none for no weights
-    counts = [floor(e) for e in exact]
-    by_remainder = sorted(range(len(exact)), key=lambda i: counts[i] - exact[i])
-    for i in by_remainder[: total - sum(counts)]:
-        counts[i] += 1
-    return tuple(counts)
-
-
-def _shared_out(parts: Sequence[Part], total: int, default: Callable[[Part], float]) -> tuple[int, ...]:
-    weights = [part.weight if part.weight is not None else default(part) for part in parts]
-    return largest_remainders(total, [Fraction(repr(float(w))) for w in weights])
-
-
-def _alike(part: Part) -> float:
-    return 1.0
-
-
-def _rounded(value: Fraction) -> int:
-    return floor(value + Fraction(1, 2))
-
-
-def _domains(mixture: Mixture, epoch: int, total: int, synthetic: int) -> NDArray[np.bool_]:
-    """(N,) which positions are synthetic."""
-    if mixture.balanced:
-        # Where the rounded share of the positions so far rises by one.
-        p, q = share_of(mixture.ratio, epoch).as_integer_ratio()
-        so_far = (2 * np.arange(total + 1, dtype=np.int64) * p + q) // (2 * q)
-        return np.diff(so_far) > 0
-    chosen = np.zeros(total, bool)
-    chosen[_permutation(mixture.seed, _DOMAINS, epoch, total)[:synthetic]] = True
-    return chosen
-
-
-def _through_permutations(seed: int, stream: int, numbers: NDArray[np.int64], length: int) -> NDArray[np.int64]:
-    """Where running numbers lead in one permutation of a source after another."""
-    if not len(numbers):
-        return numbers
-    rounds = range(int(numbers[0]) // length, int(numbers[-1]) // length + 1)
-    orders = np.concatenate([_permutation(seed, stream, r, length) for r in rounds])
-    return orders[numbers - rounds[0] * length]
-
-
-def _permutation(seed: int, stream: int, number: int, count: int) -> NDArray[np.int64]:
-    """(count,) an order that follows from the seed, the stream and the number alone, on every machine."""
-    if not count:
-        return np.empty(0, np.int64)
-    keys = uniform(seed, [stream * _STREAM + number], (count,))[0].numpy()
-    return np.argsort(keys, kind="stable")
-
-
-def _hash(mixture: Mixture, source: NDArray[np.int32], index: NDArray[np.int64]) -> str:
-    identities = [part.identity for part in mixture.real + mixture.synthetic]
-    digest = hashlib.sha256(json.dumps([VERSION, mixture.seed, len(mixture.real), identities]).encode())
-    digest.update(source.astype("<i4").tobytes())
-    digest.update(index.astype("<i8").tobytes())
-    return digest.hexdigest()
+def _facts_of(part: Part) -> dict[str, Any]:
+    return {"length": part.length, "weight": part.weight, "identity": part.identity}

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,15 @@ from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.labels import LabelPolicy, make_policy
-from lidar_synth.mixing.batches import MixedBatches
+from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
+from lidar_synth.mixing.epochs import CurrentEpoch, Position
 from lidar_synth.mixing.items import to_item
-from lidar_synth.mixing.plan import EpochSize, Mixture, Part, Plan, plan, quotas
+from lidar_synth.mixing.plan import Plan
+from lidar_synth.mixing.quotas import EpochSize, Mixture, Part
 from lidar_synth.mixing.schedules import Schedule, make_schedule
 from lidar_synth.mixing.sources import check_together, each, identity_of
-from lidar_synth.mixing.state import shared_integers
 from lidar_synth.mixing.synthetic import make_synthetic
 from lidar_synth.noise import keyed_rng
 
@@ -35,7 +37,8 @@ class MixedScans(Dataset[Any]):
 
     What stands where in an epoch is a pure function of the arguments and the epoch (plan.py), already shuffled: go
     through it in order (a ``DataLoader`` without ``shuffle``) or by ``batches``, which also serves several ranks. Any
-    other sampler works too. Call ``set_epoch`` before each epoch; otherwise the same scans come again.
+    other sampler works too. Call ``set_epoch`` before each epoch; otherwise the same scans come again, with a warning.
+    ``set_epoch`` after ``iter(loader)`` raises, but with ``batches``, where it counts from the next pass on.
 
     Args:
         real: indexable source of ``Scan``, or ``Sources`` of several; None with ratio 1.
@@ -47,7 +50,7 @@ class MixedScans(Dataset[Any]):
         label_options: keyword arguments of the label policy.
         epoch_size: ``"add"`` gives every real scan once and adds synthetic ones; ``"replace"`` keeps the number of
             real scans as the length; a number is the length.
-        reuse: how often a synthetic scan is given, each time augmented anew.
+        reuse: how often a synthetic scan is given, in as many epochs, each time augmented anew.
         balanced: spread synthetic samples evenly, so that every batch in order holds its exact share (up to one
             sample where that is no whole number).
         augment: ``(scan, rng) -> scan`` for synthetic scans, after the label policy.
@@ -64,6 +67,7 @@ class MixedScans(Dataset[Any]):
         collate: the ``collate_fn``.
         mixture: the settings that determine the plan.
         real, synthetic: the sources, in the plan's order.
+        current: the epoch that all its processes see.
 
     Raises:
         ConfigError: on a ratio outside [0, 1], sources of different sensors or classes, a policy that a source
@@ -118,7 +122,7 @@ class MixedScans(Dataset[Any]):
         if isinstance(collate, str):
             collate = Collate(collate, sensors[0] if sensors else None, "allow" if labels == "none" else unlabelled)
         self.collate: Callable[[Any], Any] = collate
-        self._epoch = shared_integers(0)
+        self.current = CurrentEpoch()
         self._planned: tuple[int, Plan] | None = None
         self.set_epoch(0)
         if real_as_is and compare:
@@ -180,16 +184,18 @@ class MixedScans(Dataset[Any]):
     @property
     def epoch(self) -> int:
         """The epoch that indexing refers to."""
-        return int(self._epoch)
+        return int(self.current)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch, before a ``DataLoader`` begins to iterate; its workers are told, persistent ones too.
 
+        Where one is iterating already, its next sample raises; those of ``batches`` keep the epoch they began in.
+
         Raises:
             ConfigError: on an epoch for which there is no ratio.
         """
-        quotas(self.mixture, epoch)
-        self._epoch.fill_(epoch)
+        Plan(self.mixture, epoch)
+        self.current.set(epoch)
         if get_worker_info() is None:
             for source in self.synthetic:
                 if hasattr(source, "set_epoch"):
@@ -200,12 +206,12 @@ class MixedScans(Dataset[Any]):
         """The plan of an epoch, by default of the current one; its hash is logged once in the main process."""
         epoch = self.epoch if epoch is None else epoch
         if self._planned is None or self._planned[0] != epoch:
-            self._planned = (epoch, plan(self.mixture, epoch))
+            self._planned = (epoch, Plan(self.mixture, epoch))
             if get_worker_info() is None:
                 made = self._planned[1]
                 log.info(
                     "epoch %d: %d samples, %d of them synthetic, plan %s",
-                    epoch, len(made), int(made.domain.sum()), made.hash[:16],
+                    epoch, len(made), made.synthetics, made.hash[:16],
                 )  # fmt: skip
         return self._planned[1]
 
@@ -214,24 +220,26 @@ class MixedScans(Dataset[Any]):
 
         Args:
             epoch: of the plan.
-            positions: in order; by default all.
+            positions: in order, of which the first ``AHEAD`` count; by default all.
         """
         if any(hasattr(source, "expect") for source in self.synthetic):
             made = self.plan(epoch)
-            asked = np.arange(len(made)) if positions is None else np.fromiter(positions, np.int64)
+            asked = islice(range(len(made)) if positions is None else positions, AHEAD)
+            sources, indices = made.at(np.fromiter(asked, np.int64))
             for number, source in enumerate(self.synthetic, made.reals):
                 if hasattr(source, "expect"):
-                    source.expect(made.index[asked[made.source[asked] == number]].tolist())
+                    source.expect(indices[sources == number].tolist())
 
     def length(self, epoch: int) -> int:
         """Samples of an epoch."""
-        return sum(quotas(self.mixture, epoch))
+        made = self._planned
+        return len(made[1] if made is not None and made[0] == epoch else Plan(self.mixture, epoch))
 
     def __len__(self) -> int:
         return self.length(self.epoch)
 
     def __getitem__(self, index: int) -> Any:
-        epoch = self.epoch
+        epoch = self.epoch_of(index)
         length = len(self.plan(epoch))
         if not -length <= index < length:
             raise IndexError(f"sample {index} of {length}")
@@ -247,13 +255,23 @@ class MixedScans(Dataset[Any]):
             >>> domains.count(0), domains.count(1)
             (3, 3)
         """
-        made = self.plan()
-        return SYNTHETIC if made.source[index] >= made.reals else REAL
+        made = self.plan(index.epoch if isinstance(index, Position) else None)
+        return SYNTHETIC if made[index if index >= 0 else index + len(made)][0] >= made.reals else REAL
+
+    def epoch_of(self, index: int) -> int:
+        """The epoch of an index that is fetched: that in which iterating began.
+
+        For those who fetch scans elsewhere, such as in the main process on a GPU.
+
+        Raises:
+            ConfigError: where another epoch was set since.
+        """
+        return self.current.of(index)
 
     def sample(self, epoch: int, position: int) -> Any:
         """The sample at a position of an epoch, 0 <= position < length; ``self[i]`` is ``sample(epoch, i)``."""
         made = self.plan(epoch)
-        source, index = int(made.source[position]), int(made.index[position])
+        source, index = made[position]
         if source >= made.reals:
             return self.finish(self.synthetic[source - made.reals][index], epoch, position)
         real = self.real[source][index]
@@ -273,7 +291,7 @@ class MixedScans(Dataset[Any]):
         """
         made = self.plan(epoch)
         rng = keyed_rng(self.seed, epoch, position)
-        return self._finish(int(made.source[position]) - made.reals, scan, rng)
+        return self._finish(made[position][0] - made.reals, scan, rng)
 
     def _finish(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
         scan = self._policies[source](scan, rng)

@@ -1,5 +1,6 @@
 """``MixedStream``: the same plan as an ``IterableDataset``, epoch by epoch or endlessly."""
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain, count, islice, takewhile
 from typing import Any
@@ -7,9 +8,10 @@ from typing import Any
 from torch.utils.data import IterableDataset, get_worker_info
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.mixing.batches import cut_steps, go_to, rank_share
+from lidar_synth.mixing.batches import AHEAD, CutSteps, cut_steps, go_to, rank_share
+from lidar_synth.mixing.epochs import check_pass, shared_integers
 from lidar_synth.mixing.scans import MixedScans
-from lidar_synth.mixing.state import checked_state, place, shared_integers
+from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state, make_state, place
 
 
 class MixedStream(IterableDataset[Any]):
@@ -18,7 +20,10 @@ class MixedStream(IterableDataset[Any]):
     Worker w of W yields every W-th batch, so that ``DataLoader(stream, batch_size=B, num_workers=W)`` with the same B
     yields the same batches in the same order for every W. Over all ranks and workers every sample is yielded once.
 
-    The state is {seed, epoch, position} where the batches given so far end. A worker's own state, which torchdata's
+    ``set_epoch`` counts from the next pass on: a pass stays in the epoch in which it began, and where persistent
+    workers cannot tell which one that was, it raises.
+
+    The state (state.py) says where the batches given so far end. A worker's own state, which torchdata's
     ``StatefulDataLoader`` asks for, adds how many samples it has given since, and fits the same ranks and workers only.
 
     Args:
@@ -32,7 +37,8 @@ class MixedStream(IterableDataset[Any]):
         rank, world_size: see ``place``; they have to be known before workers start.
 
     Raises:
-        ConfigError: on a batch size below 1 or a rank out of range.
+        ConfigError: on a batch size below 1 or a rank out of range; on iterating with default ranks where an
+            ``Accelerator`` is set up for several processes.
 
     Example:
         >>> from torch.utils.data import DataLoader
@@ -59,16 +65,19 @@ class MixedStream(IterableDataset[Any]):
         self.scans, self.batch_size, self.endless = scans, batch_size, endless
         self.drop_last, self.collate = drop_last, scans.collate
         self.rank, self.world_size = place(rank, world_size)
+        self._by_default = rank is None
+        self._process = os.getpid()  # that has iterated last
         self._start = shared_integers(0, 0)  # epoch and position where a state said to go on
         self._given = 0  # samples that this process has given since it began to iterate
         self._begun: tuple[int, int] | None = None  # epoch and position where it began
-        self._resume: dict[str, int] = {}  # a state that this process has to go on from
+        self._resume: dict[str, Any] = {}  # a state that this process has to go on from
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch in which iterating begins."""
         self.scans.set_epoch(epoch)
 
     def __iter__(self) -> Iterator[Any]:
+        self._check()
         self._begun = None
         epoch, position, given = self._progress()
         if given and (self._resume | self._place()) != self._resume:
@@ -77,24 +86,34 @@ class MixedStream(IterableDataset[Any]):
                 "the same ranks, workers and batch size",
                 "state_dict(done=...) gives a state that fits any.",
             )
-        self._begun, self._given, self._resume = (epoch, position), given, {}
-        return self._samples(epoch, position)
+        again = self._process == os.getpid() and get_worker_info() is not None
+        self._begun, self._given, self._resume, self._process = (epoch, position), given, {}, os.getpid()
+        self.scans.current.note_pass(epoch)
+        return self._samples(epoch, position, again and not self.endless)
 
-    def _samples(self, begin: int, position: int) -> Iterator[Any]:
+    def _samples(self, begin: int, position: int, guarded: bool) -> Iterator[Any]:
+        """The samples of this process.
+
+        Args:
+            begin, position: where to begin.
+            guarded: a persistent worker's later pass, which may have begun after its ``iter``: refuse another epoch.
+        """
         worker, workers = self._place()["worker"], self._place()["workers"]
         batches = islice(self._batches(begin, position), worker, None, workers)
-        epoch, first, told = begin, -position, None  # number of the epoch's first sample
+        epoch, first, told = begin, -position, 0  # number of the epoch's first sample; where to tell sources again
         for number in islice(chain.from_iterable(batches), self._given, None):
-            while number >= first + len(self.scans.plan(epoch)):
-                epoch, first = epoch + 1, first + len(self.scans.plan(epoch))
-            if worker == 0 and told != epoch:
+            if guarded:
+                check_pass(begin, self.scans.epoch)
+            while number >= (end := first + self.scans.length(epoch)):
+                epoch, first, told = epoch + 1, end, 0
+            if worker == 0 and number >= told:
                 ahead = chain.from_iterable(self._batches(begin, position, number))
-                end, told = first + len(self.scans.plan(epoch)), epoch
                 self.scans.expect(epoch, (n - first for n in takewhile(end.__gt__, ahead) if n >= number))
+                told = min(end, number + AHEAD * self.world_size // 2)
             self._given += 1
             yield self.scans.sample(epoch, number - first)
 
-    def state_dict(self, done: int | None = None) -> dict[str, int]:
+    def state_dict(self, done: int | None = None) -> dict[str, Any]:
         """Where to go on.
 
         Args:
@@ -106,27 +125,27 @@ class MixedStream(IterableDataset[Any]):
             ConfigError: on more batches than there are.
         """
         epoch, position, given = self._progress()
-        state = {"seed": self.scans.seed, "epoch": epoch, "position": position}
         if done is not None:
-            return state | self._after(epoch, position, done)
+            return make_state(self.scans.mixture, *self._after(epoch, position, done))
         done, part = divmod(given, self.batch_size)
         batch = next(self._batches(epoch, position, done * self.batch_size * self.world_size), ())
         if get_worker_info() is not None or part not in (0, len(batch)):
-            return state | self._place() | {"given": given}
-        state |= self._after(epoch, position, done + (part > 0))
-        if not self.endless and state["epoch"] > epoch:
+            return make_state(self.scans.mixture, epoch, position) | self._place() | {"given": given}
+        after = self._after(epoch, position, done + (part > 0))
+        if not self.endless and after[0] > epoch:
             # Not the next epoch yet: whoever resumes here still has to see this one end.
-            state |= {"epoch": epoch, "position": self.scans.length(epoch)}
-        return state
+            after = epoch, self.scans.length(epoch)
+        return make_state(self.scans.mixture, *after)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on where a state says.
 
         Raises:
-            ConfigError: on a state that is none, or another seed's.
+            ConfigError: on a state that is none, or of another mixture.
         """
-        epoch, position = checked_state(state, self.scans.seed)
-        self._begun, self._resume = None, dict(state)
+        epoch, position = checked_state(state, self.scans.mixture)
+        self._begun, self._resume = None, {k: v for k, v in state.items() if k not in ("plan", "mixture")}
+        self.scans.current.forget_pass()
         if get_worker_info() is None:
             # A worker keeps its state to itself: what is shared, the main process may have changed since.
             self._start[0], self._start[1] = epoch, position
@@ -139,7 +158,9 @@ class MixedStream(IterableDataset[Any]):
             return *self._begun, self._given
         if in_worker and self._resume:
             return self._resume["epoch"], self._resume["position"], self._resume.get("given", 0)
-        epoch = self.scans.epoch
+        # A worker that has just started begins where the main process stood at its iter(loader).
+        started = in_worker and self._process != os.getpid()
+        epoch = self.scans.current.at_start if started else self.scans.epoch
         position = int(self._start[1]) if int(self._start[0]) == epoch else 0
         return epoch, position, self._resume.get("given", 0) if self._resume.get("epoch") == epoch else 0
 
@@ -159,22 +180,30 @@ class MixedStream(IterableDataset[Any]):
         size = self.batch_size * self.world_size
         steps: Iterable[range] = (range(i * size, (i + 1) * size) for i in count(since // size))
         if not self.endless:
-            steps = self._steps(0, self.scans.length(epoch) - position)[since // size :]
+            cut = self._steps(0, self.scans.length(epoch) - position)
+            steps = (cut[i] for i in range(since // size, len(cut)))
         return (rank_share(step, self.rank, self.world_size) for step in steps)
 
-    def _steps(self, start: int, end: int) -> list[range]:
+    def _check(self) -> None:
+        if self._by_default:
+            check_unshared("MixedStream(...)", self.rank, self.world_size)
+
+    def __getstate__(self) -> dict[str, Any]:
+        self._check()  # workers that are spawned do not see the Accelerator
+        return self.__dict__
+
+    def _steps(self, start: int, end: int) -> CutSteps:
         # A loader cuts batches of its own size, so what is left has to stay a batch of its own.
         return cut_steps(start, end, self.batch_size, self.world_size, self.drop_last, join=False)
 
-    def _after(self, epoch: int, position: int, done: int) -> dict[str, int]:
+    def _after(self, epoch: int, position: int, done: int) -> tuple[int, int]:
         """The epoch and position after a number of batches."""
         if not self.endless:
             steps = self._steps(position, self.scans.length(epoch))
             if not 0 <= done <= len(steps):
                 raise ConfigError(f"{done} batches done of {len(steps)}", "a number of batches of this epoch")
-            last = done == len(steps)
-            return {"epoch": epoch + last, "position": 0 if last else steps[done].start}
+            return (epoch, steps[done].start) if done < len(steps) else after_epoch(self.scans.mixture, epoch)
         position += done * self.batch_size * self.world_size
         while position >= (length := self.scans.length(epoch)):
             epoch, position = epoch + 1, position - length
-        return {"epoch": epoch, "position": position}
+        return epoch, position

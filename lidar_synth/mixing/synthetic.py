@@ -53,7 +53,7 @@ class Generated:
         condition: for a conditional model, an indexable source of conditions, such as the real scans. Scan n is
             conditioned on entry n modulo the source's length; ``Generator.range_images`` lists the kinds of entries.
         cache: number of latest scans that each process keeps in memory (about 1 MB each at 64 x 1024), which saves
-            time if a process accesses a scan again (``reuse``).
+            time if a process accesses a scan again: with ``reuse``, an epoch later.
         sampling: steps, solver and guidance, as for ``Generator.scans``.
 
     Raises:

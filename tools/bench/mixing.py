@@ -11,6 +11,7 @@ not count; caches of the file system are warm.
 import argparse
 import tempfile
 import time
+import tracemalloc
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -84,6 +85,24 @@ def print_rates(title: str, samples: int, seconds: dict[str, float], base: str) 
         print(f"| {name} | {samples / value:.1f} | {seconds[base] / value:.1%} |")
 
 
+def print_long_plan(bank: Bank, samples: int = 10**8) -> None:
+    """A Markdown line: how long a plan takes to its first batch, and the most memory that Python held meanwhile."""
+    start = time.perf_counter()
+    train = MixedScans.wrap(range(samples * 3 // 4), bank, 0.25, to_sample=to_item)
+    next(iter(train.batches(BATCH)))
+    train.plan()[samples // 2]
+    seconds = time.perf_counter() - start
+    tracemalloc.start()
+    train.set_epoch(1)
+    next(iter(train.batches(BATCH)))
+    train.plan()[samples // 2]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    print(
+        f"\nA plan of {len(train):,} samples: {1e3 * seconds:.0f} ms to the first batch, {peak / 2**20:.2f} MiB at most"
+    )
+
+
 def main() -> None:
     """Times everything in turns and prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -100,6 +119,7 @@ def main() -> None:
         else:
             real = write_dataset(Path(folder) / "real", made[: arguments.scans])
         bank = write_bank(Path(folder) / "bank", made[arguments.scans :])
+        print_long_plan(bank)
         points = sum(len(scan) for scan in real) / len(real)
         print(f"{len(real)} real scans of {points:,.0f} points each")
 

@@ -121,9 +121,9 @@ class _Others(Dataset[Place]):
         return len(self._dataset)
 
     def __getitem__(self, position: int) -> Place:
-        epoch = self._dataset.epoch
+        epoch = self._dataset.epoch_of(position)
         made = self._dataset.plan(epoch)
-        source, index = int(made.source[position]) - made.reals, int(made.index[position])
-        if source >= 0 and self._dataset.synthetic[source] is None:
-            return Place(epoch, position, (source, index))
+        source, index = made[position]
+        if source >= made.reals and self._dataset.synthetic[source - made.reals] is None:
+            return Place(epoch, position, (source - made.reals, index))
         return Place(epoch, position, sample=self._dataset.sample(epoch, position))

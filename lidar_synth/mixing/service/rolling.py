@@ -45,8 +45,8 @@ class RollingBank:
         model: the name of a shipped model or the path of a checkpoint; the model must be unconditional.
         seed: of the scans, 0 <= seed < 2^64.
         slots: number of scans in shared memory, 3 to 5 bytes per cell each. It should exceed what all workers request
-            in advance: workers x ``prefetch_factor`` x batch size x ratio. A scan that is needed several times
-            (``reuse``) stays in memory only while there is room.
+            in advance: workers x ``prefetch_factor`` x batch size x ratio. A scan that comes again in the next epoch
+            (the plan's ``reuse``) is kept until then if there is room for an epoch's scans, and made again otherwise.
         starved: what happens on a request for a scan that is not ready: ``"wait"`` for it, or ``"reuse"`` the scan in
             memory that was served least often.
         refresh: share in (0, 1]; None = off. The bank keeps a pool of scans and replaces this share of it with each

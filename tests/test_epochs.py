@@ -1,0 +1,248 @@
+"""What is fetched belongs to the epoch in which iterating began, or it raises; repeated epochs are said once."""
+
+import copy
+import pickle
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any
+
+import pytest
+from mixtures import Endless, Scans
+from torch.utils.data import DataLoader, DistributedSampler, RandomSampler, Subset
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.mixing import MixedScans, MixedStream
+from lidar_synth.mixing.epochs import Position
+
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
+
+REAL = 200
+LATE = r"set_epoch\(1\) while a DataLoader was going through epoch 0.*before iter.*batch_sampler=train.batches"
+
+
+def mixed(real: int = REAL, ratio: Any = 0.25, **options: Any) -> MixedScans:
+    scans = Scans("r", 1) * real
+    return MixedScans.wrap([f"r{i}" for i in range(len(scans))], Endless(), ratio, to_sample=name, **options)
+
+
+def name(scan: Any, rng: Any) -> str:
+    return str(scan.id)
+
+
+def planned(train: MixedScans, epoch: int) -> list[str]:
+    made = train.plan(epoch)
+    return [f"{'s' if d else 'r'}{i}" for d, i in zip(made.domain, made.index, strict=True)]
+
+
+def samples(batches: Any) -> list[str]:
+    return [sample for batch in batches for sample in batch]
+
+
+def refused(iterator: Any, message: str, *, last: bool = True) -> None:
+    """Going on raises; torch would then wait 5 s for each worker to end by itself."""
+    with pytest.raises(ConfigError, match=message):
+        list(iterator)
+    for worker in getattr(iterator, "_workers", ()) if last else ():
+        worker.terminate()
+
+
+def samplers(train: MixedScans) -> dict[str, dict[str, Any]]:
+    """Ways to go through it that do not carry the epoch."""
+    return {
+        "in order": {"batch_size": 4},
+        "shuffled": {"batch_size": 4, "shuffle": True},
+        "distributed": {"batch_size": 4, "sampler": DistributedSampler(train, 1, 0)},
+        "random": {"batch_size": 4, "sampler": RandomSampler(train)},
+    }
+
+
+@pytest.mark.parametrize("persistent", [False, True])
+@pytest.mark.parametrize("way", ["in order", "shuffled", "distributed", "random"])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_epoch_that_is_set_after_iter_raises(workers: int, way: str, persistent: bool) -> None:
+    """In the first pass, and in a later one of persistent workers."""
+    train = mixed()
+    loader = DataLoader(
+        train, num_workers=workers, collate_fn=list, persistent_workers=persistent and workers > 0,
+        **samplers(train)[way],
+    )  # fmt: skip
+    iterator = iter(loader)
+    next(iterator)
+    train.set_epoch(1)
+    refused(iterator, LATE, last=not loader.persistent_workers)
+    assert sorted(samples(loader)) == sorted(planned(train, 1))  # set in time now
+    iterator = iter(loader)
+    next(iterator)
+    train.set_epoch(2)
+    refused(iterator, r"set_epoch\(2\) while .* epoch 1")
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_hook_at_the_beginning_of_an_epoch(workers: int) -> None:
+    """As trainers call it: after ``iter``, before the first batch. Workers have begun to fetch."""
+    train = mixed()
+    iterator = iter(DataLoader(train, 4, num_workers=workers, collate_fn=list))
+    time.sleep(0.3 * (workers > 0))
+    train.set_epoch(1)
+    if workers:
+        refused(iterator, LATE)
+    else:
+        assert samples(iterator) == planned(train, 1)
+
+
+@pytest.mark.parametrize("persistent", [False, True])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_batches_keep_the_epoch_in_which_iterating_began(workers: int, persistent: bool) -> None:
+    train = mixed()
+    batches = train.batches(4)
+    loader = DataLoader(
+        train,
+        batch_sampler=batches,
+        num_workers=workers,
+        collate_fn=list,
+        persistent_workers=persistent and workers > 0,
+    )
+    for epoch in range(3):
+        iterator = iter(loader)
+        train.set_epoch(epoch + 1)
+        first = next(iterator)
+        batches.set_epoch(epoch + 1)
+        assert first + samples(iterator) == planned(train, epoch)
+
+
+def test_what_takes_the_epoch_from_a_position_is_still_guarded() -> None:
+    train = mixed()
+    subset = Subset(train, list(range(len(train))))  # indexes its own list
+    iterator = iter(DataLoader(subset, 4, collate_fn=list))
+    next(iterator)
+    train.set_epoch(1)
+    refused(iterator, LATE)
+
+
+@pytest.mark.parametrize("endless", [False, True])
+@pytest.mark.parametrize("workers", [0, 1, 2])
+def test_a_stream_keeps_the_epoch_in_which_iterating_began(workers: int, endless: bool) -> None:
+    train = mixed(40)
+    stream = MixedStream(train, batch_size=4, endless=endless)
+    stream.set_epoch(3)
+    iterator: Any = iter(DataLoader(stream, 4, num_workers=workers, collate_fn=list))
+    stream.set_epoch(5)
+    assert samples(islice(iterator, 10)) == planned(train, 3)[:40]
+    for worker in getattr(iterator, "_workers", ()):  # torch would wait for those of an endless stream
+        worker.terminate()
+
+
+def test_a_streams_persistent_workers_keep_it_or_raise() -> None:
+    train = mixed(40)
+    stream = MixedStream(train, batch_size=4, endless=False)
+    loader = DataLoader(stream, 4, num_workers=2, collate_fn=list, persistent_workers=True)
+    assert samples(loader) == planned(train, 0)
+    stream.set_epoch(1)
+    iterator = iter(loader)
+    next(iterator)
+    stream.set_epoch(2)
+    refused(iterator, r"set_epoch\(2\) while .* epoch 1")
+
+
+def test_indexing_by_hand_takes_the_epoch_that_is_set() -> None:
+    train = mixed(9)
+    assert [train[i] for i in range(len(train))] == planned(train, 0)
+    train.set_epoch(1)
+    assert [train[i] for i in range(len(train))] == planned(train, 1)
+    assert train[Position(2, 0)] == planned(train, 0)[2]
+    assert train.domain(Position(2, 0)) == int(planned(train, 0)[2][0] == "s")
+
+
+def test_a_position_survives_copies_and_is_an_integer() -> None:
+    position = Position(5, 3)
+    for copied in (pickle.loads(pickle.dumps(position)), copy.deepcopy(position)):
+        assert (copied, copied.epoch, type(copied)) == (5, 3, Position)
+    assert [10, 11, 12, 13, 14, 15][position] == 15
+
+
+@pytest.fixture
+def caught() -> Iterator[list[warnings.WarningMessage]]:
+    with warnings.catch_warnings(record=True) as messages:
+        warnings.simplefilter("always")
+        yield messages
+
+
+AGAIN = "epoch 0 begins once more"
+
+
+def test_an_epoch_that_comes_again_is_said_once(caught: list[warnings.WarningMessage]) -> None:
+    for carried in (False, True):
+        train = mixed(9)
+        how: dict[str, Any] = {"batch_sampler": train.batches(4)} if carried else {"batch_size": 4}
+        loader = DataLoader(train, collate_fn=list, **how)
+        [train[i] for i in range(3)]  # a look at some samples is no pass
+        list(loader)
+        assert not caught
+        list(loader)
+        list(loader)
+        assert [str(w.message)[: len(AGAIN)] for w in caught] == [AGAIN]
+        caught.clear()
+        for epoch in range(1, 4):
+            train.set_epoch(epoch)
+            list(loader)
+        assert not caught
+
+
+def show_warnings(worker: int) -> None:
+    """As outside of pytest, which keeps them to itself."""
+    warnings.showwarning = lambda message, *_: print(message, file=sys.stderr, flush=True)  # type: ignore[assignment]
+
+
+def test_workers_say_that_an_epoch_comes_again(capfd: pytest.CaptureFixture[str]) -> None:
+    loader = DataLoader(mixed(20), 4, num_workers=2, collate_fn=list, worker_init_fn=show_warnings)
+    list(loader)
+    assert AGAIN not in capfd.readouterr().err
+    list(loader)
+    list(loader)
+    assert capfd.readouterr().err.count(AGAIN) == 1
+
+
+def test_resuming_in_an_epoch_is_no_repetition(caught: list[warnings.WarningMessage]) -> None:
+    for make in (lambda: mixed(9).batches(4), lambda: MixedStream(mixed(9), batch_size=4, endless=False)):
+        whole = make()
+        list(whole)
+        state = whole.state_dict(1)
+        whole.load_state_dict(state)
+        list(whole)
+        assert not caught
+        list(whole)
+        assert [str(w.message)[: len(AGAIN)] for w in caught] == [AGAIN]
+        caught.clear()
+
+
+@pytest.mark.parametrize("shuffle", [False, True])
+def test_a_distributed_sampler_sees_every_sample(shuffle: bool) -> None:
+    """Made once, in the first epoch: of one ratio that is the longest, so that later ones fit."""
+    train = mixed(10)
+    ranks = [DistributedSampler(train, 2, rank, shuffle=shuffle) for rank in range(2)]
+    lengths = set()
+    for epoch in range(4):
+        train.set_epoch(epoch)
+        seen = []
+        for sampler in ranks:
+            sampler.set_epoch(epoch)
+            seen += samples(DataLoader(train, 4, sampler=sampler, num_workers=1, collate_fn=list))
+        assert set(seen) == set(planned(train, epoch))
+        assert len(seen) - len(train) in (0, 1)  # what it adds to be even
+        lengths.add(len(train))
+    assert lengths == {13, 14}
+
+
+def test_a_long_plan_starts_at_once() -> None:
+    """No list of all positions, steps or scans is made on the way to the first batch."""
+    train = MixedScans.wrap(range(75_000_000), Endless(), 0.25, to_sample=name)
+    assert len(train) == 10**8
+    loader = DataLoader(train, batch_sampler=train.batches(8), collate_fn=list)
+    assert len(loader) == 10**8 // 8
+    assert len(next(iter(loader))) == 8
+    stream = MixedStream(train, batch_size=8, endless=False)
+    stream.load_state_dict(train.batches(8).state_dict(12_499_999))
+    assert len(list(stream)) == 8
