@@ -53,7 +53,8 @@ class ShardReader:
         entry: Entry | None = None,
     ) -> None:
         self.name = name
-        self._file = _open(file, name)
+        self._handle = _open_plain(file, name) if isinstance(file, Path) else file
+        self._file = _open(self._handle, name)
         try:
             self._read_facts(facts, entry)
             self._read_datasets()
@@ -91,6 +92,7 @@ class ShardReader:
         """Close the file."""
         with suppress(OSError, RuntimeError):
             self._file.close()
+        self._handle.close()
 
     def __enter__(self) -> "ShardReader":
         return self
@@ -152,18 +154,23 @@ class ShardReader:
             raise DataError(f"{self.name}: {what} cannot be read ({error})", "a whole shard", REPAIR) from error
 
 
-def _open(file: Path | BinaryIO, name: str) -> h5py.File:
-    # A chunk is a whole scan and read once: a cache would only cost memory, in every worker.
-    options: dict[str, Any] = {"rdcc_nbytes": 0}
-    if isinstance(file, Path):
-        options["locking"] = False  # nothing is ever written into a shard that is in its place
-        try:
-            with file.open("rb"):
-                pass  # HDF5's own message does not say why it cannot open
-        except OSError as error:
-            reason = error.strerror or error
-            raise FileError(f"shard {name} cannot be read ({reason})", "a shard of the bank", REPAIR) from error
+def _open_plain(path: Path, name: str) -> BinaryIO:
+    """A shard on disk, for HDF5 to read through Python.
+
+    By its path HDF5 would open a file once for the whole process, and refuse to do so with other settings than those of
+    whoever has it open already, plain h5py for instance.
+    """
     try:
-        return h5py.File(file, "r", **options)
+        return path.open("rb", buffering=0)
+    except OSError as error:
+        reason = error.strerror or error
+        raise FileError(f"shard {name} cannot be read ({reason})", "a shard of the bank", REPAIR) from error
+
+
+def _open(file: BinaryIO, name: str) -> h5py.File:
+    try:
+        # A chunk is a whole scan and read once: a cache would only cost memory, in every worker.
+        return h5py.File(file, "r", rdcc_nbytes=0)
     except (OSError, RuntimeError) as error:
+        file.close()
         raise DataError(f"{name} is cut, damaged or no HDF5 file ({error})", f"a shard of {FORMAT}", REPAIR) from error
