@@ -183,7 +183,7 @@ class Index:
     shards: tuple[Entry, ...]
     repairs: tuple[str, ...] = ()
     curation: tuple[str, ...] = ()
-    files: dict[str, str] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         for entry in self.shards:
