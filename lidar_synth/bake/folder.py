@@ -67,8 +67,8 @@ def recorded(plan: Plan, number: int) -> Entry | None:
         if replace(entry, bytes=0, sha256="") == wanted:
             return entry
     index = _index(plan.out)
-    entry = None if index is None else index.by_file.get(wanted.file)
-    return entry if entry is not None and replace(entry, bytes=0, sha256="") == wanted else None
+    there = None if index is None else index.by_file.get(wanted.file)
+    return there if there is not None and replace(there, bytes=0, sha256="") == wanted else None
 
 
 def finished(plan: Plan, number: int) -> Entry | None:

@@ -24,14 +24,14 @@ from lidar_synth.noise import keyed_rng
 DIMENSIONS = 64
 """Of a sketch."""
 
-CELLS_PER_ROOT = 4
+CELLS_PER_ROOT = 2
 """Cells, for each of the square root of the number of scans."""
 
-PROBES = 8
+PROBES = 16
 """Cells that a scan is compared with."""
 
 CROWD = 4096
-"""Scans of one cell that others are compared with, at most: the first ones. A cell holds a sixteenth of it at a million
+"""Scans of one cell that others are compared with, at most: the first ones. A cell holds an eighth of it at a million
 scans, unless very many are almost the same; then the first of them are found."""
 
 CANDIDATES = 6
@@ -44,7 +44,7 @@ _STEPS = 4095  # of an entry of a signature, which lies in [0, 1]: sums of 1024 
 _SAMPLE = 65_536  # signatures that centre and scale of the sketches are taken from
 _SPREAD = 4  # standard deviations that a byte holds
 _NUMBERS = 2.0**30  # more than there are scans; times a distance, float64 holds it exactly
-_NONE = 2.0**53  # more than any key
+_NONE = 2.0**53 - 1  # more than any key
 
 
 class Signatures(Protocol):
@@ -75,7 +75,7 @@ def find_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[n
         nearest = _nearest(sketches, steps)
         for part in _parts(count):
             candidates = nearest[np.searchsorted(own, first[part])]
-            found = np.where(candidates < 0, -1, own[candidates])
+            found = np.where(candidates < 0, -1, own[candidates])  # numbers among the first ones, and among all
             copies = first[part] < np.arange(part.start, part.stop)
             found[copies] = first[part][copies, None]
             likeness[part], twin[part] = _best(signatures, part, found)
@@ -121,12 +121,12 @@ def _sketches(signatures: Signatures, own: NDArray[np.int64]) -> NDArray[np.int8
     return sketches
 
 
-def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int64]:
+def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32]:
     """(N, CANDIDATES) numbers of the earlier sketches that are nearest, -1 where there are fewer."""
     count = len(sketches)
     cells = min(count, int(CELLS_PER_ROOT * count**0.5) + 1)
     centres = sketches[np.sort(keyed_rng(count, cells).choice(count, cells, replace=False))]
-    probes = np.empty((count, min(PROBES, cells)), np.uint32)
+    probes = np.empty((count, min(PROBES, cells)), np.min_scalar_type(cells))
     for part in _parts(count):
         keys = _keys(sketches[part], centres, np.arange(cells))
         probes[part] = np.sort(np.partition(keys, probes.shape[1] - 1)[:, : probes.shape[1]]) % _NUMBERS
@@ -139,10 +139,12 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int64
             for start in range(a, b, ROWS):
                 _compare(sketches, queries[start : min(start + ROWS, b)], members[cell], best)
         steps.update()
-    return np.where(best == _NONE, -1, best % _NUMBERS).astype(np.int64)
+    best[best == _NONE] = -1
+    np.fmod(best, _NUMBERS, out=best)
+    return best.astype(np.int32)
 
 
-def _by_cell(of: NDArray[np.uint32], cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _by_cell(of: NDArray[np.unsignedinteger], cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Numbers of the sketches, those of one cell together and ascending; where each cell begins, and the end."""
     order = np.argsort(of, kind="stable")
     return order, np.searchsorted(of[order], np.arange(cells + 1))
@@ -161,7 +163,8 @@ def _keys(some: NDArray[np.int8], others: NDArray[np.int8], numbers: NDArray[np.
     """(M, N) squared distance of two sketches, and the number of the second one: ordered by the one, then the other."""
     a, b = some.astype(np.float32), others.astype(np.float32)
     distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)  # whole numbers below 2^22
-    return distances.astype(np.float64) * _NUMBERS + numbers
+    keys: NDArray[np.float64] = distances.astype(np.float64) * _NUMBERS + numbers
+    return keys
 
 
 def _best(
