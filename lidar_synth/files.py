@@ -5,6 +5,7 @@ A file is written beside its place and renamed, so that a reader never meets hal
 
 import hashlib
 import os
+import secrets
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -22,18 +23,26 @@ STRAY = "allow_pickle"
 SKIP_HINT = "Copy the file again, or leave it out with on_bad='skip'."
 
 
-def write_file(path: Path, content: bytes | Callable[[BinaryIO], object], *, durable: bool = False) -> None:
+def part_of(path: Path) -> Path:
+    """A name beside ``path`` for a file that is being written; no other call, process or machine gets the same."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+
+
+def write_file(
+    path: Path, content: bytes | Callable[[BinaryIO], object], *, durable: bool = False, overwrite: bool = True
+) -> None:
     """Write beside ``path``, then rename; a failure leaves what was there before.
 
     Args:
         path: where the file will stand; its folder is made.
         content: the bytes, or a function that writes them to an open binary file.
         durable: have the bytes on the disk before the rename, so that a power cut leaves a whole file too.
+        overwrite: replace a file that is there; otherwise the first of several processes wins.
 
     Raises:
         FileError: where the target cannot be written or the disk is full.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = part_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as file:
@@ -44,7 +53,8 @@ def write_file(path: Path, content: bytes | Callable[[BinaryIO], object], *, dur
             if durable:
                 file.flush()
                 os.fsync(file.fileno())
-        part.replace(path)
+        if overwrite or not _linked(part, path):
+            part.replace(path)
     except OSError as error:
         raise FileError(
             f"{path} cannot be written ({error.strerror or error})",
@@ -54,6 +64,17 @@ def write_file(path: Path, content: bytes | Callable[[BinaryIO], object], *, dur
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def _linked(part: Path, path: Path) -> bool:
+    """Put a file in its place unless one is there; False where the file system has no second names."""
+    try:
+        os.link(part, path)
+    except FileExistsError:
+        return True
+    except OSError:
+        return False
+    return True
 
 
 def read_file(path: Path) -> bytes:

@@ -12,6 +12,7 @@ import time
 from collections import namedtuple
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,11 @@ import lidar_synth.bake.folder as folder_module
 import lidar_synth.bake.run as run_module
 import lidar_synth.bake.shard as shard_module
 from lidar_synth.bake import ENGINES, Plan, Resources, Share, bake, bake_shard
-from lidar_synth.bake.folder import SETTINGS, prepare
-from lidar_synth.bank import INDEX, Index
-from lidar_synth.errors import FileError
+from lidar_synth.bake.folder import SETTINGS, prepare, write_bank_files
+from lidar_synth.bank import INDEX, Entry, Index
+from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.files import sha256
+from lidar_synth.formats.writer import NOTES
 
 
 @pytest.fixture(scope="module")
@@ -163,35 +166,115 @@ def test_a_finished_shard_that_rots_is_made_again(plan: Plan, expected: dict[str
 
 
 def test_halves_of_killed_processes_are_removed(plan: Plan, expected: dict[str, bytes]) -> None:
+    """Not while another process is at work in the folder, and then whoever began them, here or elsewhere."""
     prepare(plan)
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    host = shard_module.socket.gethostname()
-    mine, other = (plan.out / f".shard-00000.h5.{h}-{ended.pid}.part" for h in (host, "another"))
-    running = plan.out / f".shard-00000.h5.{host}-{os.getppid()}.part"
-    for path in (mine, other, running):
+    halves = [plan.out / f".shard-0000{k}.h5.abcd.part" for k in range(2)]
+    for path in halves:
         path.touch()
-    bake_shard(plan, 0)
-    assert not mine.exists() and other.exists() and running.exists()
+    hold = f"from lidar_synth.bake.lock import shared; from pathlib import Path\nwith shared(Path({str(plan.out / SETTINGS)!r})): print(flush=True); input()"  # noqa: E501
+    with subprocess.Popen(
+        [sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None and other.stdout.readline() == "\n"
+        assert bake(plan, progress=False) is not None
+        assert all(path.exists() for path in halves) and (plan.out / NOTES).exists()
+        other.kill()  # it gives nothing back itself
     bake(plan, progress=False)
     assert files(plan.out) == expected
 
 
+SHARES = {"all": [()] * 3, "shares": [("--shard-index", str(k), "--num-shards", "3") for k in range(3)]}
+
+
+@pytest.mark.parametrize("shares", ["all", pytest.param("shares", marks=pytest.mark.slow)])
+def test_three_bakes_at_once(model: Path, tmp_path: Path, shares: str) -> None:
+    """Three processes as one starts them; none clears away what another is just writing."""
+    whole = plan_in(tmp_path / "whole" / "bank", model, count=60, shard_size=5)
+    bake(whole, progress=False)
+    out = tmp_path / "bank"
+    processes = [start(out, model, *options) for options in SHARES[shares]]
+    ended = [(process.communicate()[1], process.returncode) for process in processes]
+    assert [code for _, code in ended] == [0, 0, 0], ended
+    assert files(out) == files(whole.out)
+
+
+def test_one_that_ends_while_another_begins_a_shard(plan: Plan, expected: dict[str, bytes]) -> None:
+    """The other one is between the first scan of its shard and the last when a whole bake comes and goes."""
+    ended: list[subprocess.CompletedProcess[str]] = []
+
+    def another() -> None:
+        assert list(plan.out.glob(".*.part"))
+        command = [sys.executable, "-m", "lidar_synth", "bake", str(plan.out), "--model", plan.job.model]
+        command += ["--count", str(plan.job.count), "--shard-size", str(SIZE), "--seed", "4"]
+        ended.append(subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False))
+        assert list(plan.out.glob(".*.part"))
+
+    stop_after(plan, 4, another)
+    assert [process.returncode for process in ended] == [0], ended
+    assert files(plan.out) == expected
+
+
+def test_two_folders_claimed_at_once(plan: Plan, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both see an empty folder; the one that is a moment late finds out."""
+    late = plan_in(plan.out, model, seed=5)
+    looked = Path.is_file
+
+    def slow(path: Path, **options: bool) -> bool:
+        seen = looked(path, **options)
+        if path.name == SETTINGS and not seen:
+            monkeypatch.setattr(Path, "is_file", looked)
+            prepare(plan)
+        return seen
+
+    monkeypatch.setattr(Path, "is_file", slow)
+    with pytest.raises(ConfigError, match="was filled with {'seed': 4}; expected {'seed': 5}"):
+        prepare(late)
+
+
 def test_two_that_end_at_the_same_time(plan: Plan, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of them clears away what the other one is just writing; it matters where the index is not there."""
+    """Each writes the same files; neither needs the notes that the other one clears away."""
+    prepare(plan)
+    for number in range(4):
+        bake_shard(plan, number)
     written = folder_module.write_bank_files
 
-    def disturbed(root: Path, index: Index) -> None:
-        written(root, index)
-        raise FileError("cleared away", "")
+    def both(root: Path, index: Index, baked: bool = False) -> Index:
+        monkeypatch.setattr(folder_module, "write_bank_files", written)
+        assert bake(plan, progress=False) == index
+        return written(root, index, baked)
 
-    monkeypatch.setattr(folder_module, "write_bank_files", disturbed)
+    monkeypatch.setattr(folder_module, "write_bank_files", both)
     assert bake(plan, progress=False) is not None
     assert files(plan.out) == expected
-    monkeypatch.setattr(folder_module, "write_bank_files", lambda root, index: disturbed(root / "elsewhere", index))
-    (plan.out / INDEX).unlink()
-    with pytest.raises(FileError, match="cleared away"):
-        bake(plan, progress=False)
+
+
+def test_a_rerun_over_many_shards_parses_the_index_once(
+    plan: Plan, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """10,000 shards, all but 20 of them there. What a shard holds is not read then; a few bytes do."""
+    many = plan_in(plan.out, model, count=10_000, shard_size=1)
+    prepare(many)
+    for entry in many.shards:
+        (plan.out / entry.file).write_bytes(b"shard")
+    content = {"bytes": 5, "sha256": sha256(plan.out / many.shards[0].file)}
+    write_bank_files(plan.out, Index((many.facts,), tuple(replace(e, **content) for e in many.shards)), baked=True)
+    for entry in many.shards[::500]:
+        (plan.out / entry.file).unlink()
+    parsed, made = [0], [0]
+    parse, begin = Index.from_json, Entry.__post_init__
+
+    def count_parsed(text: bytes, where: str) -> Index:
+        parsed[0] += 1
+        return parse(text, where)
+
+    def count_made(entry: Entry) -> None:
+        made[0] += 1
+        begin(entry)
+
+    monkeypatch.setattr(Index, "from_json", count_parsed)
+    monkeypatch.setattr(Entry, "__post_init__", count_made)
+    assert bake(many, progress=False) is not None
+    assert parsed[0] <= 3 and made[0] < 10 * len(many.shards)
 
 
 # The disk

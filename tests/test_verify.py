@@ -1,6 +1,7 @@
 """Keeping banks whole: verify finds what is wrong, repair makes it again; merge, split and head keep every scan."""
 
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -8,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from banks import some_image, write_bank
@@ -17,7 +19,7 @@ from typer.testing import CliRunner
 import lidar_synth.bake.repair as repair_module
 from lidar_synth.bake import Job, bake, make_plan
 from lidar_synth.bake.edit import head, merge, split
-from lidar_synth.bake.folder import write_bank_files
+from lidar_synth.bake.folder import SETTINGS, write_bank_files
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import AGREE, regenerate, verify
 from lidar_synth.bank import INDEX, Bank, Index
@@ -108,8 +110,6 @@ def test_every_flipped_bit_is_found(root: Path) -> None:
 
 def test_a_damaged_scan_is_named(root: Path) -> None:
     """A file whose hash the index knows, but with a scan that is not its CRC's: only reading it finds that."""
-    import h5py
-
     path = root / "shard-00001.h5"
     with h5py.File(path, "r+") as file:
         file["label"][2, 3, 4] = 18 - file["label"][2, 3, 4] % 19
@@ -124,6 +124,99 @@ def test_files_that_nobody_knows(root: Path) -> None:
     shutil.copyfile(root / "shard-00000.h5", root / "shard-00009.h5")
     [problem] = verify(root, progress=False)
     assert (problem.file, problem.what) == ("shard-00009.h5", "is not in the index")
+
+
+SIDE = ["README.md", "croissant.json", SETTINGS]
+
+
+def sides(root: Path) -> dict[str, bytes]:
+    return {name: (root / name).read_bytes() for name in SIDE}
+
+
+SIDE_DAMAGE: dict[str, Callable[[Path, np.random.Generator], object]] = {
+    "flip": lambda path, rng: flip(path, int(rng.integers(8 * path.stat().st_size))),
+    "cut": lambda path, rng: os.truncate(path, int(rng.integers(path.stat().st_size))),
+    "longer": lambda path, rng: path.write_bytes(path.read_bytes() + b" "),
+    "missing": lambda path, rng: path.unlink(),
+}
+
+
+@pytest.mark.parametrize("name", SIDE)
+@pytest.mark.parametrize("kind", SIDE_DAMAGE)
+def test_damage_beside_the_shards_is_found_and_mended(root: Path, original: Path, name: str, kind: str) -> None:
+    rng = np.random.default_rng(SIDE.index(name))
+    for _ in range(20 if kind in ("flip", "cut") else 1):
+        SIDE_DAMAGE[kind](root / name, rng)
+        [problem] = verify(root, progress=False)
+        assert problem.file == name
+        assert repair(root, progress=False) == {name: "written again from the index"}
+        assert verify(root, progress=False) == [] and sides(root) == sides(original)
+        assert (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
+
+
+def test_damage_beside_the_shards_by_command(root: Path, model: Path) -> None:
+    (root / SETTINGS).write_text("{}")
+    status, output = call("verify", root)
+    assert status == 1 and f"{SETTINGS}: has sha256" in output and "damaged, or was edited" in output
+    status, output = call("repair", root)
+    assert status == 0 and f"{SETTINGS}: written again from the index" in output
+    assert bake(make_plan(root, Job(model=str(model), count=8, shard_size=3)), progress=False) is not None
+
+
+def test_a_bank_under_another_name_is_whole(root: Path, tmp_path: Path) -> None:
+    assert verify(root.rename(tmp_path / "other"), progress=False) == []
+
+
+def test_all_is_lost_but_the_shards(root: Path, original: Path) -> None:
+    for name in (*SIDE, INDEX):
+        (root / name).unlink()
+    assert repair(root, progress=False) == {INDEX: "written again from the shards"}
+    assert sides(root) == sides(original) and (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
+
+
+def test_an_index_of_an_older_version_names_no_other_files(root: Path, original: Path, model: Path) -> None:
+    """It is the same bank; the settings of its bake stand in another order, and are left as they are."""
+    values = json.loads((root / INDEX).read_bytes())
+    assert set(values.pop("files")) == set(SIDE)
+    values["checksum"] = Bank(original).identity
+    (root / INDEX).write_text(json.dumps(values))
+    settings = json.loads((root / SETTINGS).read_bytes())
+    (root / SETTINGS).write_text(json.dumps(dict(reversed(settings.items())), indent=1))
+    assert Bank(root).identity == Bank(original).identity
+    (root / "README.md").unlink()
+    assert verify(root, progress=False) == [] and repair(root, progress=False) == {}
+    bake(make_plan(root, Job(model=str(model), count=8, shard_size=3)), progress=False)
+    assert list(json.loads((root / SETTINGS).read_bytes())) == list(reversed(settings))
+    assert verify(root, progress=False) == [] and (root / "README.md").is_file()
+    flip(root / SETTINGS, 80)
+    assert repair(root, progress=False) == {SETTINGS: "written again from the index"}
+    assert sides(root) == sides(original)
+
+
+def test_a_deep_look_takes_other_scans_each_time(root: Path, model: Path) -> None:
+    drawn = [call("verify", root, "--deep", "--model", model, "--sample", 2)[1] for _ in range(2)]
+    seeds = [re.findall(r"scans drawn by --seed (\d+)", output) for output in drawn]
+    assert len(seeds[0]) == len(seeds[1]) == 1 and seeds[0] != seeds[1]
+    assert "drawn by --seed 7" in call("verify", root, "--deep", "--model", model, "--sample", 2, "--seed", 7)[1]
+    samples = [frozenset(regenerate(root, str(model), 2, progress=False)) for _ in range(8)]
+    assert len(set(samples)) > 1
+    again = [set(regenerate(root, str(model), 2, progress=False, seed=7)) for _ in range(2)]
+    assert again[0] == again[1] and len(again[0]) == 2
+
+
+def test_a_shard_that_is_open_in_plain_h5py(root: Path) -> None:
+    """In this process; whoever comes first, the other one reads it too."""
+    path = root / "shard-00001.h5"
+    bank = Bank(root)
+    for options in ({}, {"locking": True}, {"locking": False}, {"libver": "latest"}, {"driver": "stdio"}):
+        with h5py.File(path, "r", **options) as plain:
+            assert verify(root, progress=False) == []
+            assert np.array_equal(plain["range"][0], bank.shard(1).read(0)["range"])
+        with h5py.File(path, "r", **options) as plain:  # the bank has it open now
+            assert plain["range"].shape == (3, 8, 32)
+        bank.close()
+    with h5py.File(path, "r+"):
+        assert len(bank[4].points)
 
 
 def test_scans_that_are_not_what_they_say(tmp_path: Path, model: Path) -> None:

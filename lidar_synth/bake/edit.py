@@ -17,7 +17,7 @@ from tqdm import tqdm
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files import sha256
+from lidar_synth.files import part_of, sha256
 
 
 def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
@@ -96,8 +96,8 @@ def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool
         FileError: where it cannot be written.
     """
     left_out = set(numbers)
-    if not left_out <= set(range(len(bank))):
-        raise ConfigError(f"scans {sorted(left_out - set(range(len(bank))))[:8]} to leave out", f"0 to {len(bank) - 1}")
+    if none := sorted(number for number in left_out if not 0 <= number < len(bank)):
+        raise ConfigError(f"scans {none[:8]} to leave out", f"0 to {len(bank) - 1}")
     if len(left_out) == len(bank):
         raise ConfigError(f"all {len(bank)} scans of {bank.root} left out ({why})", "a rule that leaves some")
     _check_empty(out)
@@ -111,8 +111,7 @@ def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool
             entries.append(replace(entry, file=_name(len(entries), True), dropped=dropped))
             _link(Path(bank.root) / entry.file, out / entries[-1].file)
     index = replace(bank.index, shards=tuple(entries), curation=(*bank.index.curation, why))
-    write_bank_files(out, index)
-    return index
+    return write_bank_files(out, index)
 
 
 def _name(number: int, curated: bool) -> str:
@@ -138,9 +137,7 @@ def _write(out: Path, parts: Sequence[tuple[Bank, int, int]], progress: bool) ->
                 new = replace(entry, file=_name(len(entries), bool(curation)), source=sources.index(facts))
                 entries.append(_take(bank, number, new, first, last, out))
                 bar.update(last - first)
-    index = Index(tuple(sources), tuple(entries), curation=curation)
-    write_bank_files(out, index)
-    return index
+    return write_bank_files(out, Index(tuple(sources), tuple(entries), curation=curation))
 
 
 def _take(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path) -> Entry:
@@ -155,7 +152,7 @@ def _take(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Pat
     entry = replace(entry, first=entry.first + start, scans=stop - start, dropped=dropped)
     shard = bank.shard(number)
     names = [name for p in range(start, stop) if (name := shard.condition(p)) is not None]
-    part = path.with_name(f".{path.name}.part")
+    part = part_of(path)
     with ShardWriter(part, shard.facts, entry, conditions=names) as writer:
         for position in range(start, stop):
             writer.append_chunks(*shard.chunks(position))
@@ -166,8 +163,7 @@ def _take(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Pat
 
 def _link(source: Path, path: Path) -> None:
     """A second name for a file; a copy where the file system has no second names."""
-    part = path.with_name(f".{path.name}.part")
-    part.unlink(missing_ok=True)
+    part = part_of(path)
     try:
         os.link(source, part)
     except OSError:

@@ -4,28 +4,38 @@ A shard is written beside its place and renamed when it is on the disk. Just bef
 ``.lidar_synth/``; when all shards are there, ``finish`` gathers the notes in ``index.json``. A shard counts as
 finished when its file has the noted hash, so that a run which is killed at any moment loses the shards it was making
 and nothing else.
+
+Several runs may fill one folder at the same time. Each is ``at_work`` there, and nothing is cleared away before the
+last of them has ended.
 """
 
+import hashlib
 import json
 import os
 import shutil
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
-from lidar_synth.bake.job import Plan
+from lidar_synth.bake.job import Plan, settings_of
+from lidar_synth.bake.lock import alone, shared
 from lidar_synth.bank import INDEX, Entry, Index
-from lidar_synth.bank.card import write_card
+from lidar_synth.bank.card import card_files
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import read_file, sha256, write_file
 from lidar_synth.formats.writer import NOTES, claim
 
 SETTINGS = ".bake.json"
-"""File in the bank's folder that says what it is being filled with."""
+"""File in the bank's folder that says what it is being filled with; the runs that fill it hold a lock on it."""
+
+LOGS = ".slurm"
+"""Folder of the logs of Slurm's jobs, in the bank's folder until that is finished."""
 
 
 def prepare(plan: Plan) -> None:
-    """Claim the folder for the plan's settings.
+    """Claim the folder for the plan's settings, and clear away what killed runs left half-made.
 
     Raises:
         ConfigError: where it holds a bank of other settings; the message shows the difference.
@@ -34,6 +44,19 @@ def prepare(plan: Plan) -> None:
     if (plan.out / INDEX).exists() and not (plan.out / SETTINGS).exists():
         raise ConfigError(f"{plan.out} holds a bank that no bake made", "a folder of its own", "Choose another one.")
     claim(plan.out / SETTINGS, plan.settings)
+    _clear_up(plan.out, finished=False)
+
+
+@contextmanager
+def at_work(plan: Plan) -> Iterator[None]:
+    """While it lasts, no process clears anything away in the plan's folder.
+
+    Raises:
+        FileError: where the folder is not, or no more, the one that ``prepare`` claimed.
+    """
+    check_folder(plan)
+    with shared(plan.out / SETTINGS):
+        yield
 
 
 def recorded(plan: Plan, number: int) -> Entry | None:
@@ -43,11 +66,9 @@ def recorded(plan: Plan, number: int) -> Entry | None:
         entry = Entry(**json.loads(read_file(_note(plan, number))))
         if replace(entry, bytes=0, sha256="") == wanted:
             return entry
-    index = _index(plan)
-    for entry in index.shards if index else ():
-        if replace(entry, bytes=0, sha256="") == wanted:
-            return entry
-    return None
+    index = _index(plan.out)
+    there = None if index is None else index.by_file.get(wanted.file)
+    return there if there is not None and replace(there, bytes=0, sha256="") == wanted else None
 
 
 def finished(plan: Plan, number: int) -> Entry | None:
@@ -88,36 +109,61 @@ def finish(plan: Plan) -> Index | None:
     Raises:
         FileError: where they cannot be written.
     """
-    entries = []
-    for number in range(len(plan.shards)):
-        entry = recorded(plan, number)
-        if entry is None or not (plan.out / entry.file).is_file():
-            return None
-        entries.append(entry)
-    index, there = Index((plan.facts,), tuple(entries)), _index(plan)
-    if there is not None and there.shards == index.shards:
-        index = there  # it may know of repairs
-    try:
-        write_bank_files(plan.out, index)
-    except FileError:
-        # A process that ends at the same time clears this one's halves away, when it has written the same.
-        if _index(plan) != index:
-            raise
-    for part in plan.out.glob(".*.part"):
-        part.unlink(missing_ok=True)
-    shutil.rmtree(plan.out / NOTES, ignore_errors=True)
+    with at_work(plan):
+        entries = []
+        for number in range(len(plan.shards)):
+            entry = recorded(plan, number)
+            if entry is None or not (plan.out / entry.file).is_file():
+                return None
+            entries.append(entry)
+        index, there = Index((plan.facts,), tuple(entries)), _index(plan.out)
+        if there is not None and there.shards == index.shards:
+            index = there  # it may know of repairs
+        index = write_bank_files(plan.out, index, baked=True)
+    _clear_up(plan.out, finished=True)
     return index
 
 
-def write_bank_files(root: Path, index: Index) -> None:
-    """The card, and the index last: with it the bank is whole.
+def write_bank_files(root: Path, index: Index, baked: bool = False) -> Index:
+    """The card, for the folder of a bake its settings, and the index last: with it the bank is whole.
+
+    Args:
+        root: the bank's folder.
+        index: of its shards.
+        baked: whether a bake filled the folder, and may go on with it.
+
+    Returns:
+        The index, with the hashes of the other files.
 
     Raises:
         FileError: where they cannot be written.
     """
-    write_card(root, index)
+    files = card_files(root.resolve().name, index) | (_settings_file(root, index) if baked else {})
+    for name, content in files.items():
+        if not _holds(root / name, content):  # a file that is locked stays the same file
+            write_file(root / name, content)
+    index = replace(index, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
     write_file(root / INDEX, index.to_json(), durable=True)
     sync_folder(root)
+    return index
+
+
+def _settings_file(root: Path, index: Index) -> dict[str, bytes]:
+    """The settings of the bake that fills a folder, as ``claim`` writes them. Older versions wrote another order."""
+    wanted = json.dumps(settings_of(index.sources[0]), indent=1).encode()
+    with suppress(FileError, ValueError, RecursionError):
+        there = read_file(root / SETTINGS)
+        values = json.loads(there)
+        if values == json.loads(wanted) and json.dumps(values, indent=1).encode() == there:
+            return {SETTINGS: there}
+    return {SETTINGS: wanted}
+
+
+def _holds(path: Path, content: bytes) -> bool:
+    try:
+        return read_file(path) == content
+    except FileError:
+        return False
 
 
 def sync_folder(path: Path) -> None:
@@ -146,10 +192,34 @@ def check_folder(plan: Plan) -> None:
     )
 
 
-def _index(plan: Plan) -> Index | None:
-    """The index that is there, if one can be read."""
+def _clear_up(root: Path, finished: bool) -> None:
+    """Remove what processes that ended left half-made, and what a finished bank does not need.
+
+    While another process is at work there, it is left to that one.
+    """
+    with alone(root / SETTINGS) as nobody_else:
+        if not nobody_else:
+            return
+        for part in root.glob(".*.part"):
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+        for folder in (NOTES, LOGS) if finished else ():
+            shutil.rmtree(root / folder, ignore_errors=True)
+
+
+def _index(root: Path) -> Index | None:
+    """The index that is there, if one can be read; parsed again only when its file is another one."""
     try:
-        return Index.from_json(read_file(plan.out / INDEX), str(plan.out / INDEX))
+        there = (root / INDEX).stat()
+    except OSError:
+        return None
+    return _parsed(root / INDEX, there.st_ino, there.st_size, there.st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _parsed(path: Path, *version: int) -> Index | None:
+    try:
+        return Index.from_json(read_file(path), str(path))
     except (FileError, DataError):
         return None
 

@@ -106,13 +106,19 @@ class Plan:
     @property
     def settings(self) -> dict[str, Any]:
         """All that decides the bank's bytes, by name."""
-        made_by = {"checkpoint": self.facts.checkpoint, "fields": list(self.facts.fields), **self.facts.software}
-        return self.job.model_dump(exclude={"model", "fields"}) | made_by
+        return settings_of(self.facts)
 
     @property
     def scan_bytes(self) -> int:
         """Size of a scan before compression."""
         return sum(shape[0] * shape[1] * dtype.itemsize for shape, dtype in self.facts.encoding.arrays().values())
+
+
+def settings_of(facts: Facts) -> dict[str, Any]:
+    """All that decides the bytes of a bank with these facts, by name, sorted."""
+    others = {"checkpoint": facts.checkpoint, "fields": list(facts.fields), "compression": facts.compression,
+              "layout": facts.layout}  # fmt: skip
+    return dict(sorted((facts.settings | others | facts.software).items()))
 
 
 def make_plan(out: str | Path, job: Job) -> Plan:

@@ -8,17 +8,18 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import sync_folder, write_bank_files
+from lidar_synth.bake.folder import SETTINGS, sync_folder, write_bank_files
 from lidar_synth.bake.job import Plan
 from lidar_synth.bake.shard import load_checked, write_shard
-from lidar_synth.bake.verify import check_scans, check_shard, job_of, read_index
+from lidar_synth.bake.verify import check_scans, check_shard, check_side_files, job_of, read_index
 from lidar_synth.bank import INDEX, Entry, Facts, Index, ShardReader
-from lidar_synth.errors import DataError, FileError
-from lidar_synth.files import sha256
+from lidar_synth.errors import DataError, FileError, LidarSynthError
+from lidar_synth.files import part_of, sha256
 
 
 def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[str, str]:
-    """Generate damaged and missing shards again; write the index anew where it is damaged or missing.
+    """Generate damaged and missing shards again; write anew what is damaged or missing of the index and of the files
+    that follow from it: the card, and the settings of the bake.
 
     On the machine and with the versions that made the bank, the bytes are the same. Elsewhere the scans are equal to
     rounding; the index then gets the new hashes, and the fact.
@@ -39,9 +40,11 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
     done: dict[str, str] = {}
     try:
         index = read_index(root)
+        baked = SETTINGS in index.files or (root / SETTINGS).is_file()
     except (DataError, FileError) as error:
-        index = _index_from_shards(root, error)
+        index, baked = _index_from_shards(root, error), True
         done[INDEX] = "written again from the shards"
+    done |= {problem.file: "written again from the index" for problem in check_side_files(root, index)}
     shards, repairs = list(index.shards), list(index.repairs)
     total = sum(entry.scans for entry in shards)
     with tqdm(total=total, desc="repair", unit="scan", disable=not progress) as bar:
@@ -56,20 +59,25 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
             if not same:
                 repairs.append(f"{entry.file} was made again with torch {torch.__version__}, with other bytes")
     if done:
-        write_bank_files(root, replace(index, shards=tuple(shards), repairs=tuple(repairs)))
+        write_bank_files(root, replace(index, shards=tuple(shards), repairs=tuple(repairs)), baked)
     return done
 
 
 def _make_again(root: Path, facts: Facts, entry: Entry, model: str | None, progress: Callable[[int], object]) -> Entry:
     """Generate a shard and put it in its place."""
     job = job_of(facts, model)
-    part = root / f".{entry.file}.repair.part"
-    write_shard(load_checked(job, facts), part, job, facts, entry, progress)
+    part = part_of(root / entry.file)
     try:
+        write_shard(load_checked(job, facts), part, job, facts, entry, progress)
         made = replace(entry, bytes=part.stat().st_size, sha256=sha256(part))
         part.replace(root / entry.file)
     except OSError as error:
+        if isinstance(error, LidarSynthError):
+            raise
         raise FileError(f"{root / entry.file} cannot be written ({error.strerror})", "a folder to write to") from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
     sync_folder(root)
     return made
 

@@ -12,7 +12,7 @@ from types import FrameType
 
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import finish, finished, prepare
+from lidar_synth.bake.folder import at_work, finish, finished, prepare
 from lidar_synth.bake.job import Plan
 from lidar_synth.bake.local import bake_local
 from lidar_synth.bake.processes import bake_in_processes
@@ -84,13 +84,14 @@ def bake(
         raise ConfigError(f"{resources.workers} workers", "at least 1")
     prepare(plan)
     with _terminated_as_interrupted():
-        mine = range(len(plan.shards))[share.index :: share.of]
-        looked_at = tqdm(mine, "looking at what is there", unit="shard", leave=False, disable=not progress, delay=2)
-        missing = [number for number in looked_at if finished(plan, number) is None]
-        scans = sum(plan.shards[number].scans for number in missing)
-        if missing:
-            with tqdm(total=scans, unit="scan", smoothing=0.05, disable=not progress) as bar:
-                run(plan, missing, resources, bar.update)
+        with at_work(plan):
+            mine = range(len(plan.shards))[share.index :: share.of]
+            looked_at = tqdm(mine, "looking at what is there", unit="shard", leave=False, disable=not progress, delay=2)
+            missing = [number for number in looked_at if finished(plan, number) is None]
+            scans = sum(plan.shards[number].scans for number in missing)
+            if missing:
+                with tqdm(total=scans, unit="scan", smoothing=0.05, disable=not progress) as bar:
+                    run(plan, missing, resources, bar.update)
         return finish(plan)
 
 

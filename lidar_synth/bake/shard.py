@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -11,10 +10,11 @@ from pathlib import Path
 import torch
 
 from lidar_synth.bake.conditions import condition_names, conditions, open_conditions
-from lidar_synth.bake.folder import check_folder, finished, publish
+from lidar_synth.bake.folder import at_work, finished, publish
 from lidar_synth.bake.job import DTYPES, Job, Plan
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.files import part_of
 from lidar_synth.formats import ScanFiles
 from lidar_synth.generate.generator import BATCH, Generator, load_generator
 from lidar_synth.geometry.scan import RangeImage
@@ -45,17 +45,16 @@ def bake_shard(plan: Plan, number: int, progress: Progress = lambda scans: None)
         progress(there.scans)
         return there
     entry = plan.shards[number]
-    check_folder(plan)
-    _check_space(plan, entry)
-    generator = load_checked(plan.job, plan.facts)
-    _remove_parts(plan, entry)
-    part = plan.out / f".{entry.file}.{socket.gethostname()}-{os.getpid()}.part"
-    try:
-        write_shard(generator, part, plan.job, plan.facts, entry, progress)
-        return publish(plan, number, part)
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
+    part = part_of(plan.out / entry.file)
+    with at_work(plan):
+        _check_space(plan, entry)
+        generator = load_checked(plan.job, plan.facts)
+        try:
+            write_shard(generator, part, plan.job, plan.facts, entry, progress)
+            return publish(plan, number, part)
+        finally:
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
 
 
 def write_shard(generator: Generator, path: Path, job: Job, facts: Facts, entry: Entry, progress: Progress) -> None:
@@ -139,26 +138,3 @@ def _check_space(plan: Plan, entry: Entry) -> None:
             f"about {need / 1e6:.0f} MB for the next shard",
             "Free some space and run the same again: finished shards are kept.",
         )
-
-
-def _remove_parts(plan: Plan, entry: Entry) -> None:
-    """Halves of this shard that processes of this machine left behind when they were killed."""
-    host = socket.gethostname()
-    for part in plan.out.glob(f".{entry.file}.{host}-*.part"):
-        process = part.name.removesuffix(".part").rpartition("-")[2]
-        if not _alive(int(process)):
-            part.unlink(missing_ok=True)
-
-
-def _alive(process: int) -> bool:
-    if process == os.getpid():
-        return False  # a part of a name that this process is going to use was left by an earlier one
-    if os.name == "nt":
-        return True  # there, signal 0 is control-C
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True

@@ -8,13 +8,11 @@ runs the jobs as processes of this machine, to try things without Slurm.
 from collections.abc import Sequence
 from typing import Any
 
+from lidar_synth.bake.folder import LOGS
 from lidar_synth.bake.job import Plan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError, FileError, LibraryError
-
-LOGS = ".slurm"
-"""Folder of the jobs' logs, in the bank's folder."""
 
 _OPTIONS = {"cluster": "slurm", "timeout_min": 240}  # submitit's own limit is 5 minutes, less than a shard may take
 _TIMEOUTS = 1000  # how often a job may run out of time and go on

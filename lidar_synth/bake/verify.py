@@ -7,17 +7,21 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from lidar_synth.bake.folder import SETTINGS
 from lidar_synth.bake.job import Job
 from lidar_synth.bake.shard import generate, load_checked, one_computer
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader
+from lidar_synth.bank.card import CARD, CROISSANT
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files import read_file, sha256
 from lidar_synth.geometry.scan import RangeImage
-from lidar_synth.noise import keyed_rng
 
 AGREE = 0.9
 """Share of cells in which a scan that is generated again has to agree. On the machine that made it all do; elsewhere
 rounding moves a few ranges and flips a label here and there; a scan of another seed agrees in few."""
+
+SIDE_FILES = CARD, CROISSANT, SETTINGS
+"""What stands beside the shards and the index, and can be written again from the index."""
 
 _CLOSE = 2e-3  # relative difference of two ranges that agree
 
@@ -27,7 +31,7 @@ class Problem:
     """Something that is wrong with a bank.
 
     Args:
-        file: the shard.
+        file: its name.
         what: what is wrong with it, in words.
     """
 
@@ -36,7 +40,8 @@ class Problem:
 
 
 def verify(root: Path, progress: bool = True) -> list[Problem]:
-    """Check every shard's presence, size and hash, its attributes against the index, and the CRC of every scan.
+    """Check every shard's presence, size and hash, its attributes against the index, and the CRC of every scan; then
+    the hashes of the card and the other files that the index names (older versions named none).
 
     Args:
         root: the bank's folder.
@@ -58,7 +63,22 @@ def verify(root: Path, progress: bool = True) -> list[Problem]:
             bar.update(entry.scans)
     known = {entry.file for entry in index.shards}
     foreign = sorted(path.name for path in root.glob("*.h5") if path.name not in known)
-    return problems + [Problem(name, "is not in the index") for name in foreign]
+    return problems + [Problem(name, "is not in the index") for name in foreign] + check_side_files(root, index)
+
+
+def check_side_files(root: Path, index: Index) -> list[Problem]:
+    """What is wrong with the files beside the shards."""
+    problems = []
+    for name in filter(index.files.get, SIDE_FILES):
+        try:
+            found = sha256(root / name)
+        except OSError as error:
+            problems.append(Problem(name, f"cannot be read ({error.strerror or error})"))
+            continue
+        if found != index.files[name]:
+            what = f"has sha256 {found[:12]}, by the index {index.files[name][:12]}: it is damaged, or was edited"
+            problems.append(Problem(name, what))
+    return problems
 
 
 def check_shard(root: Path, facts: Facts, entry: Entry) -> Iterator[str]:
@@ -87,14 +107,17 @@ def check_scans(path: Path, facts: Facts | None, entry: Entry | None) -> Iterato
         yield str(error)
 
 
-def regenerate(root: Path, model: str | None = None, sample: int = 16, progress: bool = True) -> dict[str, float]:
+def regenerate(
+    root: Path, model: str | None = None, sample: int = 16, progress: bool = True, *, seed: int | None = None
+) -> dict[str, float]:
     """Generate some scans again, from their seeds, and compare.
 
     Args:
         root: the bank's folder.
         model: the checkpoint, where it is not a shipped one.
-        sample: how many scans, spread over the bank.
+        sample: how many scans, drawn from the bank.
         progress: show a bar.
+        seed: of the draw, >= 0; by default every call draws others.
 
     Returns:
         {id: share of cells that agree}; less than ``AGREE`` means that the scan is not what its id says.
@@ -104,7 +127,7 @@ def regenerate(root: Path, model: str | None = None, sample: int = 16, progress:
         FileError, DataError: where bank or checkpoint cannot be read.
     """
     bank = Bank(root)
-    chosen = sorted(keyed_rng(len(bank), sample).choice(len(bank), min(sample, len(bank)), replace=False).tolist())
+    chosen = sorted(np.random.default_rng(seed).choice(len(bank), min(sample, len(bank)), replace=False).tolist())
     shares = {}
     for number in tqdm(chosen, desc="generate again", unit="scan", disable=not progress):
         name = bank.ids[number]

@@ -6,24 +6,19 @@ Both follow from the index alone, so that the same bank has the same card.
 
 import json
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from lidar_synth.bank.index import FORMAT, Index
-from lidar_synth.files import write_file
 
 CARD, CROISSANT = "README.md", "croissant.json"
 
 
-def write_card(root: Path, index: Index) -> None:
-    """Write both files into the bank's folder.
-
-    Raises:
-        FileError: where they cannot be written.
-    """
-    name = root.resolve().name
-    write_file(root / CARD, dataset_card(name, index).encode())
-    write_file(root / CROISSANT, (json.dumps(croissant(name, index), indent=1) + "\n").encode())
+def card_files(name: str, index: Index) -> dict[str, bytes]:
+    """Both files of a bank of this name, by the files' names."""
+    return {
+        CARD: dataset_card(name, index).encode(),
+        CROISSANT: (json.dumps(croissant(name, index), indent=1) + "\n").encode(),
+    }
 
 
 def summary(index: Index) -> dict[str, Any]:

@@ -9,6 +9,7 @@
                curated bank also ``dropped``, positions in the file of the scans that are left out
     repairs    what was made again with other bytes, in words
     curation   in a curated bank: by what scans were left out, in words
+    files      sha256 of the other files that are written with the index; banks of older versions have none
     checksum   sha256 of the rest, as JSON without spaces and with sorted keys
 
 The facts stand in the root attributes of each shard too, text and numbers as they are, everything else as JSON, and
@@ -224,6 +225,7 @@ class Index:
         shards: at least one.
         repairs: what was made again with other bytes.
         curation: by what scans were left out; () for a bank that is not curated.
+        files: {name: sha256} of the other files beside the shards; they are no part of the bank's identity.
 
     Raises:
         DataError: where they do not fit together.
@@ -233,6 +235,7 @@ class Index:
     shards: tuple[Entry, ...]
     repairs: tuple[str, ...] = ()
     curation: tuple[str, ...] = ()
+    files: dict[str, str] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         for entry in self.shards:
@@ -258,6 +261,11 @@ class Index:
         """Scans up to and with each shard."""
         return list(accumulate(entry.kept for entry in self.shards))
 
+    @cached_property
+    def by_file(self) -> dict[str, Entry]:
+        """The shards by their files' names."""
+        return {entry.file: entry for entry in self.shards}
+
     @property
     def size(self) -> int:
         """Bytes of all shards."""
@@ -265,12 +273,13 @@ class Index:
 
     @cached_property
     def checksum(self) -> str:
-        """What tells this bank from every other one."""
+        """What tells this bank from every other one: the sha256 of all but ``files``, one of which names it."""
         return _sum(self._values())
 
     def to_json(self) -> bytes:
         """The content of ``index.json``."""
-        return (json.dumps(self._values() | {"checksum": self.checksum}, indent=1, sort_keys=True) + "\n").encode()
+        values = self._values() | ({"files": self.files} if self.files else {})
+        return (json.dumps(values | {"checksum": _sum(values)}, indent=1, sort_keys=True) + "\n").encode()
 
     @classmethod
     def from_json(cls, text: bytes, where: str) -> "Index":
@@ -290,6 +299,7 @@ class Index:
                 tuple(Entry.from_dict(entry) for entry in values["shards"]),
                 tuple(values["repairs"]),
                 tuple(values.get("curation", ())),
+                {str(name): str(sha256) for name, sha256 in values.get("files", {}).items()},
             )
             if values["scans"] != index.scans:
                 raise ValueError(f"{values['scans']} scans, but its shards hold {index.scans}")

@@ -14,15 +14,19 @@ def verify(
     bank: BankFolder,
     deep: Annotated[bool, typer.Option("--deep", help="generate some scans again from their seeds, too")] = False,
     sample: Annotated[int, typer.Option(min=1, help="how many scans --deep generates")] = 16,
+    seed: Annotated[int | None, typer.Option(min=0, help="which ones [others each time]")] = None,
     model: Model = None,
 ) -> None:
-    """Checks a bank: its index, every shard's hash and attributes, and every scan. Exit status 1 = not whole.
+    """Checks a bank: its index, every shard's hash and attributes, every scan, and the card. Exit status 1 = not whole.
 
     \b
     Examples:
       lidar-synth verify bank
       lidar-synth verify bank --deep --model runs/student/student.safetensors
+      lidar-synth verify bank --deep --sample 100 --seed 7
     """
+    import secrets
+
     from lidar_synth.bake.verify import AGREE, regenerate
     from lidar_synth.bake.verify import verify as run
 
@@ -35,7 +39,9 @@ def verify(
     typer.echo(f"{bank}: whole")
     if not deep:
         return
-    shares = regenerate(bank, model, sample)
+    seed = secrets.randbits(32) if seed is None else seed
+    typer.echo(f"{bank}: scans drawn by --seed {seed}")
+    shares = regenerate(bank, model, sample, seed=seed)
     other = {name: share for name, share in shares.items() if share < AGREE}
     for name, share in other.items():
         typer.echo(f"{name}: {share:.1%} of its cells agree with the scan made again", err=True)
@@ -45,7 +51,7 @@ def verify(
 
 
 def repair(bank: BankFolder, model: Model = None) -> None:
-    """Generates again exactly the shards of a bank that are damaged or missing.
+    """Generates again exactly the shards of a bank that are damaged or missing, and writes its index and card again.
 
     On the machine and with the versions that made the bank, the bytes are the same; elsewhere the scans are equal to
     rounding, and the index says so.

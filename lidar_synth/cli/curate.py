@@ -30,9 +30,9 @@ def curate(
 ) -> None:
     """Scores every scan of a bank, lists the oddest, and makes a bank without those that a rule means.
 
-    Scores are kept in BANK/scores.npz. The curated bank is an index: it shares the shards, and no shard is written
-    anew. A rule is conditions joined by "and", each a score, one of < <= > >=, and a number; run it without --out to
-    see what it would drop.
+    Scores are kept in BANK/scores.npz; run it again to resume it where it was stopped. The curated bank is an index: it
+    shares the shards, and no shard is written anew. A rule is conditions joined by "and", each a score, one of < <= >
+    >=, and a number; run it without --out to see what it would drop.
 
     \b
     Scores:
@@ -43,7 +43,7 @@ def curate(
       floating    share of ground returns above the sensor
       speckle     share of neighbours on one surface with two labels
       confidence  mean of the returns
-      duplicate   likeness to the most similar earlier scan, 0 to 1
+      duplicate   likeness to the most similar earlier scan that is found, 0 to 1
     \b
     Examples:
       lidar-synth curate bank --plot scores.png
@@ -93,7 +93,7 @@ def _scores(
     opened: "Bank", bank: Path, reference: str | None, split: str | None, jobs: int, progress: bool
 ) -> "Scores":
     """From the file where it belongs to this bank and this reference; else made, and kept."""
-    from lidar_synth.bake.curate import FILE, read_scores, score, write_scores
+    from lidar_synth.bake.curate import FILE, kept_in, read_scores, score, write_scores
     from lidar_synth.errors import ConfigError
     from lidar_synth.formats import open_scans
 
@@ -106,8 +106,9 @@ def _scores(
         there = read_scores(path)
         if (there.bank, there.reference) == (opened.identity, name):
             return there
-    scores = score(opened, source, name=name, jobs=jobs, progress=progress)
-    write_scores(path, scores)
+    with kept_in(bank) as folder:
+        scores = score(opened, source, name=name, jobs=jobs, progress=progress, folder=folder)
+        write_scores(path, scores)
     return scores
 
 

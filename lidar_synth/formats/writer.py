@@ -138,8 +138,7 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
     """
     wanted = json.loads(json.dumps(settings))
     if not path.is_file():
-        write_file(path, json.dumps(wanted, indent=1).encode())
-        return
+        write_file(path, json.dumps(wanted, indent=1).encode(), overwrite=False)  # another one may be as quick
     try:
         there = json.loads(read_text(path))
     except ValueError as error:

@@ -1,15 +1,20 @@
-"""Scans that are alike, by their signatures. The work grows with the square of the number of scans."""
+"""Scans that are alike, by their signatures: all pairs of a bank that is not large, and of others what is found."""
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from lidar_synth.bake.curate.neighbours import Signatures, find_alike
+
+ALL_PAIRS = 20_000
+"""Scans of which every pair is compared."""
+
 BLOCK = 2048
 """Signatures compared with one another at a time: 16 MB of products."""
 
 
-def most_alike(signatures: NDArray[np.float16], progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """For each scan the one before it that is most like it.
+def most_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """For each scan the one before it that is most like it; of more than ``ALL_PAIRS`` the one that is found to be.
 
     Only those before it: of a group of scans that are alike, the first one is like none, and stays where the others
     are dropped.
@@ -21,6 +26,11 @@ def most_alike(signatures: NDArray[np.float16], progress: bool = True) -> tuple[
     Returns:
         (N,) likeness in [0, 1], 0 for the first scan; (N,) number of that scan, -1 for the first.
     """
+    return (compare_all if len(signatures) <= ALL_PAIRS else find_alike)(signatures, progress)
+
+
+def compare_all(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """As ``most_alike``, by every pair; the work grows with the square of the number of scans."""
     count = len(signatures)
     best, twin = np.zeros(count), np.full(count, -1)
     starts = range(0, count, BLOCK)

@@ -1,6 +1,6 @@
 """What is measured of one scan, without knowing the others."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +16,9 @@ RANGE_BINS = 64
 
 SIDE, CELLS = 80.0, 32
 """Side in metres of the square around the sensor that a signature shows from above, and its cells along it."""
+
+SIGNATURE = CELLS * CELLS
+"""Entries of a signature."""
 
 GROUND = tuple(TRAIN_ID[name] for name in ("road", "parking", "sidewalk", "other-ground", "terrain"))
 """Train ids of what one can stand on."""
@@ -82,7 +85,7 @@ class Features(NamedTuple):
         numbers: by name in ``MEASURES``.
         ranges: (RANGE_BINS,) returns by range.
         classes: (19,) returns by train id.
-        signature: (CELLS * CELLS,) float16, the square roots of the returns in each cell of a map, farthest ahead and
+        signature: (SIGNATURE,) float16, the square roots of the returns in each cell of a map, farthest ahead and
             left first, as a vector of length 1; 0 for a scan without a return there. The product of two such vectors is
             the Bhattacharyya coefficient of the maps: 1 for scans that are alike, 0 for what has nothing in common.
     """
@@ -93,11 +96,15 @@ class Features(NamedTuple):
     signature: NDArray[np.float16]
 
 
+def measured(fields: Collection[str]) -> tuple[str, ...]:
+    """The names in ``MEASURES`` of what can be measured of scans with these fields."""
+    return tuple(name for name, measure in MEASURES.items() if measure.field is None or measure.field in fields)
+
+
 def features(image: RangeImage) -> Features:
     """What is measured of a range image, as far as its channels go."""
     scan = unproject(image)
-    known = {name: m for name, m in MEASURES.items() if m.field is None or m.field in image.channels}
-    numbers = {name: measure.of(image, scan) for name, measure in known.items()}
+    numbers = {name: MEASURES[name].of(image, scan) for name in measured(image.channels)}
     ranges, _ = np.histogram(image.range[image.mask], RANGE_BINS, (0, image.sensor.range_max))
     labels = np.zeros(0, np.uint8) if scan.label is None else scan.label
     classes = np.bincount(labels[labels != IGNORE], minlength=len(NAMES))
@@ -108,7 +115,7 @@ def _signature(points: NDArray[np.float32]) -> NDArray[np.float16]:
     half = SIDE / 2
     near = points[(np.abs(points[:, :2]) < half).all(1), :2]
     row, column = ((half - near) * (CELLS / SIDE)).astype(np.int64).clip(0, CELLS - 1).T
-    roots = np.sqrt(np.bincount(row * CELLS + column, minlength=CELLS * CELLS))
+    roots = np.sqrt(np.bincount(row * CELLS + column, minlength=SIGNATURE))
     return (roots / max(float(np.linalg.norm(roots)), 1.0)).astype(np.float16)
 
 

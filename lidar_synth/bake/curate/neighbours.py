@@ -1,0 +1,184 @@
+"""Scans that are alike among very many, approximately: each is compared with a few cells of a Voronoi partition.
+
+A signature is projected onto random signs and rounded to bytes, its sketch, which keeps distances to some per cent
+(Johnson and Lindenstrauss; Achlioptas, "Database-friendly random projections", 2003). Some sketches, drawn at random,
+are the centres of cells; a scan is compared with the earlier scans of the ``PROBES`` cells whose centres are nearest to
+it (an inverted file: Jegou et al., "Product quantization for nearest neighbor search", 2011), and the ``CANDIDATES``
+nearest sketches found by their whole signatures. Exact copies are found by hash, always.
+
+Everything before the whole signatures is integers that float32 holds exactly: the result does not depend on the
+machine, its threads, or how many rows are taken at a time. The work grows with N^1.5.
+"""
+
+import hashlib
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from lidar_synth.noise import keyed_rng
+
+DIMENSIONS = 64
+"""Of a sketch."""
+
+CELLS_PER_ROOT = 2
+"""Cells, for each of the square root of the number of scans."""
+
+PROBES = 16
+"""Cells that a scan is compared with."""
+
+CROWD = 4096
+"""Scans of one cell that others are compared with, at most: the first ones. A cell holds an eighth of it at a million
+scans, unless very many are almost the same; then the first of them are found."""
+
+CANDIDATES = 6
+"""Nearest sketches whose whole signatures are compared."""
+
+ROWS = 1024
+"""Signatures taken at a time."""
+
+_STEPS = 4095  # of an entry of a signature, which lies in [0, 1]: sums of 1024 of them are exact in float32
+_SAMPLE = 65_536  # signatures that centre and scale of the sketches are taken from
+_SPREAD = 4  # standard deviations that a byte holds
+_NUMBERS = 2.0**30  # more than there are scans; times a distance, float64 holds it exactly
+_NONE = 2.0**53 - 1  # more than any key
+
+
+class Signatures(Protocol):
+    """(N, D) float16 unit vectors without negative entries, in memory or on disk."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, rows: Any, /) -> NDArray[np.float16]:
+        """Some rows, by a slice or an array of their numbers."""
+        ...
+
+
+def find_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """For each signature an earlier one that is most like it, or nearly so; as ``most_alike``.
+
+    Returns:
+        (N,) likeness in [0, 1], never more than that of the most similar one; (N,) number of the earlier one, -1 where
+        none was found.
+    """
+    count = len(signatures)
+    likeness, twin = np.zeros(count), np.full(count, -1)
+    with tqdm(total=PROBES + 3, desc="duplicates", unit="step", disable=not progress, delay=2) as steps:
+        first = _first_copies(signatures)
+        steps.update()
+        own = np.flatnonzero(first == np.arange(count))  # the first of each group of copies
+        sketches = _sketches(signatures, own)
+        steps.update()
+        nearest = _nearest(sketches, steps)
+        for part in _parts(count):
+            candidates = nearest[np.searchsorted(own, first[part])]
+            found = np.where(candidates < 0, -1, own[candidates])  # numbers among the first ones, and among all
+            copies = first[part] < np.arange(part.start, part.stop)
+            found[copies] = first[part][copies, None]
+            likeness[part], twin[part] = _best(signatures, part, found)
+        steps.update()
+    return likeness, twin
+
+
+def _parts(count: int) -> Iterator[slice]:
+    return (slice(start, min(start + ROWS, count)) for start in range(0, count, ROWS))
+
+
+def _first_copies(signatures: Signatures) -> NDArray[np.int64]:
+    """(N,) the number of the first signature with the same bytes."""
+    hashes = np.empty(len(signatures), np.uint64)
+    for part in _parts(len(signatures)):
+        rows = np.ascontiguousarray(signatures[part])
+        hashes[part] = [int.from_bytes(hashlib.blake2b(row.tobytes(), digest_size=8).digest(), "big") for row in rows]
+    _, first, group = np.unique(hashes, return_index=True, return_inverse=True)
+    return first[group]
+
+
+def _sketches(signatures: Signatures, own: NDArray[np.int64]) -> NDArray[np.int8]:
+    """(len(own), DIMENSIONS) the sketches of some signatures."""
+    width = signatures[:1].shape[1]
+    signs = keyed_rng(width, DIMENSIONS).choice(np.array([-1, 1], np.float32), (width, DIMENSIONS))
+
+    def project(rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        values: NDArray[np.float32] = np.rint(signatures[rows].astype(np.float32) * _STEPS) @ signs
+        return values
+
+    some = own[np.linspace(0, len(own) - 1, min(len(own), _SAMPLE)).astype(np.int64)]
+    total, squares = np.zeros(DIMENSIONS), 0.0  # of integers below 2^53
+    for part in _parts(len(some)):
+        values = project(some[part]).astype(np.float64)
+        total += values.sum(0)
+        squares += float((values**2).sum())
+    centre = np.rint(total / len(some)).astype(np.float32)
+    variance = squares / len(some) - float((total / len(some)) @ (total / len(some)))
+    scale = np.float32(127 / _SPREAD / max(np.sqrt(max(variance, 0.0) / DIMENSIONS), 1.0))
+    sketches = np.empty((len(own), DIMENSIONS), np.int8)
+    for part in _parts(len(own)):
+        sketches[part] = np.rint((project(own[part]) - centre) * scale).clip(-127, 127)
+    return sketches
+
+
+def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32]:
+    """(N, CANDIDATES) numbers of the earlier sketches that are nearest, -1 where there are fewer."""
+    count = len(sketches)
+    cells = min(count, int(CELLS_PER_ROOT * count**0.5) + 1)
+    centres = sketches[np.sort(keyed_rng(count, cells).choice(count, cells, replace=False))]
+    probes = np.empty((count, min(PROBES, cells)), np.min_scalar_type(cells))
+    for part in _parts(count):
+        keys = _keys(sketches[part], centres, np.arange(cells))
+        probes[part] = np.sort(np.partition(keys, probes.shape[1] - 1)[:, : probes.shape[1]]) % _NUMBERS
+    order, bounds = _by_cell(probes[:, 0], cells)
+    members = [order[a:b][:CROWD] for a, b in pairwise(bounds)]
+    best = np.full((count, CANDIDATES), _NONE)
+    for probe in probes.T:
+        queries, bounds = _by_cell(probe, cells)
+        for cell, (a, b) in enumerate(pairwise(bounds)):
+            for start in range(a, b, ROWS):
+                _compare(sketches, queries[start : min(start + ROWS, b)], members[cell], best)
+        steps.update()
+    best[best == _NONE] = -1
+    np.fmod(best, _NUMBERS, out=best)
+    return best.astype(np.int32)
+
+
+def _by_cell(of: NDArray[np.unsignedinteger], cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of the sketches, those of one cell together and ascending; where each cell begins, and the end."""
+    order = np.argsort(of, kind="stable")
+    return order, np.searchsorted(of[order], np.arange(cells + 1))
+
+
+def _compare(
+    sketches: NDArray[np.int8], queries: NDArray[np.int64], members: NDArray[np.int64], best: NDArray[np.float64]
+) -> None:
+    """Enter, among the best of each query, the earlier members of a cell."""
+    keys = _keys(sketches[queries], sketches[members], members)
+    keys[members >= queries[:, None]] = _NONE
+    best[queries] = np.partition(np.concatenate([best[queries], keys], 1), CANDIDATES - 1)[:, :CANDIDATES]
+
+
+def _keys(some: NDArray[np.int8], others: NDArray[np.int8], numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(M, N) squared distance of two sketches, and the number of the second one: ordered by the one, then the other."""
+    a, b = some.astype(np.float32), others.astype(np.float32)
+    distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)  # whole numbers below 2^22
+    keys: NDArray[np.float64] = distances.astype(np.float64) * _NUMBERS + numbers
+    return keys
+
+
+def _best(
+    signatures: Signatures, part: slice, found: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Likeness and number of the most similar of the candidates (M, K) of some signatures; the first of equals."""
+    found = np.sort(found, 1)
+    numbers, places = np.unique(found, return_inverse=True)
+    others = signatures[numbers.clip(0)].astype(np.float32)
+    own = signatures[part].astype(np.float32)
+    likeness = np.full(found.shape, -1.0)
+    for column, place in enumerate(places.reshape(found.shape).T):
+        likeness[:, column] = np.einsum("nd,nd->n", own, others[place])
+    likeness[found < 0] = -1
+    best = likeness.argmax(1)
+    rows = np.arange(len(found))
+    return likeness[rows, best].clip(0, 1), found[rows, best]

@@ -1,0 +1,151 @@
+"""The features of a bank's scans on disk, so that no bank is too large for the memory.
+
+A file holds ``BLOCK`` scans, 2.4 kB each, and is there whole or not at all: a run that was killed resumes behind the
+files that are there.
+"""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+import lidar_synth
+from lidar_synth.bake.curate.features import RANGE_BINS, SIGNATURE, features, measured
+from lidar_synth.bake.lock import alone, shared
+from lidar_synth.bank import INDEX, Bank
+from lidar_synth.classes import NAMES
+from lidar_synth.errors import DataError, FileError
+from lidar_synth.files import write_file
+from lidar_synth.formats.convert import in_processes
+
+BLOCK = 4096
+"""Scans of a file."""
+
+FOLDER = ".curate"
+"""In a bank's folder, while its scans are measured."""
+
+_UNIT = 64  # scans that a worker takes at a time
+
+
+class Store:
+    """Rows of features, one for each scan of a bank.
+
+    Args:
+        folder: of the files.
+        count: rows when all are there.
+        names: of the numbers that are measured.
+
+    Attributes:
+        dtype: of a row: ``ranges``, ``classes``, ``numbers`` and ``signature``, as in ``Features``.
+    """
+
+    def __init__(self, folder: Path, count: int, names: tuple[str, ...]) -> None:
+        self.folder, self.count, self.names = folder, count, names
+        self.dtype = np.dtype([
+            ("ranges", "<u4", RANGE_BINS), ("classes", "<u4", len(NAMES)), ("numbers", "<f8", len(names)),
+            ("signature", "<f2", SIGNATURE),
+        ])  # fmt: skip
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, rows: "slice | NDArray[np.int64]") -> NDArray[np.float16]:
+        """The signatures of some rows; nothing of them stays in memory."""
+        numbers = np.arange(self.count)[rows] if isinstance(rows, slice) else rows
+        found = np.empty((len(numbers), SIGNATURE), np.float16)
+        for block in np.unique(numbers // BLOCK).tolist():
+            here = numbers // BLOCK == block
+            found[here] = self.read(block)["signature"][numbers[here] % BLOCK]
+        return found
+
+    def read(self, block: int) -> NDArray[Any]:
+        """The rows of a file, mapped from the disk.
+
+        Raises:
+            FileError: where it cannot be read.
+            DataError: where it holds something else.
+        """
+        path = self._path(block)
+        try:
+            rows: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+        except OSError as error:
+            raise FileError(f"{path} cannot be read ({error.strerror or error})", "what was measured") from error
+        except ValueError as error:
+            raise DataError(f"{path} is damaged ({error})", "what was measured") from error
+        if rows.dtype != self.dtype or rows.shape != (min(BLOCK, self.count - block * BLOCK),):
+            raise DataError(f"{path} holds {rows.shape} of {rows.dtype}", "what was measured")
+        return rows
+
+    def blocks(self) -> Iterator[NDArray[Any]]:
+        """The rows of all files, one file after the other."""
+        return map(self.read, range(-(-self.count // BLOCK)))
+
+    def write(self, block: int, rows: NDArray[Any]) -> None:
+        """Write a file.
+
+        Raises:
+            FileError: where it cannot be written.
+        """
+        write_file(self._path(block), lambda file: np.save(file, rows, allow_pickle=False), durable=True)
+
+    def there(self) -> int:
+        """How many rows are there, from the first on."""
+        for block in range(-(-self.count // BLOCK)):
+            try:
+                self.read(block)
+            except (FileError, DataError):
+                return block * BLOCK
+        return self.count
+
+    def _path(self, block: int) -> Path:
+        return self.folder / f"features-{block:06d}.npy"
+
+
+def measure(bank: Bank, folder: Path, jobs: int, progress: bool) -> Store:
+    """The features of all scans of a bank; those that are in the folder are not measured again.
+
+    Raises:
+        DataError, FileError: where a scan cannot be read, or the folder cannot be written.
+    """
+    own = folder / f"{bank.identity[:16]}-{lidar_synth.__version__}"  # what another bank or version left is of no use
+    store = Store(own, len(bank), measured(bank.fields))
+    start = store.there()
+    spans = [range(a, min(a + _UNIT, len(bank))) for a in range(start, len(bank), _UNIT)]
+    waiting: list[NDArray[Any]] = []
+    with (
+        in_processes(partial(_rows, bank, store), spans, jobs) as results,
+        tqdm(total=len(bank), initial=start, desc="scores", unit="scan", disable=not progress) as bar,
+    ):
+        for rows in results:
+            waiting.append(rows)
+            bar.update(len(rows))
+            start += len(rows)
+            if start % BLOCK == 0 or start == len(bank):
+                store.write((start - 1) // BLOCK, np.concatenate(waiting))
+                waiting.clear()
+    return store
+
+
+def _rows(bank: Bank, store: Store, span: range) -> NDArray[Any]:
+    rows = np.empty(len(span), store.dtype)
+    for row, number in zip(rows, span, strict=True):
+        found = features(bank.image(number))
+        row["ranges"], row["classes"], row["signature"] = found.ranges, found.classes, found.signature
+        row["numbers"] = [found.numbers[name] for name in store.names]
+    return rows
+
+
+@contextmanager
+def kept_in(root: Path) -> Iterator[Path]:
+    """A folder in a bank's own for the features of its scans; it stays when the run is killed or fails."""
+    with shared(root / INDEX):
+        yield root / FOLDER
+    with alone(root / INDEX) as nobody_else, suppress(OSError):
+        if nobody_else:
+            shutil.rmtree(root / FOLDER)
