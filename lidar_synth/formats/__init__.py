@@ -7,6 +7,7 @@ file per dataset or format holds both. To add a format, write such a file and ad
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from lidar_synth.bank import is_bank, is_url
 from lidar_synth.errors import ConfigError, DataError, FileError
@@ -140,7 +141,7 @@ def open_scans(
         path = Path(path)
     name = layout_of(Path(path)) if layout is None else layout
     reader = choose("layout", name, READERS)
-    options = {"sensor": sensor, "split": split}
+    options: dict[str, Any] = {"sensor": sensor, "split": split}
     if split is not None and reader not in (KITTI360, SemanticKITTI, KITTIObject):
         raise ConfigError(f"split {split!r} of {path}", f"no split: layout {name!r} has none")
     plain = {"fields": fields, "reflectance_max": reflectance_max}

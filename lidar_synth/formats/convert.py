@@ -56,13 +56,13 @@ class Outcome(NamedTuple):
     """What became of one scan.
 
     Args:
-        index: its number in the source.
+        number: its index in the source.
         skipped: why it was not written; "" where it was.
         dropped: points that were left out of it.
         domain: of the scan; None where it was not read.
     """
 
-    index: int
+    number: int
     skipped: str = ""
     dropped: int = 0
     domain: int | None = None
@@ -113,7 +113,7 @@ def convert(
     try:
         with in_processes(work, missing, jobs, CHUNK) as results:
             for done in tqdm(results, total=len(missing), unit="scan", disable=not (progress and missing)):
-                _count(report, done, name_of(source, done.index) or str(done.index))
+                _count(report, done, name_of(source, done.number) or str(done.number))
                 domains.add(done.domain)
     finally:
         if SYNTHETIC in domains and REAL not in domains:

@@ -162,22 +162,24 @@ class SemanticKITTIWriter(Writer):
     def carry(self, source: ScanFiles) -> list[str]:
         if not isinstance(source, SemanticKITTI):
             return ["times.txt: when the scans were taken is not known"]
-        places = [(i, *name.split("/")) for i, name in enumerate(source.ids)]
         missing = []
-        for sequence in sorted({s for _, s, _ in places}):
-            paths = {frame: self.path(i, f"{s}/{frame}") for i, s, frame in places if s == sequence}
-            if any(p.parents[1].name != sequence or int(p.stem) != int(f) for f, p in paths.items() if f.isdigit()):
+        for sequence in sorted({name.split("/")[0] for name in source.ids}):
+            if not all(self._keeps(i, n) for i, n in enumerate(source.ids) if n.startswith(f"{sequence}/")):
                 missing.append(f"the calibration, poses and times of sequence {sequence}: its scans get other numbers")
                 continue
-            folder = self.root / "sequences" / sequence
             self._carried.add(sequence)
             for name in SIDE_FILES:
                 path = source.root / "sequences" / sequence / name
                 if path.is_file():
-                    write_file(folder / name, read_file(path))
+                    write_file(self.root / "sequences" / sequence / name, read_file(path))
                 else:
                     missing.append(f"sequences/{sequence}/{name}: {source.root} has none")
         return missing
+
+    def _keeps(self, index: int, name: str) -> bool:
+        """Whether a scan of SemanticKITTI's keeps its sequence and its frame."""
+        path, (sequence, frame) = self.path(index, name), name.split("/")
+        return path.parents[1].name == sequence and frame.isdigit() and int(path.stem) == int(frame)
 
     def finish(self) -> None:
         for folder in sorted((self.root / "sequences").glob("*")):

@@ -229,7 +229,7 @@ def made_up(sensor: Sensor, fields: frozenset[str]) -> Scan:
 def _generators_kept() -> Iterator[None]:
     """Leave the global generators of Python, numpy and torch as they were."""
     python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 - what a trainer draws from
-    devices = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
+    devices = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []  # type: ignore[no-untyped-call]
     with torch.random.fork_rng(devices):
         try:
             yield

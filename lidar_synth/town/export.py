@@ -11,7 +11,7 @@ from tqdm import tqdm
 from lidar_synth.errors import ConfigError
 from lidar_synth.files import write_file
 from lidar_synth.formats.convert import in_processes
-from lidar_synth.formats.domain import TOWN as SETTINGS
+from lidar_synth.formats.domain import TOWN
 from lidar_synth.formats.kitti360 import KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
@@ -29,6 +29,7 @@ LAYOUTS: dict[str, type[Writer]] = {
 SEQUENCES = {"kitti360": 4, "semantic_kitti": 0}
 """Where scans go by default: a drive or sequence that every split trains on."""
 
+SETTINGS = TOWN
 _README = """# Synthetic street scans
 
 These scans are **synthetic**: rays cast into a procedural town by `lidar-synth town` (package lidar_synth). They are

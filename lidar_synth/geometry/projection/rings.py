@@ -120,7 +120,7 @@ def _best_of(group: NDArray[np.intp], elevation: NDArray[np.float64]) -> int:
         sides = elevation[low:begin], elevation[begin:high]
         return float(sum(np.abs(side - np.median(side)).sum() for side in sides))
 
-    return min(group.tolist(), key=uneven)
+    return int(min(group.tolist(), key=uneven))
 
 
 def _without_fragments(begins: NDArray[np.intp], elevation: NDArray[np.float64]) -> NDArray[np.intp]:
