@@ -129,6 +129,9 @@ def test_a_release_becomes_a_checkpoint(name: str, tmp_path: Path) -> None:
     assert (header.normalisation.kind, header.normalisation.divisor) == ("linear", 56.0)
     assert list(header.conditioning) == ([name] if name in ("semantic", "camera") else [])
     assert header.provenance["data"] == "KITTI-360"
+    seen = {part["dataset"]: part["drives"] for part in header.provenance["seen"]}
+    assert "2013_05_28_drive_0002_sync" in seen["KITTI-360"]
+    assert ("odometry 21" in seen.get("KITTI", {})) == (VELOCITY in networks)  # the autoencoder's, within a flow's file
     if VELOCITY in networks:  # the averaged weights are taken, not the last ones
         head = networks[VELOCITY].state_dict()["head.bias"]
         assert torch.equal(head, weights[f"{UNET_EMA}diffusion_modelout2bias"])

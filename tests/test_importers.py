@@ -98,6 +98,10 @@ def test_the_header_says_what_the_peer_does(released: Path) -> None:
     assert len(header.time_grid) == 33
     assert header.provenance["data"] == "KITTI-360"
     assert header.provenance["images"] == 96
+    [seen] = header.provenance["seen"]
+    assert (seen["dataset"], [drive[-9:-5] for drive in seen["drives"]]) == (
+        "KITTI-360", ["0003", "0004", "0005", "0006", "0007", "0009", "0010"],
+    )  # fmt: skip
     json.dumps(header.to_dict())
 
 
