@@ -21,7 +21,7 @@ if not Path("/proc/self/status").exists():
     pytest.skip("limits and peaks of memory are those of Linux", allow_module_level=True)
 
 from fuzzing import mutators
-from fuzzing.cases import Cases, seed_files
+from fuzzing.cases import Cases, mutable, seed_files
 from fuzzing.checks import fingerprint, flaws
 from fuzzing.run import FLAWS, fuzz
 from fuzzing.targets import TARGETS, Target, read
@@ -85,22 +85,26 @@ def test_a_number_gives_the_same_case(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", map(needs, TARGETS))
 def test_mutators_read_the_valid_files_and_change_them(tmp_path: Path, name: str) -> None:
     """One that always raised would be replaced by flipped bits without a word."""
-    for file, content in seed_files(TARGETS[name], tmp_path / "valid").items():
-        known = mutators.BY_SUFFIX.get(Path(file).suffix)
+    files = seed_files(TARGETS[name], tmp_path / "valid")
+    for file in mutable(TARGETS[name], files):
+        content, known = files[file], mutators.BY_SUFFIX.get(Path(file).suffix)
         assert known, f"no mutator knows {file}"
         for mutator in [*known, *mutators.BY_SUFFIX[""]]:
             made = [mutator(content, Random(number)) for number in range(8)]
-            assert sum(other != content for other in made) >= 5, mutator
+            assert sum(other != content for other in made) >= 3, mutator
             assert made[0] == mutator(content, Random(0)), mutator
 
 
-def only_zeros(root: Path) -> None:
+NUMBERS = bytes(range(256))
+
+
+def only_numbers(root: Path) -> None:
     root.mkdir()
-    (root / "zeros.bin").write_bytes(bytes(4))
+    (root / "numbers.bin").write_bytes(NUMBERS)
 
 
 def is_valid(root: Path) -> bool:
-    return (root / "zeros.bin").is_file() and (root / "zeros.bin").read_bytes() == bytes(4)
+    return (root / "numbers.bin").is_file() and (root / "numbers.bin").read_bytes() == NUMBERS
 
 
 def refuses(root: Path) -> list[Any]:
@@ -167,7 +171,7 @@ def gives_nan(root: Path) -> list[Any]:
 )
 def test_what_a_broken_reader_does_is_noticed(reader: Any, verdict: str, detail: str) -> None:
     """The process is started again where a case ended it, so that every case is counted."""
-    report = fuzz("broken", Target(only_zeros, reader), range(3), limits=Limits(seconds=1.0))
+    report = fuzz("broken", Target(only_numbers, reader), range(3), limits=Limits(seconds=1.0))
     assert report.counts == {verdict: 3}
     assert [flaw.number for flaw in report.flaws] == ([0, 1, 2] if verdict in FLAWS else [])
     assert all(detail in flaw.detail for flaw in report.flaws)
@@ -175,7 +179,7 @@ def test_what_a_broken_reader_does_is_noticed(reader: Any, verdict: str, detail:
 
 def test_a_harness_that_fails_is_no_verdict() -> None:
     with pytest.raises(RuntimeError, match=r"broken: the harness failed \(exit status 1\)(.|\n)*KeyError"):
-        fuzz("broken", Target(only_zeros, partial(dict.__getitem__, {})), range(1))
+        fuzz("broken", Target(only_numbers, partial(dict.__getitem__, {})), range(1))
 
 
 def test_checks_see_what_is_unsound() -> None:
@@ -203,7 +207,7 @@ def test_the_tool_prints_a_table_and_keeps_what_is_wrong(
 ) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "tools"))
     tool = importlib.import_module("fuzz")
-    monkeypatch.setitem(TARGETS, "broken", Target(only_zeros, raises))
+    monkeypatch.setitem(TARGETS, "broken", Target(only_numbers, raises))
     monkeypatch.setattr(sys, "argv", ["fuzz.py", "--cases", "4", "--reader", "bin", "--reader", "broken",
                                       "--keep", str(tmp_path)])  # fmt: skip
     with pytest.raises(SystemExit) as ended:

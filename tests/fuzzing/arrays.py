@@ -11,8 +11,8 @@ from fuzzing.mutators import FLOATS, INTEGERS, mutates
 from fuzzing.text import encoded, replace_number, replace_word
 
 TYPES = (
-    "<f4", ">f4", "<f2", "<f8", "<c8", "<c16", "|O", "<U4", "|S4", "|V4", "<M8[s]", "<m8[D]", "|b1", "|u1", "<i2", "<u4",
-    "<i8", "<u8",
+    "<f4", ">f4", "<f2", "<f8", "<c8", "<c16", "|O", "<U4", "|S4", "|V4", "<M8[s]", "<m8[D]", "|b1", "|u1", "<i2",
+    "<u4", "<i8", "<u8",
 )  # fmt: skip
 """What an array may be of."""
 

@@ -18,6 +18,7 @@ Files = Mapping[str, bytes]
 def seed_files(target: Target, folder: Path) -> Files:
     """The files of the valid dataset; they are made in ``folder``, or read from there if it exists."""
     if not folder.is_dir():
+        folder.parent.mkdir(parents=True, exist_ok=True)
         part = folder.with_name(f"{folder.name}.part")
         shutil.rmtree(part, ignore_errors=True)
         target.make(part)
@@ -25,10 +26,14 @@ def seed_files(target: Target, folder: Path) -> Files:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+def mutable(target: Target, files: Files) -> list[str]:
+    """The names of the files that may be mutated."""
+    return [name for name in files if any(fnmatch(Path(name).name, pattern) for pattern in target.files)]
+
+
 def mutated(target: Target, files: Files, rng: Random) -> dict[str, bytes | None]:
     """The files that are other in a case than in the valid dataset; None = missing."""
-    names = [name for name in files if fnmatch(Path(name).name, target.files)]
-    name = rng.choice(names)
+    name = rng.choice(mutable(target, files))
     change = rng.random()
     if change < 0.01:
         return {name: None}

@@ -11,8 +11,10 @@ from fuzzing.mutators import INTEGERS, LIMIT, mutate, mutates
 
 Members = list[tuple[str, bytes]]
 
-NAMES = ("", "x.npy", "points.npy", "range.npy", "sensor.npy", "label.npy", "allow_pickle.npy", "../../x.npy", "/x.npy",
-         "points.npy/", "a" * 60_000, "\u00e4.npy", "box_values.npy", "box_.npy", "pose.npy", "image.npy", "json")  # fmt: skip
+NAMES = (
+    "", "x.npy", "points.npy", "range.npy", "sensor.npy", "label.npy", "allow_pickle.npy", "../../x.npy", "/x.npy",
+    "points.npy/", "a" * 60_000, "\u00e4.npy", "box_values.npy", "box_.npy", "pose.npy", "image.npy", "json",
+)  # fmt: skip
 """What a member may be called."""
 
 
@@ -149,8 +151,10 @@ def edit_tar(content: bytes, rng: Random) -> bytes:
     i = rng.randrange(len(members))
     if rng.random() < 0.25:
         stem, dot, kind = members[i][0].partition(".")
-        name = rng.choice(("", "x." + kind, "../../" + stem + dot + kind, stem, f"%2E%2E/{kind}", f"{stem}.{kind}.npy",
-                           f"{stem}.ring.npy", f"{stem}.pose.npy", "a" * 300 + dot + kind, "\udcff" + dot + kind))  # fmt: skip
+        ends = ("json", "points.npy", "ring.npy", "pose.npy", f"{kind}.npy", kind)
+        name = (
+            rng.choice(("x", "../../" + stem, "%2E%2E/x", "/x", "", "a" * 300, "\udcff", stem)) + dot + rng.choice(ends)
+        )
         members[i] = (name, members[i][1])
     else:
         members = edit_members(members, rng)

@@ -34,14 +34,14 @@ class Target:
     Args:
         make: writes a small valid dataset into a folder; the same bytes every time.
         read: reads the folder and returns all that it found, for ``checks``.
-        files: pattern of the names of the files that are mutated.
+        files: patterns of the names of the files that are mutated.
         mend: makes checksums of the folder fit again after a mutation, where they can be; done for half of the cases.
         library: that has to be importable.
     """
 
     make: Callable[[Path], object]
     read: Callable[[Path], Any]
-    files: str = "*"
+    files: tuple[str, ...] = ("*",)
     mend: Callable[[Path], object] | None = None
     library: str = ""
 
@@ -212,9 +212,9 @@ TARGETS: dict[str, Target] = {
     "kitti_raw": Target(make_kitti_raw, partial(read, "kitti_raw")),
     "kitti360": Target(partial(write, "kitti360"), partial(read, "kitti360")),
     "nuscenes": Target(partial(write_nuscenes, count=2), partial(read, "nuscenes")),
-    "bank": Target(make_bank, partial(read, "bank"), mend=mend_index),
-    "bank_index": Target(make_bank, partial(read, "bank"), files="index.json", mend=mend_index),
-    "bank_shard": Target(make_bank, read_shard, files="shard-00000.h5"),
+    "bank": Target(make_bank, partial(read, "bank"), files=("*.h5", "index.json"), mend=mend_index),
+    "bank_index": Target(make_bank, partial(read, "bank"), files=("index.json",), mend=mend_index),
+    "bank_shard": Target(make_bank, read_shard, files=("shard-00000.h5",)),
     "sensor": Target(make_sensors, read_sensors),
     "checkpoint": Target(make_checkpoint, read_checkpoint),
 }

@@ -6,6 +6,7 @@ import resource
 import sys
 import time
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing.connection import Connection
@@ -146,8 +147,6 @@ def memory(name: str) -> int:
 def reset_peak() -> int:
     """Set the peak of the process's memory to what it holds now; bytes. Where the system refuses, the old peak stays,
     and what lies below it is not seen."""
-    try:
+    with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        pass
     return memory("VmHWM")
