@@ -5,8 +5,8 @@ A file is written beside its place and renamed, so that a reader never meets hal
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError, FileError
+
+LARGEST_IMAGE = 65535
+"""Pixels of an image's width or height at most."""
 
 SKIP_HINT = "Copy the file again, or leave it out with on_bad='skip'."
 
@@ -128,9 +131,20 @@ def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
     """
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
     try:
+        if any(len(row) != columns for row in rows):
+            raise ValueError("a line of another length")
         return np.array(rows, np.float64).reshape(-1, columns)
     except ValueError as error:
         raise DataError(f"{path} does not hold rows of {columns} numbers", f"{columns} numbers per line") from error
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Name a file in the errors of what is made from its values."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
 
 
 def read_named_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -162,16 +176,16 @@ def write_named_matrices(path: Path, matrices: Mapping[str, NDArray[np.float64]]
 
 
 def png_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) of a PNG, from its header; None where there is no such file."""
+    """(width, height) of a PNG, from its header; None where there is no such file, or its header is damaged."""
     try:
         with path.open("rb") as file:
             header = file.read(24)
     except OSError:
         return None
-    if header[:8] != b"\x89PNG\r\n\x1a\n":
+    if len(header) < 24 or header[:8] != b"\x89PNG\r\n\x1a\n":
         return None
     width, height = np.frombuffer(header[16:], ">u4").tolist()
-    return width, height
+    return (width, height) if 1 <= min(width, height) <= max(width, height) <= LARGEST_IMAGE else None
 
 
 def numbers(values: Iterable[float]) -> str:

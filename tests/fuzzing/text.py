@@ -87,6 +87,17 @@ def change_words_of_a_line(content: bytes, rng: Random) -> bytes:
     return b"\n".join(lines)
 
 
+@mutates(".pcd", ".ply")
+def edit_header(content: bytes, rng: Random) -> bytes:
+    """Numbers, words and lines of a header change; what stands below it does not."""
+    end = next(m.end() for m in re.finditer(rb"^(DATA|end_header)[^\n]*\n", content, re.M))
+    header = content[:end]
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        change = rng.choice((replace_number, replace_number, replace_word, change_lines, change_words_of_a_line))
+        header = change(header, rng)
+    return header + content[end:]
+
+
 @mutates(".txt", ".json", ".yaml", ".xml")
 def change_encoding(content: bytes, rng: Random) -> bytes:
     """Another encoding than UTF-8."""
