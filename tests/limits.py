@@ -1,4 +1,4 @@
-"""Run a call in a process of its own, within limits of memory and time: for input that could end or exhaust a process."""
+"""Run a call in a process of its own, within limits of memory and time, as input that could end a process needs."""
 
 import re
 from collections.abc import Callable
