@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import typer
 from banks import some_image, write_bank
-from layouts import MAKERS, WRITTEN_AS, formats, some_scan, write_all
+from layouts import MAKERS, WRITTEN_AS, some_scan, write_all
 from typer.testing import CliRunner
 
 from lidar_synth.classes import IGNORE, SEMANTIC_KITTI
@@ -33,7 +33,7 @@ def files(root: Path) -> dict[str, bytes]:
     return {p.relative_to(root).as_posix(): p.read_bytes() for p in paths}
 
 
-@pytest.mark.parametrize("to", formats())
+@pytest.mark.parametrize("to", WRITERS)
 @pytest.mark.parametrize("layout", READERS)
 def test_every_layout_becomes_every_format(tmp_path: Path, layout: str, to: str) -> None:
     MAKERS[layout](tmp_path / "in")

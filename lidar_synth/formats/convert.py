@@ -77,8 +77,7 @@ def convert(
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
     claim(writer.root / SETTINGS, _settings(source, writer, as_sensor))
-    missing = [i for i in range(len(source)) if not writer.complete(i, name_of(source, i))]
-    report = Report(kept=len(source) - len(missing))
+    missing, report = _compare(source, writer, on_bad)
     work = partial(convert_one, source, writer, as_sensor, on_bad)
     with in_processes(work, missing, jobs, CHUNK) as results:
         for index, reason in tqdm(results, total=len(missing), unit="scan", disable=not (progress and missing)):
@@ -88,6 +87,34 @@ def convert(
                 report.written += 1
     writer.finish()
     return report
+
+
+def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], Report]:
+    """Indices of the scans that are not there yet, and what is known before any is read.
+
+    Raises:
+        DataError: on a scan whose name is no path under the output folder, or that of a scan before it, with
+            ``on_bad="error"``.
+    """
+    report, missing = Report(), []
+    taken: set[str] = set()
+    for index in range(len(source)):
+        name = name_of(source, index)
+        try:
+            places = {os.path.normcase(writer.path(index, name))} | ({f"id {name}"} if name is not None else set())
+            if places & taken:
+                raise DataError(f"scan {index} is called {name!r}", "a name, and a file, that no scan before it has")
+            taken |= places
+        except DataError as error:
+            if on_bad == "error":
+                raise
+            report.skipped[f"{name} (scan {index})"] = str(error)
+            continue
+        if writer.complete(index, name):
+            report.kept += 1
+        else:
+            missing.append(index)
+    return missing, report
 
 
 def convert_one(source: Source, writer: Writer, as_sensor: Sensor | None, on_bad: OnBad, index: int) -> tuple[int, str]:

@@ -140,10 +140,10 @@ class KITTIObjectWriter(Writer):
         super().__init__(root, calibration=calibration)
         self.part = part
 
-    def path(self, index: int, name: str | None = None) -> Path:
-        match = re.fullmatch(r"(training|testing)/(\d+)", name or "")
+    def _place(self, index: int, name: str | None) -> str:
+        match = re.fullmatch(r"(training|testing)/0*([0-9]{1,10})", name or "")
         part, frame = (match[1], int(match[2])) if match else (self.part, index)
-        return self.root / part / "velodyne" / f"{frame:06d}.bin"
+        return f"{part}/velodyne/{frame:06d}.bin"
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         folder, frame = path.parents[1], path.stem

@@ -133,10 +133,11 @@ class SemanticKITTIWriter(Writer):
         super().__init__(root, calibration=calibration)
         self.sequence = sequence
 
-    def path(self, index: int, name: str | None = None) -> Path:
-        match = re.fullmatch(r"(?:2013_05_28_drive_00)?(\d\d)(?:_sync)?/(\d+)", name or "")
+    def _place(self, index: int, name: str | None) -> str:
+        # Six digits, as the dataset has: poses.txt has a line for every frame up to the last.
+        match = re.fullmatch(r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,6})", name or "")
         sequence, frame = (match[1], int(match[2])) if match else (self.sequence, index)
-        return self.root / "sequences" / sequence / "velodyne" / f"{frame:06d}.bin"
+        return f"sequences/{sequence}/velodyne/{frame:06d}.bin"
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         folder, frame = path.parents[1], path.stem
