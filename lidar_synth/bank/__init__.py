@@ -1,14 +1,15 @@
 """Banks: folders of generated scans as range images in HDF5, "lidar-synth-bank/1".
 
-``encoding`` says how a range image is stored, ``shard`` what a file of them holds and how it is read, ``writer`` writes
-it, ``index`` is what a bank says about itself, ``reader`` makes it a source of scans, ``card`` describes it to people
-and to data set tools.
+``encoding`` says how a range image is stored, ``shard`` what a file of them holds and how it is read, ``layout`` checks
+what such a file declares, ``storage`` reads ranges of files and URLs, ``writer`` writes a shard, ``index`` is what a
+bank says about itself, ``reader`` makes it a source of scans, ``card`` describes it to people and to data set tools.
 """
 
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.bank.index import FORMAT, INDEX, Entry, Facts, Index
-from lidar_synth.bank.reader import Bank, is_bank, is_url
+from lidar_synth.bank.reader import Bank, is_bank
 from lidar_synth.bank.shard import ShardReader
+from lidar_synth.bank.storage import is_url
 from lidar_synth.bank.writer import ShardWriter
 
 __all__ = [

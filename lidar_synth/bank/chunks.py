@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import deflate as libdeflate
+import h5py
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,11 @@ from numpy.typing import NDArray
 from lidar_synth.errors import LibraryError
 
 _GZIP_LEVEL = 1
+_DEFLATE_RATIO = 1032  # no deflated byte holds more
+
+FILTERS = {"gzip": (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32),
+           "blosc2": (32026, h5py.h5z.FILTER_FLETCHER32)}  # fmt: skip
+"""HDF5's numbers of what packs a chunk, in order, by ``compression``."""
 
 
 def checksum(seed: int, index: int, arrays: Mapping[str, NDArray[Any]], condition: bytes = b"") -> int:
@@ -46,6 +52,8 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
     if fletcher32(packed) != int.from_bytes(chunk[-4:], "little"):
         raise ValueError("its Fletcher-32 does not match")
     size = math.prod(shape) * dtype.itemsize
+    if size > _DEFLATE_RATIO * len(packed):
+        raise ValueError(f"{len(packed)} bytes cannot hold {size}")
     try:
         plain = libdeflate.zlib_decompress(packed, size)
     except libdeflate.DeflateError as error:
@@ -57,6 +65,24 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
     for k, plane in enumerate(others, 1):
         values |= np.left_shift(plane, 8 * k, dtype=dtype)
     return values.reshape(shape)
+
+
+def unpack(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any], compression: str) -> NDArray[Any]:
+    """The array in a chunk of a file.
+
+    Raises:
+        ValueError, OSError, RuntimeError: where the chunk is damaged, or holds something else.
+        LibraryError: on Blosc2 without hdf5plugin.
+    """
+    if compression == "gzip":
+        return inflate(chunk, shape, dtype)
+    # hdf5plugin has its filters for HDF5 alone, so HDF5 unpacks the chunk, as the only one of a file in memory.
+    options = {"chunks": (1, *shape), "fletcher32": True, **filters(compression)}
+    with h5py.File("chunk", "w", driver="core", backing_store=False) as file:
+        dataset = file.create_dataset("values", (1, *shape), dtype, **options)
+        dataset.id.write_direct_chunk((0,) * dataset.ndim, chunk)
+        values: NDArray[Any] = dataset[0]
+    return values
 
 
 def fletcher32(data: bytes | bytearray | memoryview) -> int:

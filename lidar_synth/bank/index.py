@@ -38,14 +38,20 @@ from typing import Any
 import h5py
 import numpy as np
 
+from lidar_synth.bank.chunks import FILTERS
 from lidar_synth.bank.encoding import RANGE_STEPS, Encoding
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import DataError
 from lidar_synth.geometry.sensor import Sensor
 
 FORMAT = "lidar-synth-bank/1"
+LAYOUTS = ("plain", "paged")
 INDEX = "index.json"
 
 REPAIR = "lidar-synth repair BANK makes what is damaged or missing again."
+
+_TEXT = ("format", "model", "checkpoint", "label_policy", "licence", "data_licence", "compression", "layout")
+_DEPTH = 32  # most levels of JSON: each nested one costs Python a call
+_SCAN = 20  # fewest bytes of a scan: its seed, its index and its CRC
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,11 @@ class Facts:
         """How the scans are stored."""
         return Encoding(self.sensor, self.fields)
 
+    @cached_property
+    def text_size(self) -> int:
+        """Bytes of all of it as JSON."""
+        return len(json.dumps(self.to_dict()).encode())
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values, with format and scale."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -86,15 +97,19 @@ class Facts:
         """The inverse of ``to_dict``.
 
         Raises:
-            DataError: on another format, keys that do not belong there, or a scale that is not the sensor's.
+            DataError: on another format, keys that do not belong there, values of another kind, or a scale that is
+                not the sensor's.
         """
-        values = dict(values)
-        _check_format(values.pop("format", None), where)
-        scale = values.pop("scale", None)
         try:
-            facts = cls(**values | {"sensor": Sensor.from_dict(values["sensor"]), "fields": tuple(values["fields"])})
+            values = dict(values)
+            _check_format(values.pop("format", None), where)
+            scale = values.pop("scale", None)
+            facts = cls(**values | {"sensor": _sensor(values["sensor"]), "fields": tuple(values["fields"])})
+            facts._check_kinds()
             expected = facts.encoding.scale
-        except (KeyError, TypeError, ConfigError) as error:
+        except DataError:
+            raise
+        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
             raise DataError(f"{where}: facts that do not fit together ({error})", f"those of {FORMAT}") from error
         if scale != expected:
             raise DataError(f"{where}: scale {scale!r}", f"{expected!r} for sensor {facts.sensor.name!r}", REPAIR)
@@ -107,12 +122,27 @@ class Facts:
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any], where: str) -> "Facts":
         """The inverse of ``to_attributes``; raises as ``from_dict``."""
-        _check_format(_plain("format", attributes.get("format", b"")), where)
         try:
+            _check_format(_plain("format", attributes.get("format", b"")), where)
             values = {name: _plain(name, value) for name, value in attributes.items()}
-        except (ValueError, AttributeError) as error:
+        except DataError:
+            raise
+        except (ValueError, TypeError, RecursionError) as error:
             raise DataError(f"{where}: attributes that cannot be read ({error})", f"those of {FORMAT}") from error
         return cls.from_dict(values, where)
+
+    def _check_kinds(self) -> None:
+        """Raise ``TypeError`` or ``ValueError`` where a value is of another kind than it has to be."""
+        kinds = dict.fromkeys(_TEXT[1:], str) | {"settings": dict, "provenance": dict, "software": dict}
+        for name, kind in kinds.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind):
+                raise TypeError(f"{name} is {value!r}")
+            str(value).encode()  # half of a surrogate pair is text for JSON, and for nothing else
+        if not isinstance(self.condition, dict | None):
+            raise TypeError(f"condition is {self.condition!r}")
+        if self.compression not in FILTERS or self.layout not in LAYOUTS:
+            raise ValueError(f"compression {self.compression!r}, layout {self.layout!r}")
 
 
 @dataclass(frozen=True)
@@ -153,9 +183,27 @@ class Entry:
         return rank + bisect_right(range(len(self.dropped)), rank, key=lambda i: self.dropped[i] - i)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values; ``Entry(**values)`` is the inverse."""
+        """Plain values."""
         values = asdict(self)
         return values if self.dropped else {name: value for name, value in values.items() if name != "dropped"}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Entry":
+        """The inverse of ``to_dict``, for a shard that is written.
+
+        Raises:
+            TypeError, ValueError: on keys or values that no shard has.
+        """
+        entry = cls(**values)
+        whole = (entry.seed, entry.first, entry.scans, entry.source, entry.bytes, *entry.dropped)
+        # A JSON number may be 1e30 or 2.0, and a truth value counts as a number too.
+        if not all(type(number) is int and 0 <= number < 1 << 64 for number in whole):
+            raise ValueError(f"numbers of {entry}")
+        if not (isinstance(entry.file, str) and isinstance(entry.sha256, str)):
+            raise TypeError(f"text of {entry}")
+        if entry.scans * _SCAN > entry.bytes:
+            raise ValueError(f"{entry.bytes} bytes cannot hold {entry.scans} scans")
+        return entry
 
     @property
     def span(self) -> str:
@@ -228,20 +276,23 @@ class Index:
             DataError: on another format, or content that is damaged.
         """
         try:
-            values = json.loads(text)
+            values = _from_json(text)
             _check_format(values.get("format"), where)
             given = values.pop("checksum", None)
             if given != _sum(values):
                 raise DataError(f"{where} does not have its own checksum: it was damaged or edited", "it as written")
-            return cls(
+            index = cls(
                 tuple(Facts.from_dict(facts, where) for facts in values["sources"]),
-                tuple(Entry(**entry) for entry in values["shards"]),
+                tuple(Entry.from_dict(entry) for entry in values["shards"]),
                 tuple(values["repairs"]),
                 tuple(values.get("curation", ())),
             )
+            if values["scans"] != index.scans or not all(isinstance(w, str) for w in index.repairs + index.curation):
+                raise ValueError("scans, repairs or curation")
+            return index
         except DataError:
             raise
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise DataError(f"{where} is damaged ({error})", f"the index of a bank, {FORMAT}", REPAIR) from error
 
     def _values(self) -> dict[str, Any]:
@@ -253,6 +304,32 @@ class Index:
             "repairs": list(self.repairs),
         }
         return values | ({"curation": list(self.curation)} if self.curation else {})
+
+
+def _from_json(text: str | bytes) -> Any:
+    """Values of a JSON text.
+
+    Raises:
+        ValueError, RecursionError: where it is none, or nested too deep.
+    """
+    values = json.loads(text)
+    level = [values]
+    for _ in range(_DEPTH):
+        level = [
+            child for v in level if isinstance(v, dict | list) for child in (v.values() if isinstance(v, dict) else v)
+        ]
+    if level:
+        raise ValueError(f"values nested more than {_DEPTH} deep")
+    return values
+
+
+def _sensor(values: Any) -> Sensor:
+    """The sensor of a bank's facts, which tell it as ``to_dict`` does."""
+    sensor = Sensor.from_dict(values)
+    numbers = [v for v in (*sensor.shape, sensor.columns, sensor.rows) if v is not None]
+    if not all(type(number) is int for number in numbers) or sensor.to_dict() != values:
+        raise TypeError(f"sensor {str(values)[:200]}")
+    return sensor
 
 
 def _sum(values: Any) -> str:
@@ -276,12 +353,9 @@ def _attribute(value: Any) -> Any:
     return np.array(text, h5py.string_dtype("utf-8", max(len(text), 1)))
 
 
-_TEXT = ("format", "model", "checkpoint", "label_policy", "licence", "data_licence", "compression", "layout")
-
-
 def _plain(name: str, value: Any) -> Any:
     """The inverse of ``_attribute``."""
     if isinstance(value, float):
         return float(value)
     text = value if isinstance(value, str) else bytes(value).decode()
-    return text if name in _TEXT else json.loads(text)
+    return text if name in _TEXT else _from_json(text)

@@ -6,16 +6,18 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, cast, overload
+from typing import Any, overload
 
 from lidar_synth.bank.index import INDEX, REPAIR, Facts, Index
 from lidar_synth.bank.shard import ShardReader
-from lidar_synth.errors import DataError, FileError, LibraryError
+from lidar_synth.bank.storage import RemoteFile, is_url, open_storage
+from lidar_synth.errors import DataError, FileError
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 _OPEN = 64  # shards kept open at a time
+_REMOTE = 256  # of a bank at a URL: no open files, but about 70 kB each that would have to be fetched again
 
 
 class Bank:
@@ -41,7 +43,7 @@ class Bank:
 
     def __init__(self, root: str | Path) -> None:
         self.root = str(root) if is_url(root) else Path(root)
-        self.index = Index.from_json(_read(self.root, INDEX), f"{self.root}/{INDEX}")
+        self.index = Index.from_json(_read_index(self.root), f"{self.root}/{INDEX}")
         if isinstance(self.root, Path):
             self._check_files(self.root)
         self._shards: OrderedDict[int, ShardReader] = OrderedDict()
@@ -111,8 +113,9 @@ class Bank:
         if number not in self._shards:
             entry = self.index.shards[number]
             where, facts = f"{self.root}/{entry.file}", self.index.sources[entry.source]
-            self._shards[number] = ShardReader(_file(self.root, entry.file), where, facts, entry)
-            if len(self._shards) > _OPEN:
+            file = open_storage(self.root, entry.file, entry.bytes)
+            self._shards[number] = ShardReader(file, where, facts, entry)
+            if len(self._shards) > (_REMOTE if is_url(self.root) else _OPEN):
                 self._shards.popitem(last=False)[1].close()
         self._shards.move_to_end(number)
         return self._shards[number]
@@ -140,11 +143,6 @@ class Bank:
 def is_bank(path: str | Path) -> bool:
     """Whether a folder holds a bank, or what is left of one."""
     return (Path(path) / INDEX).is_file() or any(Path(path).glob("shard-*.h5"))
-
-
-def is_url(path: str | Path) -> bool:
-    """Whether a path leads to another machine, by fsspec."""
-    return isinstance(path, str) and "://" in path
 
 
 class _Names(Sequence[str]):
@@ -179,32 +177,14 @@ def _name(index: Index, shard: int, position: int) -> str:
     return f"{index.sources[entry.source].model}/{entry.seed}/{entry.first + position}"
 
 
-def _file(root: str | Path, name: str) -> Path | BinaryIO:
-    """A file of the bank as ``ShardReader`` takes it."""
-    if isinstance(root, Path):
-        return root / name
+def _read_index(root: str | Path) -> bytes:
+    if isinstance(root, str):
+        return RemoteFile(f"{root.rstrip('/')}/{INDEX}").read_all()
     try:
-        import fsspec
-    except ImportError as error:
-        raise LibraryError(f"{root}, but fsspec cannot be imported ({error})", "", "pip install fsspec") from error
-    try:
-        return cast(BinaryIO, fsspec.open(f"{root.rstrip('/')}/{name}", "rb").open())
-    except ImportError as error:
-        raise LibraryError(f"{root}: {error}", "the file system's package", "pip install s3fs, gcsfs ...") from error
-    except (OSError, ValueError) as error:
-        raise FileError(f"{root}/{name} cannot be read ({error})", "a file of a bank") from error
-
-
-def _read(root: str | Path, name: str) -> bytes:
-    file = _file(root, name)
-    if not isinstance(file, Path):
-        with file:
-            return file.read()
-    try:
-        return file.read_bytes()
+        return (root / INDEX).read_bytes()
     except OSError as error:
         raise FileError(
-            f"{root} holds no bank: {name} cannot be read ({error.strerror})",
+            f"{root} holds no bank: {INDEX} cannot be read ({error.strerror})",
             "the folder of a bank that is finished",
             "A bake that was interrupted goes on by the same command; lidar-synth repair writes a lost index again.",
         ) from error

@@ -12,26 +12,33 @@ A chunk holds one scan of one array: bytes shuffled, deflated (level 1), and the
 as HDF5's own filters do it, so that any HDF5 reads it. The file format is HDF5 1.10's, whose metadata has checksums:
 with older ones a flipped bit in an attribute, such as the scale, would be read in silence. Nothing in a file depends
 on the time of writing.
+
+HDF5 is asked once, when a shard is opened, for the attributes and for where the chunks lie (``layout``). Scans are then
+read from their places in the file, with one read where their chunks lie side by side.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import h5py
+import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.bank.chunks import checksum, filters, inflate
+from lidar_synth.bank.chunks import checksum, filters, unpack
 from lidar_synth.bank.index import FORMAT, REPAIR, Entry, Facts
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.bank.layout import Layout, open_hdf5, read_attributes, read_layout
+from lidar_synth.bank.storage import LocalFile, Storage
+from lidar_synth.errors import DataError, LidarSynthError
+
+_GAP = 16 << 10  # bytes between two chunks that are read along rather than asked for separately
 
 
 class ShardReader:
     """Reads one shard; every scan is checked against its CRC.
 
     Args:
-        file: a path, or an open binary file.
+        file: a path, or a file as the bank opened it, which is closed with the reader.
         name: what to call it in errors.
         facts: what its attributes have to say, as the bank's index has it; None to take what they say.
         entry: which scans it has to hold; None to take what it says.
@@ -47,50 +54,45 @@ class ShardReader:
 
     def __init__(
         self,
-        file: Path | BinaryIO,
+        file: Path | Storage,
         name: str,
         facts: Facts | None = None,
         entry: Entry | None = None,
     ) -> None:
         self.name = name
-        self._file = _open(file, name)
+        self._file = LocalFile(file) if isinstance(file, Path) else file
         try:
-            self._read_facts(facts, entry)
-            self._read_datasets()
+            self.facts, self.entry, self._layout = self._open(facts, entry)
         except BaseException:
             self.close()
             raise
+        self.encoding = self.facts.encoding
 
     def read(self, position: int) -> dict[str, NDArray[Any]]:
         """The arrays of one scan, 0 <= position < scans.
 
         Raises:
             DataError: where it is damaged.
+            FileError: where the file cannot be read.
         """
-        with self._reading(f"scan {position}"):
-            arrays = {name: self._array(name, position) for name in self._datasets}
-            seed, index, crc = (int(self._numbers[n][position]) for n in ("seed", "index", "crc"))
-            if checksum(seed, index, arrays, self._condition(position)) != crc:
-                raise OSError("its CRC does not match")
-            if (seed, index) != (self.entry.seed, self.entry.first + position):
-                raise OSError(f"it is scan {index} of seed {seed}")
-        return arrays
+        return self._read(position)[0]
 
     def condition(self, position: int) -> str | None:
-        """The name of what a scan is conditioned on."""
-        return None if self._conditions is None else self._condition(position).decode()
+        """The name of what a scan is conditioned on.
+
+        Raises:
+            DataError: where it is no text.
+        """
+        with self._reading(f"the condition of scan {position}"):
+            return None if self._layout.conditions is None else self._condition(position).decode()
 
     def chunks(self, position: int) -> tuple[dict[str, bytes], int]:
-        """The chunks of one scan as they are in the file, and its CRC; checked by ``read`` before."""
-        self.read(position)
-        with self._reading(f"scan {position}"):
-            found = {name: self._chunk(name, position) for name in self._datasets}
-        return found, int(self._numbers["crc"][position])
+        """The chunks of one scan as they are in the file, and its CRC; raises as ``read``, which checks them."""
+        return self._read(position)[1], int(self._layout.numbers["crc"][position])
 
     def close(self) -> None:
         """Close the file."""
-        with suppress(OSError, RuntimeError):
-            self._file.close()
+        self._file.close()
 
     def __enter__(self) -> "ShardReader":
         return self
@@ -98,72 +100,97 @@ class ShardReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _read_facts(self, facts: Facts | None, entry: Entry | None) -> None:
-        """Facts and entry, by the file's attributes."""
-        with self._reading("its attributes"):
-            attributes = dict(self._file.attrs)
-            seed, first, scans = (int(attributes.pop(key, 0)) for key in ("seed", "first", "scans"))
-        self.facts = Facts.from_attributes(attributes, self.name)
-        if facts is not None and facts != self.facts:
-            mine, others = self.facts.to_dict(), facts.to_dict()
+    def _open(self, facts: Facts | None, entry: Entry | None) -> tuple[Facts, Entry, Layout]:
+        """Facts and entry, by the file's attributes, and where its scans lie."""
+        expected = (facts.text_size, entry.scans if entry else 0, len(facts.encoding.names)) if facts else ()
+        with self._opening(), open_hdf5(self._file, *expected) as file:
+            with self._reading("its attributes"):
+                attributes = read_attributes(file)
+                numbers = [int(attributes.pop(key, np.uint64(0))) for key in ("seed", "first", "scans")]
+            found = Facts.from_attributes(attributes, self.name)
+            self._check_facts(found, facts)
+            entry = self._checked_entry(*numbers, entry)
+            filters(found.compression)
+            with self._reading("its datasets"):
+                layout = read_layout(file, self._file, entry.scans, found.encoding.arrays(), found.compression)
+        return found, entry, layout
+
+    def _check_facts(self, found: Facts, facts: Facts | None) -> None:
+        if facts is not None and facts != found:
+            mine, others = found.to_dict(), facts.to_dict()
             wrong = ", ".join(key for key in others if mine[key] != others[key])
             raise DataError(f"{self.name}: {wrong} are not those of the bank's index", "a shard of it", REPAIR)
+
+    def _checked_entry(self, seed: int, first: int, scans: int, entry: Entry | None) -> Entry:
         found = Entry(Path(self.name).name, seed, first, scans)
-        self.entry = found if entry is None else entry
-        if (seed, first, scans) != (self.entry.seed, self.entry.first, self.entry.scans):
-            raise DataError(f"{self.name} holds {found.span}", f"{self.entry.span}, by the bank's index", REPAIR)
-        self.encoding = self.facts.encoding
+        entry = found if entry is None else entry
+        if (seed, first, scans) != (entry.seed, entry.first, entry.scans):
+            raise DataError(f"{self.name} holds {found.span}", f"{entry.span}, by the bank's index", REPAIR)
+        return entry
 
-    def _read_datasets(self) -> None:
-        filters(self.facts.compression)
-        count, self._layout = self.entry.scans, self.encoding.arrays()
-        with self._reading("its datasets"):
-            self._numbers = {n: self._file[n][:] for n in ("seed", "index", "crc")}
-            self._conditions = self._file["condition"][:] if "condition" in self._file else None
-            self._datasets = {n: self._file[n] for n in self._layout}
-            shapes = {n: (d.shape, d.dtype) for n, d in self._datasets.items()}
-            expected = {n: ((count, *shape), dtype) for n, (shape, dtype) in self._layout.items()}
-            if shapes != expected or any(v.shape != (count,) for v in self._numbers.values()):
-                raise OSError(f"they are {shapes}, not {expected}")
+    def _read(self, position: int) -> tuple[dict[str, NDArray[Any]], dict[str, bytes]]:
+        """The arrays of a scan, and the chunks that hold them."""
+        with self._reading(f"scan {position}"):
+            packed = self._packed(position)
+            kinds = self.encoding.arrays()
+            arrays = {name: unpack(chunk, *kinds[name], self.facts.compression) for name, chunk in packed.items()}
+            seed, index, crc = (int(values[position]) for values in self._layout.numbers.values())
+            if checksum(seed, index, arrays, self._condition(position)) != crc:
+                raise ValueError("its CRC does not match")
+            if (seed, index) != (self.entry.seed, self.entry.first + position):
+                raise ValueError(f"it is scan {index} of seed {seed}")
+        return arrays, packed
 
-    def _array(self, name: str, position: int) -> NDArray[Any]:
-        """One array of a scan."""
-        if self.facts.compression != "gzip":
-            values: NDArray[Any] = self._datasets[name][position]
-            return values
-        return inflate(self._chunk(name, position), *self._layout[name])
-
-    def _chunk(self, name: str, position: int) -> bytes:
-        """The chunk that holds one array of a scan, as it is in the file."""
-        skipped, chunk = self._datasets[name].id.read_direct_chunk((position, 0, 0))
-        if skipped:
-            raise OSError(f"filters {skipped:b} were left out")
-        return bytes(chunk)
+    def _packed(self, position: int) -> dict[str, bytes]:
+        """The chunks of a scan; those that lie side by side are read at once."""
+        places = {}
+        for name, chunks in self._layout.chunks.items():
+            offset, size, skipped = (int(v[position]) for v in (chunks.offset, chunks.size, chunks.skipped))
+            if skipped:
+                raise ValueError(f"filters {skipped:b} were left out")
+            if not size or offset + size > self._file.size:
+                raise ValueError(f"there is no {name}" if not size else f"its {name} lies outside the file")
+            places[name] = (offset, offset + size)
+        packed = {}
+        for names in _side_by_side(places):
+            start = min(places[name][0] for name in names)
+            content = self._file.read(start, max(places[name][1] for name in names) - start)
+            packed |= {name: content[places[name][0] - start : places[name][1] - start] for name in names}
+        return {name: packed[name] for name in places}
 
     def _condition(self, position: int) -> bytes:
-        return b"" if self._conditions is None else bytes(self._conditions[position])
+        return b"" if self._layout.conditions is None else bytes(self._layout.conditions[position])
+
+    @contextmanager
+    def _opening(self) -> Iterator[None]:
+        try:
+            yield
+        except LidarSynthError:
+            raise
+        except (OSError, RuntimeError) as error:
+            raise DataError(
+                f"{self.name} is cut, damaged or no HDF5 file ({error})", f"a shard of {FORMAT}", REPAIR
+            ) from error
 
     @contextmanager
     def _reading(self, what: str) -> Iterator[None]:
-        """HDF5's errors in words that help."""
+        """The errors of HDF5 and of foreign values in words that help."""
         try:
             yield
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        except LidarSynthError:
+            raise  # from the file itself, which may only be out of reach
+        except (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError) as error:
             raise DataError(f"{self.name}: {what} cannot be read ({error})", "a whole shard", REPAIR) from error
 
 
-def _open(file: Path | BinaryIO, name: str) -> h5py.File:
-    # A chunk is a whole scan and read once: a cache would only cost memory, in every worker.
-    options: dict[str, Any] = {"rdcc_nbytes": 0}
-    if isinstance(file, Path):
-        options["locking"] = False  # nothing is ever written into a shard that is in its place
-        try:
-            with file.open("rb"):
-                pass  # HDF5's own message does not say why it cannot open
-        except OSError as error:
-            reason = error.strerror or error
-            raise FileError(f"shard {name} cannot be read ({reason})", "a shard of the bank", REPAIR) from error
-    try:
-        return h5py.File(file, "r", **options)
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{name} is cut, damaged or no HDF5 file ({error})", f"a shard of {FORMAT}", REPAIR) from error
+def _side_by_side(places: dict[str, tuple[int, int]]) -> list[list[str]]:
+    """Names in groups whose places, (start, end) each, have no gap of more than ``_GAP``."""
+    groups: list[list[str]] = []
+    reached = -_GAP - 1
+    for name in sorted(places, key=lambda name: places[name]):
+        start, end = places[name]
+        if start > reached + _GAP:
+            groups.append([])
+        groups[-1].append(name)
+        reached = max(reached, end)
+    return groups
