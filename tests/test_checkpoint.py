@@ -1,10 +1,12 @@
 """Checkpoints: what is written comes back, and nothing else is taken for one."""
 
+import hashlib
 import json
 import os
 import struct
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -16,11 +18,15 @@ from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthErro
 from lidar_synth.generate.checkpoint import (
     FORMAT,
     VELOCITY,
+    WITHOUT_CHECKSUM,
+    Checkpoint,
     Header,
     Part,
+    has_checksum,
     load_checkpoint,
     read_header,
     save_checkpoint,
+    weights_hash,
 )
 from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.geometry.sensor import Sensor
@@ -61,24 +67,38 @@ def saved(tmp_path: Path) -> Path:
     return path
 
 
+def checksummed(values: dict[str, Any]) -> str:
+    """A header's text, with the checksum that belongs to it."""
+    values = {k: v for k, v in values.items() if k != "checksum"}
+    checksum = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    return json.dumps({**values, "checksum": checksum})
+
+
 def rewrite(path: Path, **changes: Any) -> None:
-    """Change keys of the header (None = take out) without touching anything else."""
+    """Change keys of the header (None = take out) and its checksum without touching anything else."""
     content = path.read_bytes()
     size = struct.unpack("<Q", content[:8])[0]
     outer = json.loads(content[8 : 8 + size])
     header = json.loads(outer["__metadata__"]["lidar_synth"]) | changes
-    outer["__metadata__"]["lidar_synth"] = json.dumps({k: v for k, v in header.items() if v is not None})
+    outer["__metadata__"]["lidar_synth"] = checksummed({k: v for k, v in header.items() if v is not None})
     text = json.dumps(outer).encode()
     path.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + size :])
 
 
 def replace_weights(path: Path, change: Any) -> None:
     """Save other weights under a header that knows nothing of it but their sum, as a careless tool would."""
-    from lidar_synth.generate.checkpoint import weights_hash
-
     tensors = load_file(path)
     change(tensors)
-    save_file(tensors, path, {"lidar_synth": json.dumps({**HEADER.to_dict(), "weights": weights_hash(tensors)})})
+    save_file(tensors, path, {"lidar_synth": checksummed({**HEADER.to_dict(), "weights": weights_hash(tensors)})})
+
+
+def save_version_1(path: Path, header: Header = HEADER) -> str:
+    """A checkpoint as version 0.1.0 wrote it; returns its hash."""
+    tensors = {f"{VELOCITY}.{k}": v.detach() for k, v in network().state_dict().items()}
+    values = {**header.to_dict(), "format": WITHOUT_CHECKSUM, "weights": weights_hash(tensors)}
+    text = json.dumps(values, sort_keys=True, allow_nan=False)
+    save_file(tensors, path, {"lidar_synth": text})
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def test_everything_comes_back(saved: Path) -> None:
@@ -145,8 +165,9 @@ def test_a_flipped_bit_in_a_weight(saved: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": "lidar-synth-checkpoint/2"}, f"format 'lidar-synth-checkpoint/2'; expected '{FORMAT}'"),
+        ({"format": "lidar-synth-checkpoint/3"}, f"format 'lidar-synth-checkpoint/3'; expected '{FORMAT}'"),
         ({"format": None}, "format None"),
+        ({"format": WITHOUT_CHECKSUM}, r"header keys \['checksum'\]"),
         ({"convention": "t=0 noise"}, "convention 't=0 noise'"),
         ({"label_encoding": "one-hot"}, "label_encoding 'one-hot'"),
         ({"colour": "red"}, r"header keys \['colour'\]"),
@@ -174,6 +195,65 @@ def test_a_header_that_is_not_ours(saved: Path, changes: dict[str, Any], message
     with pytest.raises(DataError, match=message) as caught:
         load_checkpoint(saved)
     assert str(saved) in str(caught.value)
+
+
+def same(a: Checkpoint, b: Checkpoint) -> bool:
+    """Whether two checkpoints say the same and hold the same numbers."""
+    states = [{p: n.state_dict() for p, n in c.networks.items()} for c in (a, b)]
+    return (a.header, a.hash) == (b.header, b.hash) and all(
+        torch.equal(value, states[1][part][key]) for part, state in states[0].items() for key, value in state.items()
+    )
+
+
+def test_one_changed_byte_is_refused_or_changes_nothing(saved: Path) -> None:
+    """Every byte of the header in turn, and some of the weights."""
+    content, whole = saved.read_bytes(), load_checkpoint(saved)
+    header = 8 + struct.unpack("<Q", content[:8])[0]
+    random = Random(0)
+    refused = 0
+    for place in [*range(header), *(random.randrange(header, len(content)) for _ in range(50))]:
+        changed = bytearray(content)
+        changed[place] = random.choice([changed[place] ^ (1 << random.randrange(8)), random.randrange(256)])
+        saved.write_bytes(changed)
+        try:
+            assert same(load_checkpoint(saved), whole), place
+        except DataError:
+            refused += 1
+    assert refused > 0.9 * header
+
+
+@pytest.mark.parametrize(("old", "new"), [(b"0.86", b"0.76"), (b'range_max\\": 80.0', b'range_max\\": 90.0')])
+def test_another_time_or_range_limit_is_noticed(saved: Path, tmp_path: Path, old: bytes, new: bytes) -> None:
+    content = saved.read_bytes()
+    assert old in content
+    saved.write_bytes(content.replace(old, new))
+    for read in (load_checkpoint, read_header):
+        with pytest.raises(DataError, match="the header does not have its checksum"):
+            read(saved)
+
+
+def test_version_1_is_read(tmp_path: Path) -> None:
+    """With the hash that it always had: students, banks and resumed runs tell their checkpoints by it."""
+    path, copy = tmp_path / "old.safetensors", tmp_path / "new.safetensors"
+    digest = save_version_1(path)
+    header, networks, found = load_checkpoint(path)
+    assert (header, found, has_checksum(path)) == (HEADER, digest, False)
+    save_checkpoint(copy, header, networks)
+    assert has_checksum(copy)
+    assert load_checkpoint(copy).header == HEADER
+
+
+def test_a_deeply_nested_header(saved: Path) -> None:
+    tensors = load_file(saved)
+    save_file(tensors, saved, {"lidar_synth": '{"format": ' + "[" * 100_000 + "]" * 100_000 + "}"})
+    with pytest.raises(DataError):
+        read_header(saved)
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta", "cpu:1"])
+def test_a_device_that_is_not_there(saved: Path, device: str) -> None:
+    with pytest.raises(ConfigError, match=rf"device '{device}'; expected one that torch finds here: cpu"):
+        load_checkpoint(saved, device)
 
 
 def test_weights_without_a_header(tmp_path: Path) -> None:

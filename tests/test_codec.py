@@ -57,6 +57,50 @@ def autoencoding(metric: str = "l1", weights: dict[str, float] | None = None, **
     return Autoencoding(network(), TENSORS, SENSOR, Losses(**losses), METRICS[metric], weights or {})  # type: ignore[arg-type]
 
 
+def test_a_mask_is_trained_and_empties_cells() -> None:
+    x = tensors()
+    net = network(mask=True)
+    assert net(x).output.shape == (4, 8, 8, 32)
+    training = Autoencoding(net, TENSORS, SENSOR, Losses(mask=1.0), METRICS["l1"], {})
+    optimizer = torch.optim.Adam(training.parameters(), 1e-2)
+    returned = x[:, :1] > -1
+
+    def right() -> float:
+        return float(((net._decode(net.codebook(net._encode(x))[0])[:, 7:] > 0) == returned).float().mean())
+
+    before = right()
+    for _ in range(40):
+        optimizer.zero_grad()
+        training(x).backward()
+        optimizer.step()
+    assert right() > before + 0.2  # from random points, a codebook keeps no more
+    with torch.no_grad():
+        image = net.eval().decode(net.encode(x))
+        bits = net._decode(net.codebook(net._encode(x))[0])[:, 7:]
+    assert torch.equal((image == -1).all(1, keepdim=True), bits < 0)
+    without = Autoencoding(net, TENSORS, SENSOR, Losses(mask=0.0), METRICS["l1"], {})
+    assert training(x) > without(x)
+
+
+def test_the_adversarial_weight_balances_two_gradients() -> None:
+    """Esser et al., Eq. 7: what the verdict adds at the decoder's last layer is as large as the reconstruction's."""
+    x = tensors()
+    plain, balanced = (autoencoding(adversarial=0.6, adaptive=a).eval() for a in (False, True))
+    balanced.load_state_dict(plain.state_dict())
+    last = balanced.network.decoder.head.weight
+    output = balanced.network(x).output
+    rec, judge = balanced.reconstruction(output, x), balanced.discriminator
+    assert judge is not None
+    fooled = -judge(expected(output, TENSORS)).mean()
+    one, other = (torch.autograd.grad(part, last, retain_graph=True)[0].norm() for part in (rec, fooled))
+    difference = 0.6 * (one / (other + 1e-4) - 1) * fooled
+    torch.testing.assert_close(balanced(x) - plain(x), difference, rtol=1e-4, atol=1e-5)
+    balanced(x).backward()
+    assert all(p.grad is not None for p in balanced.parameters() if p.requires_grad)
+    with torch.no_grad():
+        assert torch.isfinite(balanced(x))
+
+
 def test_the_codec_of_a_pixel_model_does_nothing() -> None:
     codec, x = make_codec(None, TENSORS, SENSOR.shape), tensors()
     assert isinstance(codec, Identity)

@@ -138,3 +138,13 @@ def test_the_papers_latent_recipes() -> None:
         assert load_config(TrainConfig, CONFIGS / f"{teacher.codec.stem}.yaml").autoencodes
         assert set(parts) == {"velocity"} | ({"condition"} if teacher.condition else set())
         assert student.teacher.stem == f"{name}_teacher"
+
+
+@pytest.mark.parametrize("name", ["kitti360_codec", "semantic_kitti_codec"])
+def test_the_codec_recipes_have_the_numbers_of_lidms_public_configuration(name: str) -> None:
+    """autoencoder_c2_p4.yaml: the quantiser's beta 0.25 weighs the codes, disc_weight 0.6, base_learning_rate 4.5e-6."""
+    config = load_config(TrainConfig, CONFIGS / f"{name}.yaml")
+    losses, recipe = config.losses, config.recipe
+    assert (losses.commitment, losses.codebook, losses.adversarial, losses.adaptive) == (1.0, 0.25, 0.6, True)
+    assert recipe.rate == pytest.approx(4.5e-6 * recipe.batch)
+    assert (recipe.batch, recipe.accumulate, recipe.betas, recipe.weight_decay) == (8, 2, (0.5, 0.9), 0.0)

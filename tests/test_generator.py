@@ -1,6 +1,7 @@
 """The generator: a scan is a function of (checkpoint, condition, grid, seed, index); what cannot be is refused."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,13 +20,22 @@ from lidar_synth.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.flow.solvers import solve, uniform_grid
 from lidar_synth.formats import WRITERS, open_scans
-from lidar_synth.generate.checkpoint import ENCODER, VELOCITY, Header, Part, save_checkpoint
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    ENCODER,
+    VELOCITY,
+    Header,
+    Part,
+    has_checksum,
+    read_header,
+    save_checkpoint,
+)
 from lidar_synth.generate.generator import Generator, load_generator, shipped_models
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import build_network
+from lidar_synth.models import AUTOENCODERS, build_network
 from lidar_synth.noise import gaussian
 from lidar_synth.town import Town
 
@@ -210,6 +220,81 @@ def test_names_and_paths(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
         load_generator(tmp_path / "peer.pth")
 
 
+CODECS = {
+    "vqvae": {"latent_channels": 4, "codes": 16, "width": 8, "multipliers": [1, 2], "strides": [[1, 2]], "blocks": 1,
+              "attention": False, "groups": 4},
+    "autoencoder": {"latent_channels": 4, "widths": [8, 16], "depth": 2, "fine": 4},
+}  # fmt: skip
+
+
+def write_latent(path: Path, architecture: str) -> Path:
+    """A latent model with random weights."""
+    given = {"resolution": SENSOR.shape, "channels": 7}
+    codec = Part(architecture, given | CODECS[architecture])
+    torch.manual_seed(0)
+    looks = {"angles": torch.from_numpy(SENSOR.ray_angles())} if architecture == "autoencoder" else {}
+    autoencoder = build_network(architecture, codec.arguments | looks)
+    channels, *resolution = autoencoder.latent_shape
+    arguments = {"resolution": resolution, "channels": channels, "width": 16, "time_width": 16, "depths": (1,),
+                 "heads": (2,), "patch": (1, 1), "window": (1, 1)}  # fmt: skip
+    flow = build_network("hdit", arguments | {"angles": torch.zeros(2, *resolution)})
+    header = Header(
+        networks={VELOCITY: Part("hdit", arguments), CODEC: codec}, sensor=SENSOR, channels=tuple(CHANNELS),
+        normalisation=NORMALISATIONS["r2flow"], time_grid=GRID,
+        provenance={"data": "none", "data_licence": "none", "licence": "MIT"},
+    )  # fmt: skip
+    save_checkpoint(path, header, {VELOCITY: flow, CODEC: autoencoder})
+    return path
+
+
+@pytest.mark.parametrize("architecture", AUTOENCODERS)
+def test_compile_compiles_the_decoder_too(architecture: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a backend that counts graphs and convolutions; the default one would need a C++ compiler."""
+    graphs: list[int] = []
+
+    def counting(graph: torch.fx.GraphModule, inputs: object) -> object:
+        graphs.append(sum("conv" in str(node.target) for node in graph.graph.nodes))
+        return graph.forward
+
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=counting))
+    path = write_latent(tmp_path / "latent.safetensors", architecture)
+    compiled, eager = load_generator(path, compile=True), load_generator(path)
+    z, chance = torch.randn(1, *eager.codec.shape), torch.full((1, eager.codec.draws, *SENSOR.shape), 0.4)
+    given = chance if eager.codec.draws else None
+    torch.testing.assert_close(compiled.codec.decode(z, given), eager.codec.decode(z, given))
+    assert sum(graphs) >= 5
+    before = len(graphs)
+    compiled.scans(0, [0])
+    assert len(graphs) > before  # the flow
+
+
+def test_what_ships_is_known_by_its_hash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A header of the older format has no checksum: one byte could change the time grid or the range limit."""
+    for name, file in shipped_models().items():
+        assert has_checksum(file) or read_header(file)[1] == module.SHIPPED[name]
+    content = shipped_models()["town"].read_bytes()
+    (tmp_path / "weights").mkdir()
+    damaged = tmp_path / "weights" / "town.safetensors"
+    for key in (b'range_max\\": 80.', b'time_grid\\": [1.0, 0.'):
+        place = content.index(key) + len(key)
+        damaged.write_bytes(content[:place] + b"9" + content[place + 1 :])
+        monkeypatch.setattr(module, "files", lambda package: tmp_path)
+        with pytest.raises(DataError, match="is not the 'town' of this version"):
+            load_generator("town")
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta", "cpu:1"])
+def test_a_device_that_is_not_there(path: Path, device: str) -> None:
+    with pytest.raises(ConfigError, match=rf"device '{device}'; expected one that torch finds here: cpu"):
+        load_generator(path, device=device)
+
+
+def test_mps_is_refused_where_there_is_none(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="device 'mps'; expected one that torch finds here: cpu"):
+        load_generator(path, device="mps")
+
+
 def test_what_ships_can_be_loaded(tmp_path: Path) -> None:
     town = Town(1, scans=1)
     Image.fromarray(town.image(0)).save(tmp_path / "seen.png")
@@ -226,7 +311,7 @@ def test_a_gpu_is_refused_where_there_is_none_and_in_a_worker(
     path: Path, generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not torch.cuda.is_available():
-        with pytest.raises(ConfigError, match="torch sees no GPU"):
+        with pytest.raises(ConfigError, match="device 'cuda'; expected one that torch finds here: cpu"):
             load_generator(path, device="cuda")
     monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=0))
     three_ways = r"\(A\) bake .*\(B\) a rolling .*\(C\) mix in"

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -69,6 +70,40 @@ def test_golden_autoencoder(golden: Path) -> None:
     assert distance(plain, tensors["output_without_quantiser"]) < tolerance(figures["output_without_quantiser"])
     gaps = net(tensors["input.x"])
     torch.testing.assert_close(gaps.gap + 0.25 * gaps.code_gap, tensors["codebook_loss"], rtol=1e-4, atol=0)
+
+
+HERE = Path(__file__).parent / "golden"
+SPREAD = {"quantize": 0.5, "quant_conv": 4.0, "post_quant_conv": 1.0, "decoder": 0.12}
+"""Standard deviations of random weights, by the first word of their names; 0.1 of all others."""
+
+
+@torch.no_grad()
+def test_golden_mask() -> None:
+    """An autoencoder with ``use_mask`` and attention in a level, by the peer's code in float64."""
+    with np.load(HERE / "lidm_vqvae_mask.npz") as file:
+        values = dict(file)
+    config, shapes = json.loads(str(values.pop("config"))), json.loads(str(values.pop("shapes")))
+    size, random = values.pop("size").tolist(), np.random.RandomState(11)
+    expected = {name: torch.from_numpy(value) for name, value in values.items()}
+    weights = {
+        key: torch.from_numpy((random.standard_normal(shape) * SPREAD.get(key.split(".")[0], 0.1)).astype(np.float32))
+        for key, shape in shapes.items()
+    }
+    x = torch.from_numpy(random.uniform(-1, 1, (2, 1, *size)).astype(np.float32))
+    part = codec_part(config, size, "")
+    net = cast(VQVAE, convert(weights, {CODEC: part})[CODEC])
+    assert (part.arguments["mask"], part.arguments["attention_levels"]) == (True, [2])
+    latent = net.encode(x)
+    assert distance(latent, expected["latent"]) < 1e-5
+    quantised, index = net.codebook(latent)
+    assert torch.equal(index.flatten(), expected["indices"])
+    raw, output = net._decode(quantised), net.decode(latent)
+    assert raw.shape == expected["raw"].shape == (2, 2, *size)
+    assert distance(raw, expected["raw"]) < 1e-5
+    sure = expected["raw"][:, 1:].abs() > 1e-3  # rounding can move the others over 0
+    assert output.shape == (2, 1, *size)
+    assert distance(output[sure], expected["output"][sure]) < 1e-5
+    assert 0.3 < (output == -1).float().mean() < 0.7
 
 
 @torch.no_grad()

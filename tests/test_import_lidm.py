@@ -46,7 +46,12 @@ CAMERA = UNCONDITIONAL | {
         "params": {"model": "ViT-L/14", "out_dim": 12, "split_per_view": 4},
     },
 }
-MODELS = {"first stage": FIRST, "unconditional": UNCONDITIONAL, "semantic": SEMANTIC, "camera": CAMERA}
+MASKED = FIRST | {"use_mask": True, "ddconfig": DDCONFIG | {"out_ch": 2, "attn_levels": [1, 5]}}
+MASKED_FLOW = UNCONDITIONAL | {"first_stage_config": {"params": MASKED}}
+MODELS = {
+    "first stage": FIRST, "unconditional": UNCONDITIONAL, "semantic": SEMANTIC, "camera": CAMERA,
+    "first stage with a mask": MASKED, "flow with a mask": MASKED_FLOW,
+}  # fmt: skip
 
 
 def config_of(model: dict[str, Any], target: str = "lidm.data.kitti.KITTI360Train", **dataset: Any) -> dict[str, Any]:
@@ -66,14 +71,14 @@ def random_weights(model: dict[str, Any], folder: Path) -> dict[str, Tensor]:
 
     torch.manual_seed(0)
     parts = _parts(model, DATASET, {}, folder)[0]
-    nested, weights = set(parts) != {CODEC}, schedule() if model is not FIRST else {}
+    nested, weights = set(parts) != {CODEC}, schedule() if "unet_config" in model else {}
     for name, part in parts.items():
         state = build_network(*part).state_dict()
         for ours, theirs in peer_names(name, part, nested).items():
             shape = [state[ours].shape[0] // len(theirs), *state[ours].shape[1:]]
             if ours == "view_embedding":
                 shape = [1, *shape]
-            if name == CODEC and ".middle.1." in ours and len(shape) == 2:
+            if name == CODEC and (".attn_1." in theirs[0] or ".attn." in theirs[0]) and len(shape) == 2:
                 shape += [1, 1]
             elif name == VELOCITY and theirs[0].endswith(("1.qkv.weight", "1.proj_out.weight", "1.proj_in.weight")):
                 shape += [1, 1] if part.arguments["context_channels"] else [1]
@@ -117,6 +122,7 @@ def test_a_release_becomes_a_checkpoint(name: str, tmp_path: Path) -> None:
     expected = {
         "first stage": {CODEC}, "unconditional": {VELOCITY, CODEC},
         "semantic": {VELOCITY, CODEC, ENCODER}, "camera": {VELOCITY, CODEC, ENCODER},
+        "first stage with a mask": {CODEC}, "flow with a mask": {VELOCITY, CODEC},
     }  # fmt: skip
     assert set(networks) == expected[name]
     assert (header.channels, header.sensor.shape, header.sensor.range_max) == (("range",), (8, 32), 56.0)
@@ -129,7 +135,8 @@ def test_a_release_becomes_a_checkpoint(name: str, tmp_path: Path) -> None:
 
 
 def test_imported_models_generate(tmp_path: Path) -> None:
-    for name, condition in (("unconditional", None), ("semantic", torch.full((8, 32), 3, dtype=torch.uint8))):
+    maps = torch.full((8, 32), 3, dtype=torch.uint8)
+    for name, condition in (("unconditional", None), ("flow with a mask", None), ("semantic", maps)):
         folder = tmp_path / name
         folder.mkdir()
         out = folder / f"{name}.safetensors"
@@ -149,6 +156,15 @@ def test_other_configurations(tmp_path: Path) -> None:
         5.84,
         1.0001,
     )
+
+
+@pytest.mark.parametrize(("scale", "kind"), [(5.84, "log"), (56, "linear")])
+def test_an_older_configuration_names_no_scale(scale: float, kind: str, tmp_path: Path) -> None:
+    """The published autoencoders with a mask are of a time when there was the logarithm only."""
+    config = config_of(MASKED, depth_scale=scale)
+    del config["data"]["params"]["dataset"]["log_scale"]
+    header, _ = read_lidm(release(tmp_path, config, random_weights(MASKED, tmp_path)))
+    assert (header.normalisation.kind, header.normalisation.divisor) == (kind, scale)
 
 
 def test_weights_without_an_average_are_taken_as_they_are(tmp_path: Path) -> None:
@@ -233,8 +249,8 @@ def test_weights_that_do_not_fit(spoil: Callable[[dict[str, Tensor]], None], mes
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (FIRST | {"use_mask": True}, "an autoencoder with"),
-        (FIRST | {"ddconfig": DDCONFIG | {"attn_levels": [1]}}, r"an autoencoder with \{'attn_levels': \[1\]\}"),
+        (FIRST | {"use_mask": True}, r"an autoencoder with \{'out_ch': 1\}"),
+        (FIRST | {"ddconfig": DDCONFIG | {"out_ch": 2}}, r"an autoencoder with \{'out_ch': 2\}"),
         (UNCONDITIONAL | {"unet_config": {"params": UNET_PARAMS | {"lib_name": "ldm"}}}, "a U-Net with"),
         (UNCONDITIONAL | {"cond_stage_config": {"target": "x.FrozenCLIPTextEmbedder"}}, "by FrozenCLIPTextEmbedder"),
         ({"linear_start": 1}, "KeyError.'first_stage_config'"),

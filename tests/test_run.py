@@ -2,11 +2,13 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +25,11 @@ from typer.testing import CliRunner
 import lidar_synth.train.plan as plan_module
 import lidar_synth.train.run as module
 from lidar_synth.cli import app
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.flow.path import Example
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.formats import WRITERS
-from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, read_header
+from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, read_header, save_checkpoint
 from lidar_synth.generate.generator import load_generator
 from lidar_synth.geometry.sensor import Sensor
 
@@ -82,6 +84,7 @@ def write_config(scans: Path, folder: Path, **changes: Any) -> Path:
 
 def call(*arguments: str | Path) -> str:
     """The command line in this process; errors come out as they are."""
+    AcceleratorState._reset_state(True)  # each call is a run of its own
     result = CliRunner().invoke(app, [str(a) for a in arguments])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -251,6 +254,122 @@ def test_a_student_is_distilled(
     monkeypatch.delattr(plan_module, "select_timesteps")  # it is not called again
     call("distill", config, "--resume", "recipe.iterations=14")
     assert read_header(tmp_path / "run" / "run.safetensors")[0].time_grid == header.time_grid
+
+
+def distilling(scans: Path, folder: Path, teacher: Path) -> Path:
+    selection = {"candidates": 10, "trajectories": 3}
+    recipe = {"metric": "pseudo_huber", "iterations": 4}
+    return write_config(scans, folder, teacher=str(teacher), steps=2, selection=selection, recipe=recipe)
+
+
+def strip_settings(path: Path) -> None:
+    """Make a selection one of version 0.1.0."""
+    with np.load(path) as values:
+        held = {name: values[name] for name in values if name != "settings"}
+    np.savez(path, **held)
+
+
+@pytest.mark.parametrize("old", [False, True], ids=["", "of version 0.1.0"])
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("intervals=3", "intervals=4"),
+        ("selection.candidates=8", "selection.candidates=10"),
+        ("selection.seed=5", "selection.seed=0"),
+        ("recipe.metric=squared_l2", "metric='pseudo_huber'"),
+        ("precision=bf16", "precision='no'"),
+        ("teacher", "teacher='"),
+    ],
+)
+def test_a_selection_of_other_settings_is_refused(
+    override: str, named: str, old: bool, scans: Path, teacher: Path, tmp_path: Path
+) -> None:
+    config = distilling(scans, tmp_path, teacher)
+    call("distill", config)
+    run = tmp_path / "run"
+    (run / "state.safetensors").unlink()  # stopped before the first save
+    if override == "teacher":
+        checkpoint = load_checkpoint(teacher)
+        header = replace(checkpoint.header, provenance=checkpoint.header.provenance | {"iterations": 99})
+        save_checkpoint(tmp_path / "other.safetensors", header, checkpoint.networks)
+        override = f"teacher={tmp_path / 'other.safetensors'}"
+    if old:
+        strip_settings(run / "selection.npz")
+        if not named.startswith(("intervals", "selection.candidates")):
+            with pytest.warns(UserWarning, match="kept no settings: only intervals"):
+                call("distill", config, override)
+            return
+    before = (run / "config.yaml").read_bytes()
+    if old:
+        with pytest.warns(UserWarning, match="kept no settings"), pytest.raises(ConfigError, match=re.escape(named)):
+            call("distill", config, override)
+        return
+    with pytest.raises(ConfigError, match=rf"selection.npz, which was made with .*{re.escape(named)}"):
+        call("distill", config, override)
+    assert (run / "config.yaml").read_bytes() == before
+
+
+def test_a_damaged_selection_is_named(scans: Path, teacher: Path, tmp_path: Path) -> None:
+    config = distilling(scans, tmp_path, teacher)
+    path = tmp_path / "run" / "selection.npz"
+    path.parent.mkdir()
+    for content in (b"", b"PK\x03\x04", b"no archive"):
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=r"selection.npz is damaged"):
+            call("distill", config)
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("seed=3", r"seed=3 \(it began with 0\)"),
+        ("recipe.metric=l1", r"recipe.metric='l1' \(it began with 'squared_l2'\)"),
+        ("recipe.rate=1e-3", r"recipe.rate=0.001 \(it began with 0.01\)"),
+        ("recipe.iterations=11", r"recipe.iterations=11 \(it began with 12\)"),
+        ("recipe.weights={range: 2}", r"recipe.weights.range=2.0 \(it began with None\)"),
+        ("data.flip=false", r"data.flip=False \(it began with True\)"),
+        ("precision=bf16", r"precision='bf16' \(it began with 'no'\)"),
+        ("timesteps=u_shaped", r"timesteps='u_shaped' \(it began with 'uniform'\)"),
+    ],
+)
+def test_a_run_is_not_resumed_with_other_settings(override: str, named: str, scans: Path, tmp_path: Path) -> None:
+    config = write_config(scans, tmp_path)
+    call("train", config, "--minutes", "0")
+    files = [tmp_path / "run" / name for name in ("config.yaml", "state.safetensors", "run.safetensors")]
+    before = [file.read_bytes() for file in files]
+    with pytest.raises(ConfigError, match=f"--resume of .*run with .*{named}"):
+        call("train", config, "--resume", override)
+    assert [file.read_bytes() for file in files] == before
+
+
+def test_a_run_is_resumed_with_more_iterations_and_what_changes_no_result(scans: Path, tmp_path: Path) -> None:
+    config = write_config(scans, tmp_path)
+    call("train", config, "--minutes", "0")
+    harmless = ["save_every=7", "samples.every=9", "samples.count=2", "gradient_checkpointing=true"]
+    call("train", config, "--resume", "recipe.iterations=14", *harmless)
+    assert read_header(tmp_path / "run" / "run.safetensors")[0].provenance["iterations"] == 14
+    with pytest.raises(ConfigError, match=r"recipe.iterations=12 \(it began with 14\)"):
+        call("train", config, "--resume")
+
+
+def test_a_run_is_not_resumed_with_another_teacher_of_the_same_name(scans: Path, teacher: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "teacher.safetensors"
+    mine.write_bytes(teacher.read_bytes())
+    config = write_config(scans, tmp_path, teacher=str(mine), strategy="reflow", steps=2, recipe={"iterations": 4})
+    call("distill", config, "--minutes", "0")
+    checkpoint = load_checkpoint(mine)
+    header = replace(checkpoint.header, provenance=checkpoint.header.provenance | {"iterations": 99})
+    save_checkpoint(mine, header, checkpoint.networks)
+    with pytest.raises(ConfigError, match=r"--resume of .*run with teacher='\w+' \(it began with '\w+'\)"):
+        call("distill", config, "--resume")
+
+
+def test_a_run_without_its_configuration_is_not_resumed(scans: Path, tmp_path: Path) -> None:
+    config = write_config(scans, tmp_path)
+    call("train", config, "--minutes", "0")
+    (tmp_path / "run" / "config.yaml").unlink()
+    with pytest.raises(FileError, match=r"run/config.yaml cannot be read"):
+        call("train", config, "--resume")
 
 
 def test_a_cache_of_other_scans_is_refused(scans: Path, teacher: Path, tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
-"""Checkpoints, "lidar-synth-checkpoint/1": one ``.safetensors`` with weights and a JSON header.
+"""Checkpoints, "lidar-synth-checkpoint/2": one ``.safetensors`` with weights and a JSON header.
 
 The header stands in the file's metadata under ``lidar_synth`` and says all that generation needs::
 
-    format          "lidar-synth-checkpoint/1"; a reader refuses every other
+    format          "lidar-synth-checkpoint/2"; "/1" is read too, every other one is refused
     convention      "t=1 noise, t=0 data, v=noise-data", so that nobody has to guess
     networks        {part: {architecture, arguments}}; "velocity" is the flow, "codec" the autoencoder of a latent
                     model (an autoencoder alone has this part only), "condition" the encoder of a condition
@@ -15,9 +15,11 @@ The header stands in the file's metadata under ``lidar_synth`` and says all that
     time_grid       descending from 1 to 0: the steps that the weights were made for
     provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher, recipe, metrics
     weights         sha256 of all tensors
+    checksum        sha256 of all other keys, as JSON with sorted keys
 
-A tensor's name is its part, a dot, and its name in the network. The hash of a checkpoint is the sha256 of its
-header, which holds that of the weights. Nothing is ever unpickled.
+A tensor's name is its part, a dot, and its name in the network. The hash of a checkpoint is its checksum, which covers
+the header and, through ``weights``, the tensors. Version 1 has no checksum: its hash is the sha256 of the header's text,
+and a changed byte of its header can go unnoticed. Nothing is ever unpickled.
 """
 
 import hashlib
@@ -33,6 +35,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from lidar_synth.devices import checked_device
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned
@@ -40,7 +43,9 @@ from lidar_synth.geometry.normalize import LABEL_BITS, Normalisation, TensorForm
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models import assemble
 
-FORMAT = "lidar-synth-checkpoint/1"
+FORMAT = "lidar-synth-checkpoint/2"
+WITHOUT_CHECKSUM = "lidar-synth-checkpoint/1"
+"""The older format, whose header no checksum covers; it is read, and no longer written."""
 CONVENTION = "t=1 noise, t=0 data, v=noise-data"
 LABEL_ENCODING = f"{LABEL_BITS} analog bits, most significant first, code 19 = no label"
 VELOCITY, CODEC, ENCODER = "velocity", "codec", "condition"
@@ -96,7 +101,7 @@ class Header:
         return TensorFormat(self.channels, self.normalisation)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as the file holds them; without ``weights``."""
+        """Plain values, as the file holds them; without ``weights`` and ``checksum``."""
         return {
             "format": FORMAT,
             "convention": CONVENTION,
@@ -118,7 +123,7 @@ class Header:
             ConfigError: on another format, and on keys or values that do not belong into a header.
         """
         values = dict(values)
-        if (given := values.pop("format", None)) != FORMAT:
+        if (given := values.pop("format", None)) not in (FORMAT, WITHOUT_CHECKSUM):
             raise ConfigError(f"format {given!r}", repr(FORMAT), "Use the version of lidar_synth that wrote it.")
         try:
             header = cls(
@@ -202,12 +207,14 @@ def save_checkpoint(
         for key, tensor in state.items():
             tensors[f"{name}.{key}"] = tensor.to(dtype if key in parameters else None).contiguous()
     _check_finite(tensors, "the network")
+    values = {**header.to_dict(), "weights": weights_hash(tensors)}
     try:
-        text = json.dumps({**header.to_dict(), "weights": weights_hash(tensors)}, sort_keys=True, allow_nan=False)
+        checksum = _checksum(values)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"a header with a value that JSON does not hold ({error})", "plain, finite values") from error
+    text = json.dumps({**values, "checksum": checksum}, sort_keys=True)
     write_file(path, save(tensors, {"lidar_synth": text}), durable=True)
-    return _hash(text)
+    return checksum
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoint:
@@ -218,12 +225,14 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
         device: where the networks shall be.
 
     Raises:
+        ConfigError: on a device that is not there.
         FileError: where the file cannot be read.
         DataError: on a file that is no checkpoint of this version, is cut or damaged, or whose weights do not fit
             its header.
     """
-    text, header, tensors = _read(Path(path))
-    if json.loads(text).get("weights") != weights_hash(tensors):
+    device = checked_device(device)
+    _, header, digest, weights, tensors = _read(Path(path))
+    if weights != weights_hash(tensors):
         raise DataError(f"{path}: the weights do not have the sum in the header", "a whole file", "Copy it again.")
     _check_finite(tensors, str(path))
     networks = {}
@@ -233,17 +242,32 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
         networks[name] = assemble(*part, state, f"{path}: the network {name!r}", device)
     if foreign := [k for k in tensors if k.partition(".")[0] not in header.networks]:
         raise DataError(f"{path}: tensors {foreign}", f"those of {sorted(header.networks)} only")
-    return Checkpoint(header, networks, _hash(text))
+    return Checkpoint(header, networks, digest)
 
 
 def read_header(path: Path) -> tuple[Header, str]:
     """The header of a checkpoint and its hash, without its weights; raises as ``load_checkpoint``."""
-    text, header, _ = _read(Path(path), weights=False)
-    return header, _hash(text)
+    content = _read(Path(path), tensors=False)
+    return content.header, content.hash
 
 
-def _read(path: Path, weights: bool = True) -> tuple[str, Header, dict[str, Tensor]]:
-    """The header's text, the header, and the tensors by name."""
+def has_checksum(path: Path) -> bool:
+    """Whether a damaged header of this checkpoint would be noticed; raises as ``load_checkpoint``."""
+    return _read(Path(path), tensors=False).format == FORMAT
+
+
+class _Content(NamedTuple):
+    """What a file holds; ``weights`` is their sum as the header tells it."""
+
+    format: str
+    header: Header
+    hash: str
+    weights: Any
+    tensors: dict[str, Tensor]
+
+
+def _read(path: Path, tensors: bool = True) -> _Content:
+    """The content of a checkpoint whose header is as it was written; its tensors are not checked yet."""
     try:
         with path.open("rb") as file:
             start = file.read(2)
@@ -259,17 +283,32 @@ def _read(path: Path, weights: bool = True) -> tuple[str, Header, dict[str, Tens
     try:
         with safe_open(path, framework="pt") as content:
             text = (content.metadata() or {}).get("lidar_synth")
-            tensors = {key: content.get_tensor(key) for key in content.keys()} if weights else {}  # noqa: SIM118
+            held = {key: content.get_tensor(key) for key in content.keys()} if tensors else {}  # noqa: SIM118
     except SafetensorError as error:
         raise DataError(f"{path} is cut, damaged or no .safetensors file ({error})", "a whole file") from error
     if text is None:
         raise DataError(f"{path} has weights but no header of lidar_synth", f"a file of {FORMAT}")
     try:
         values = json.loads(text)
-        values.pop("weights", None)
-        return text, Header.from_dict(values), tensors
-    except (ValueError, AttributeError) as error:  # a ConfigError is a ValueError
+        version = values.get("format")
+        digest = _hash(text) if version == WITHOUT_CHECKSUM else _verified(values)
+        weights = values.pop("weights", None)
+        return _Content(version, Header.from_dict(values), digest, weights, held)
+    except (ValueError, AttributeError, RecursionError) as error:  # a ConfigError is a ValueError
         raise DataError(f"{path}: {error}") from error
+
+
+def _verified(values: dict[str, Any]) -> str:
+    """Take the checksum out of a header's values; raise where it is not theirs."""
+    checksum = values.pop("checksum", None)
+    if values.get("format") == FORMAT and checksum != _checksum(values):
+        raise ConfigError("the header does not have its checksum", "a whole file", "Copy it again.")
+    return str(checksum)
+
+
+def _checksum(values: Mapping[str, Any]) -> str:
+    """sha256 of plain values, whatever the order of their keys."""
+    return _hash(json.dumps(values, sort_keys=True, allow_nan=False))
 
 
 def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:

@@ -16,10 +16,11 @@ from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 from lidar_synth.classes import IGNORE
+from lidar_synth.devices import checked_device
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow.path import Velocity, guided
 from lidar_synth.flow.solvers import solve, uniform_grid
-from lidar_synth.generate.checkpoint import CODEC, VELOCITY, Header, join, load_checkpoint
+from lidar_synth.generate.checkpoint import CODEC, VELOCITY, Header, has_checksum, join, load_checkpoint, read_header
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, blank
 from lidar_synth.geometry.normalize import TensorFormat
@@ -30,6 +31,13 @@ from lidar_synth.noise import gaussian, uniform
 
 BATCH = {"cpu": 1, "cuda": 16}
 """Scans at a time, by device: what fits a CPU's cache, what fills a GPU."""
+
+SHIPPED = {
+    "town": "2d8d08119dc4a1c0002040ff47e66dea71bf87c7ae82d667c0ccfff15778202b",
+    "town-camera": "5d96b6af7d5479f45e8ece7120bc5cf0493e639d783c0725f5f87581a6a1dc78",
+    "town-semantic": "36d110505d2108346c82a70092b1f112474d105c34e577e546d9ad36cd11e993",
+}
+"""Hashes of the shipped checkpoints whose format is the one that has no checksum of its header."""
 
 
 @dataclass(frozen=True)
@@ -223,19 +231,17 @@ def load_generator(
 
     Args:
         model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
-        device: "cpu" or "cuda".
+        device: "cpu", "cuda" or "cuda:1"; a device of ``available_devices``.
         dtype: what the network computes in; states stay float32.
-        compile: by ``torch.compile``; the first scan takes long.
+        compile: the flow's network and the decoder of a latent model, by ``torch.compile``; the first scan takes long.
         batch: scans at a time; by default what suits the device.
 
     Raises:
         ConfigError: on an unknown name, a device that is not there, or CUDA in a DataLoader worker.
-        FileError, DataError: where the checkpoint cannot be read.
+        FileError, DataError: where the checkpoint cannot be read, or a shipped one is damaged.
     """
-    device = torch.device(device)
     _refuse_worker(device)
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"device {str(device)!r}, but torch sees no GPU", "device='cpu', or a CUDA build of torch")
+    device = checked_device(device)
     path = find_model(model)
     checkpoint = load_checkpoint(path, device)
     if VELOCITY not in checkpoint.networks:
@@ -243,10 +249,18 @@ def load_generator(
     for network in checkpoint.networks.values():
         network.to(dtype).requires_grad_(False)
     if compile:
-        checkpoint.networks[VELOCITY].compile()
+        _compile(checkpoint.networks)
     flow, autoencoder = join(checkpoint.networks), checkpoint.networks.get(CODEC)
     size = batch or BATCH.get(device.type, 1)
     return Generator(path.stem, flow, checkpoint.header, checkpoint.hash, size, autoencoder)
+
+
+def _compile(networks: dict[str, nn.Module]) -> None:
+    """Compile, in place, what runs for every scan: the velocity and the decoder."""
+    networks[VELOCITY].compile()
+    if (autoencoder := networks.get(CODEC)) is not None:
+        # ``Module.compile`` is for what ``forward`` does; a codec is asked to decode.
+        setattr(autoencoder, "decode", torch.compile(autoencoder.decode))  # noqa: B010  # mypy: a method
 
 
 def shipped_models() -> dict[str, Path]:
@@ -260,10 +274,13 @@ def find_model(model: str | Path) -> Path:
 
     Raises:
         ConfigError: on an unknown name.
+        FileError, DataError: where the shipped file cannot be read, or is not the one that was shipped.
     """
     shipped = shipped_models()
-    if str(model) in shipped:
-        return shipped[str(model)]
+    if (name := str(model)) in shipped:
+        if not has_checksum(shipped[name]) and read_header(shipped[name])[1] != SHIPPED.get(name):
+            raise DataError(f"{shipped[name]} is not the {name!r} of this version", "a whole file", "Install it again.")
+        return shipped[name]
     path = Path(model)
     if path.suffix != ".safetensors":
         names = ", ".join(shipped) or "none in this installation"
@@ -271,9 +288,9 @@ def find_model(model: str | Path) -> Path:
     return path
 
 
-def _refuse_worker(device: torch.device) -> None:
+def _refuse_worker(device: torch.device | str) -> None:
     """No CUDA in DataLoader workers: a forked process cannot use it, a spawned one pays for a context each."""
-    if device.type == "cuda" and get_worker_info() is not None:
+    if str(device).startswith("cuda") and get_worker_info() is not None:
         raise ConfigError(
             "a generator on the GPU inside a DataLoader worker",
             "one of three ways: (A) bake a bank first and read it in the workers, (B) a rolling bank that one spawned "

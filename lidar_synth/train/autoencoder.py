@@ -5,6 +5,7 @@ It runs in the same loop as everything else: one network, one optimiser, one los
     reconstruction   the recipe's metric per channel, with the recipe's weights; label bits by cross-entropy
     codebook         squared distance of latents to their codes: ``commitment`` moves the encoder, ``codebook`` a
                      "gradient" codebook; an "ema" codebook moves by itself
+    mask             distance of the decoder's mask, where it has one, to 1 = return and -1 = none
     geometric        squared distance of points, each the mean of four neighbours in a row, in units of the farthest
                      range: the beams' curves shall be straight where they were
     adversarial      a discriminator of patches, with the hinge loss (Esser et al., "Taming Transformers for
@@ -50,7 +51,10 @@ class Losses:
         commitment: of the encoder's distance to its codes.
         codebook: of the codes' distance to what they stand for, where they move by gradients.
         geometric: of the points.
+        mask: of the decoder's mask.
         adversarial: of the discriminator's verdict.
+        adaptive: multiply ``adversarial`` by the ratio of two norms: of the gradient that all reconstruction terms have at
+            the decoder's last layer, and of the verdict's gradient there (Esser et al., Eq. 7).
         discriminator_width: channels of the discriminator.
         noise: standard deviation of what is added to the latents of an "autoencoder", which lie in (-1, 1).
         rare: how much more the cells of rare classes count for an "autoencoder": each by the share of its class in the
@@ -65,13 +69,15 @@ class Losses:
     commitment: float = 0.25
     codebook: float = 1.0
     geometric: float = 0.0
+    mask: float = 1.0
     adversarial: float = 0.0
+    adaptive: bool = False
     discriminator_width: int = 32
     noise: float = 0.07
     rare: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.commitment, self.codebook, self.geometric, self.adversarial, self.noise, self.rare) < 0:
+        if min(value for value in vars(self).values()) < 0:
             raise ConfigError(f"{self}", "weights of at least 0")
 
 
@@ -113,14 +119,16 @@ class Autoencoding(nn.Module):
             some = noise.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
             return self._told(self.network(x, self.losses.noise * some), x)
         encoding: Encoding = self.network(x)
-        output = encoding.output.float()
-        loss = self.reconstruction(output, x) + self.losses.commitment * encoding.gap.mean()
-        loss = loss + self.losses.codebook * encoding.code_gap.mean()
+        output, mask = encoding.output.float().tensor_split([self.tensors.size], 1)
+        loss = self.reconstruction(output, x)
+        if mask.shape[1]:
+            loss = loss + self.losses.mask * self.metric(mask, self._returned(x)).mean()
         if self.losses.geometric:
             loss = loss + self.losses.geometric * (self._points(output) - self._points(x)).square().sum(1).mean()
         if self.discriminator is not None:
-            loss = loss + self._adversarial(self.discriminator, expected(output, self.tensors), x)
-        return loss
+            loss = loss + self._adversarial(self.discriminator, expected(output, self.tensors), x, loss)
+        loss = loss + self.losses.commitment * encoding.gap.mean()
+        return loss + self.losses.codebook * encoding.code_gap.mean()
 
     def reconstruction(self, output: Tensor, x: Tensor) -> Tensor:
         """The weighted sum over channels, a scalar."""
@@ -158,15 +166,33 @@ class Autoencoding(nn.Module):
 
     def _points(self, x: Tensor) -> Tensor:
         """(B, 3, H, W / 4) mean points of neighbours, in units of the farthest range."""
-        first = sum(CHANNELS[name] for name in self.tensors.channels[: self.tensors.channels.index("range")])
-        metres = self.tensors.normalisation.decode(x[:, first : first + 1])
-        return F.avg_pool2d(metres * self.rays, (1, CURVE_LENGTH))
+        return F.avg_pool2d(self._metres(x) * self.rays, (1, CURVE_LENGTH))
 
-    def _adversarial(self, judge: nn.Module, output: Tensor, x: Tensor) -> Tensor:
+    def _returned(self, x: Tensor) -> Tensor:
+        """(B, 1, H, W) 1 where there is a return, -1 elsewhere."""
+        return 2 * (self._metres(x) > 0).to(x.dtype) - 1
+
+    def _metres(self, x: Tensor) -> Tensor:
+        """(B, 1, H, W) ranges."""
+        first = sum(CHANNELS[name] for name in self.tensors.channels[: self.tensors.channels.index("range")])
+        return self.tensors.normalisation.decode(x[:, first : first + 1])
+
+    def _adversarial(self, judge: nn.Module, output: Tensor, x: Tensor, reconstruction: Tensor | None = None) -> Tensor:
+        """Both sides' terms; an adaptive weight looks at the loss of the ``reconstruction``."""
         frozen = {name: p.detach() for name, p in judge.named_parameters()}
         fooled: Tensor = -torch.func.functional_call(judge, frozen, (output,)).mean()
         verdict = F.relu(1 - judge(x)).mean() + F.relu(1 + judge(output.detach())).mean()
-        return self.losses.adversarial * fooled + verdict / 2
+        balance = self._balance(reconstruction, fooled) if self.losses.adaptive and reconstruction is not None else 1.0
+        return self.losses.adversarial * balance * fooled + verdict / 2
+
+    def _balance(self, reconstruction: Tensor, fooled: Tensor) -> Tensor:
+        """How much larger the gradient of the reconstruction is at the decoder's last layer, at most 10^4."""
+        assert isinstance(self.network, VQVAE)
+        last = self.network.decoder.head.weight
+        if not (torch.is_grad_enabled() and last.requires_grad):
+            return fooled.new_zeros(())
+        one, other = (torch.autograd.grad(x, last, retain_graph=True)[0].norm() for x in (reconstruction, fooled))
+        return (one / (other + 1e-4)).clamp(max=1e4)
 
 
 def _code(bits: Tensor) -> Tensor:

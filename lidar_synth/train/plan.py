@@ -1,16 +1,14 @@
 """What a training configuration asks for: the networks, what they are trained on, and what the checkpoint will say."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import nn
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.files import write_file
 from lidar_synth.flow.path import METRICS, velocity_loss
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.flow.timesteps import Selection, select_timesteps
@@ -45,6 +43,7 @@ from lidar_synth.train import (
     teacher_task,
 )
 from lidar_synth.train.config import DistillConfig, Run, TrainConfig
+from lidar_synth.train.selection import load_selection, save_selection, selection_settings
 from lidar_synth.train.start import fresh_networks, provenance_of, start_networks
 from lidar_synth.train.teaching import taught_flow
 
@@ -189,20 +188,16 @@ def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, A
 
 
 def _selection(config: DistillConfig, velocity: Any, plan: Plan, accelerator: "Accelerator") -> Selection:
-    """The timesteps of the student, from the folder where an earlier call left them."""
-    path = config.output / "selection.npz"
+    """The timesteps of the student, from the folder where an earlier call with the same settings left them."""
+    path, settings = config.output / "selection.npz", selection_settings(config, plan.header)
     if path.exists():
-        with np.load(path) as values:
-            return Selection(
-                tuple(values["grid"].tolist()), float(values["cost"]), float(values["uniform_cost"]),
-                tuple(values["candidates"].tolist()), values["costs"], values["per_trajectory"],
-            )  # fmt: skip
+        return load_selection(path, settings)
     conditions = open_data(config, plan, accelerator.device).conditions if plan.header.conditioning else None
     with accelerator.autocast():
         selection = select_timesteps(
             velocity, plan.codec().shape, config.intervals, metric=config.recipe.metric, device=accelerator.device,
             condition=conditions, **config.selection.model_dump(),
         )  # fmt: skip
-    write_file(path, lambda file: np.savez(file, **asdict(selection)))
+    save_selection(path, selection, settings)
     tqdm.write(f"timesteps {selection.grid}: cost {selection.cost:.4g}, uniform {selection.uniform_cost:.4g}")
     return selection

@@ -30,6 +30,7 @@ from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.train import Autoencoding, Batches, Record, Training, reconstruct, reconstruction_figures, steps
 from lidar_synth.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.train.plan import Plan, make_plan, open_data
+from lidar_synth.train.resume import check_parents, check_resumed
 from lidar_synth.viz import write_view
 
 if TYPE_CHECKING:
@@ -43,14 +44,14 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
 
     Args:
         config: of a teacher or of a student.
-        resume: go on from the saved state in the output folder, where there is one.
+        resume: continue from the saved state in the output folder, where there is one, with the same settings.
         minutes: stop, saved, after so long.
 
     Returns:
         The checkpoint.
 
     Raises:
-        ConfigError: where the folder holds a run and ``resume`` is not set.
+        ConfigError: where the folder holds a run and ``resume`` is not set, or a run with other settings.
         LibraryError: without Accelerate.
         DataError: where the training does not stay finite; what was saved last is kept.
     """
@@ -61,17 +62,20 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
         raise LibraryError("Accelerate is not installed", "the extra 'train'", hint) from error
 
     state = config.output / "state.safetensors"
-    if state.exists() and not resume:
-        raise ConfigError(f"{config.output} holds a run", "--resume to go on, or another output=FOLDER")
+    if state.exists():
+        if not resume:
+            raise ConfigError(f"{config.output} holds a run", "--resume to go on, or another output=FOLDER")
+        check_resumed(config)
     # Without being told so, Accelerate takes the processes of torchrun on CPUs for runs of their own.
     gpu = torch.cuda.is_available() or torch.xpu.is_available() or torch.backends.mps.is_available()
     accelerator = Accelerator(mixed_precision=config.precision, cpu="LOCAL_RANK" in os.environ and not gpu)
-    if accelerator.is_main_process:
-        write_file(config.output / "config.yaml", yaml.safe_dump(config.model_dump(mode="json")).encode())
     plan = make_plan(config, accelerator)
     training = Training(plan.network.to(accelerator.device), config.recipe)
     if state.exists():
+        check_parents(config, plan.header)
         training.load(state)
+    if accelerator.is_main_process:  # after all that may refuse
+        write_file(config.output / "config.yaml", yaml.safe_dump(config.model_dump(mode="json")).encode())
     if config.compile:
         plan.network.compile()
     for module in plan.network.modules():

@@ -12,6 +12,7 @@ so that it can be sampled from and distilled without training. Frozen CLIP, whic
 is left out: see ``nets.encoders``. Its label maps count "unlabelled" as 0 and the classes from 1; ours are moved.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -115,16 +116,19 @@ def _parts(
 
 def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> Part:
     """The autoencoder of the peer's configuration, for images of ``size`` rows and columns."""
-    inner = params["ddconfig"]
-    wanted = {"double_z": False, "attn_levels": [], "z_channels": params["embed_dim"], "out_ch": inner["in_channels"]}
+    inner, mask = params["ddconfig"], bool(params.get("use_mask"))
+    wanted = {"double_z": False, "z_channels": params["embed_dim"], "out_ch": inner["in_channels"] + mask}
     odd = {key: inner.get(key) for key, value in wanted.items() if inner.get(key) != value}
-    if odd or params.get("use_mask") or params.get("lib_name") != "lidm":
+    if odd or params.get("lib_name") != "lidm":
         raise DataError(f"{path}: an autoencoder with {odd or dict(params)}", "one of LiDM's published configurations")
+    # A level that there is not is no mistake to the peer.
+    attends = sorted(set(inner["attn_levels"]) & set(range(len(inner["ch_mult"]))))
+    extra: dict[str, Any] = ({"attention_levels": attends} if attends else {}) | ({"mask": True} if mask else {})
     return Part("vqvae", {
         "resolution": list(size), "channels": inner["in_channels"], "latent_channels": params["embed_dim"],
         "codes": params["n_embed"], "width": inner["ch"], "multipliers": list(inner["ch_mult"]),
         "strides": [list(s) for s in inner["strides"]], "blocks": inner["num_res_blocks"],
-    })  # fmt: skip
+    } | extra)  # fmt: skip
 
 
 def unet_part(params: Mapping[str, Any], path: Path | str) -> Part:
@@ -144,7 +148,8 @@ def unet_part(params: Mapping[str, Any], path: Path | str) -> Part:
 def _normalisation(dataset: Mapping[str, Any]) -> Normalisation:
     low, high = dataset["depth_range"]
     scale = float(dataset["depth_scale"])
-    if dataset["log_scale"]:
+    # Older configurations do not name the scale; it was the logarithmic one, log2(range + 1) of 0 to the farthest.
+    if dataset.get("log_scale", scale < 2 * math.log2(high + 1)):
         return Normalisation("log", low, high, scale, OFFSET)
     return Normalisation("linear", low, high, scale)
 

@@ -1,5 +1,7 @@
 """The names of LiDM's weights: for every key of our networks, the peer's keys it comes from."""
 
+from collections.abc import Collection
+
 import torch
 
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Part
@@ -49,7 +51,8 @@ def peer_names(name: str, part: Part, nested: bool) -> Sources:
         found = {key: _unet(key, looking, attention) for key in keys}
     elif name == CODEC:
         levels = len(part.arguments["multipliers"])
-        found = {key: _codec(key, levels) for key in keys if key not in STATISTICS}
+        looking = part.arguments.get("attention_levels", ())
+        found = {key: _codec(key, levels, looking) for key in keys if key not in STATISTICS}
     else:
         names = {"mix": "channel_mapper", "project": "linear"}
         found = {key: (_renamed(key, names),) for key in keys}
@@ -80,8 +83,8 @@ def _unet(key: str, looking: set[str], attention: Sources) -> tuple[str, ...]:
     return tuple(f"{place}.{name}.{last}" for name in attention[layer])
 
 
-def _codec(key: str, levels: int) -> tuple[str, ...]:
-    """The autoencoder's."""
+def _codec(key: str, levels: int, looking: Collection[int]) -> tuple[str, ...]:
+    """The autoencoder's of so many levels; ``looking``: those that attend after each block."""
     top = {"to_latent": "quant_conv", "from_latent": "post_quant_conv"}
     if key == "codebook.codes":
         return ("quantize.embedding.weight",)
@@ -93,16 +96,23 @@ def _codec(key: str, levels: int) -> tuple[str, ...]:
         name = {"stem": "conv_in", "norm": "norm_out", "head": "conv_out"}[kind]
         return (f"{where}.{name}.{number}",)
     if kind == "middle":
-        if int(number) != 1:
-            return (f"{where}.{MIDDLE[int(number)]}.{_renamed(inside, CODEC_RESIDUAL)}",)
-        layer, _, last = inside.rpartition(".")
-        return tuple(f"{where}.{MIDDLE[1]}.{name}.{last}" for name in CODEC_ATTENTION[layer])
+        place = f"{where}.{MIDDLE[int(number)]}"
+        return _attention(place, inside) if int(number) == 1 else (f"{place}.{_renamed(inside, CODEC_RESIDUAL)}",)
     side = "down" if where == "encoder" else "up"
     level = int(number) if side == "down" else levels - 1 - int(number)  # ours counts as the decoder runs
     if kind == "levels":
-        block, _, inside = inside.partition(".")
+        first, _, inside = inside.partition(".")
+        block, attends = divmod(int(first), 2) if level in looking else (int(first), 0)
+        if attends:
+            return _attention(f"{where}.{side}.{level}.attn.{block}", inside)
         return (f"{where}.{side}.{level}.block.{block}.{_renamed(inside, CODEC_RESIDUAL)}",)
     return (f"{where}.{side}.{level}.{side}sample.conv.{inside.removeprefix('conv.')}",)
+
+
+def _attention(place: str, key: str) -> tuple[str, ...]:
+    """Of a layer of the autoencoder's attention at a place."""
+    layer, _, last = key.rpartition(".")
+    return tuple(f"{place}.{name}.{last}" for name in CODEC_ATTENTION[layer])
 
 
 def _renamed(key: str, names: dict[str, str]) -> str:

@@ -5,7 +5,8 @@ only (1 x 4). ``encode`` gives the latent as the encoder made it, ``decode`` fir
 nearest code (Ran et al., "Towards Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024): a flow between
 noise and latents that misses them by a little still ends on codes.
 
-The first and the last channels are those of the image, whatever they hold: labels go in and come out as bits.
+The first and the last channels are those of the image, whatever they hold: labels go in and come out as bits. With a
+``mask``, the decoder has one channel more, which says whether there is a return: below 0, the cell is empty.
 """
 
 from collections.abc import Sequence
@@ -57,7 +58,8 @@ class Encoding(NamedTuple):
     """What training looks at.
 
     Args:
-        output: (B, C, H, W) the decoder's answer through the codebook, with gradients to the encoder straight through.
+        output: (B, C, H, W) the decoder's answer through the codebook, with gradients to the encoder straight through;
+            (B, C + 1, H, W) of a network with a mask, which comes last.
         gap: (B,) mean squared distance of the latent to its codes, with gradients to the encoder.
         code_gap: (B,) the same with gradients to the codes.
     """
@@ -81,6 +83,8 @@ class VQVAE(nn.Module):
         strides: rows and columns by which the image shrinks between two levels.
         blocks: residual blocks per level; one more in the decoder.
         attention: attend in the middle.
+        attention_levels: numbers of the levels, 0 = the finest, that attend after each of their blocks.
+        mask: decode whether there is a return in a channel of its own.
         patch: rows and columns of cells that are taken together at the finest level: (1, 1) is LiDM's, more is
             faster.
         groups: of the norms; see ``convolution.GROUPS``.
@@ -106,25 +110,31 @@ class VQVAE(nn.Module):
         attention: bool = True,
         patch: Sequence[int] = (1, 1),
         groups: int = GROUPS,
+        attention_levels: Sequence[int] = (),
+        mask: bool = False,
     ) -> None:
         super().__init__()
-        self.resolution, self.patch, self.channels = pair(resolution), pair(patch), channels
+        self.resolution, self.patch, self.channels, self.mask = pair(resolution), pair(patch), channels, mask
         steps = [pair(s) for s in strides]
         if codebook not in CODEBOOKS or len(multipliers) != len(steps) + 1 or any(s not in _STEPS for s in steps):
             raise ConfigError(
                 f"codebook {codebook!r}, multipliers {tuple(multipliers)} and strides {steps}",
                 f"one of {', '.join(CODEBOOKS)}, one multiplier more than strides, strides of {tuple(_STEPS)}",
             )
+        if not set(attention_levels) <= set(range(len(multipliers))):
+            raise ConfigError(f"attention_levels {list(attention_levels)}", f"levels 0 to {len(multipliers) - 1}")
         self.draws = 0
         self.latent_shape = (latent_channels, *reduced(self.resolution, [self.patch, *steps], "an image"))
         """Channels, rows and columns of a latent."""
         self.gradient_checkpointing = False
         """Forget what is inside the levels and compute it again in the backward pass."""
         widths, cells = [width * m for m in multipliers], self.patch[0] * self.patch[1]
-        self.encoder = Encoder(cells * channels, latent_channels, width, widths, steps, blocks, attention, groups)
+        attends = [level in attention_levels for level in range(len(widths))]
+        levels = (widths, steps, blocks, attends, attention, groups)
+        self.encoder = Encoder(cells * channels, latent_channels, width, *levels)
         self.to_latent = nn.Conv2d(latent_channels, latent_channels, 1)
         self.from_latent = nn.Conv2d(latent_channels, latent_channels, 1)
-        self.decoder = Decoder(cells * channels, latent_channels, widths, steps, blocks, attention, groups)
+        self.decoder = Decoder(cells * (channels + mask), latent_channels, *levels)
         self.codebook = Codebook(codes, latent_channels, codebook)
         # Latents leave with mean 0 and variance 1 per channel, as a flow from standard normal noise likes them.
         self.register_buffer("shift", torch.zeros(latent_channels))
@@ -135,10 +145,12 @@ class VQVAE(nn.Module):
         return (self._encode(x) - _channel(self.shift)) / _channel(self.scale)
 
     def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
-        """Latents (B, *latent_shape), moved to their codes, to images (B, C, H, W); nothing is left to ``chance``."""
+        """Latents (B, *latent_shape), moved to their codes, to images (B, C, H, W), -1 where the mask says that there is
+        no return; nothing is left to ``chance``."""
         check_shape(z, self.latent_shape, "a latent")
         z = z.to(self.to_latent.weight.dtype) * _channel(self.scale) + _channel(self.shift)
-        return self._decode(self.codebook(z)[0])
+        output = self._decode(self.codebook(z)[0])
+        return torch.where(output[:, self.channels :] < 0, -1.0, output[:, : self.channels]) if self.mask else output
 
     def forward(self, x: Tensor) -> Encoding:
         """Images (B, C, H, W) there and back; in training an "ema" codebook and the latents' statistics move."""
@@ -163,7 +175,8 @@ class VQVAE(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Images (B, C, H, W) to (B, K, h, w); arguments as of ``VQVAE``, ``widths`` per level, finest first."""
+    """Images (B, C, H, W) to (B, K, h, w); arguments as of ``VQVAE``, ``widths`` and ``attends`` per level, finest
+    first."""
 
     def __init__(
         self,
@@ -173,13 +186,16 @@ class Encoder(nn.Module):
         widths: Sequence[int],
         strides: Sequence[Grid],
         blocks: int,
+        attends: Sequence[bool],
         attention: bool,
         groups: int,
     ) -> None:
         super().__init__()
         self.stem = WrapConv(channels, width)
         inputs = [width, *widths[:-1]]
-        self.levels = nn.ModuleList(_level(a, b, blocks, groups) for a, b in zip(inputs, widths, strict=True))
+        self.levels = nn.ModuleList(
+            _level(a, b, blocks, groups, looks) for a, b, looks in zip(inputs, widths, attends, strict=True)
+        )
         self.down = nn.ModuleList(
             WrapConv(w, w, _STEPS[s].down, s, _STEPS[s].pad) for w, s in zip(widths[:-1], strides, strict=True)
         )
@@ -194,7 +210,8 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """(B, K, h, w) to images (B, C, H, W); arguments as of ``VQVAE``, ``widths`` per level, finest first."""
+    """(B, K, h, w) to images (B, C, H, W); arguments as of ``VQVAE``, ``widths`` and ``attends`` per level, finest
+    first."""
 
     def __init__(
         self,
@@ -203,6 +220,7 @@ class Decoder(nn.Module):
         widths: Sequence[int],
         strides: Sequence[Grid],
         blocks: int,
+        attends: Sequence[bool],
         attention: bool,
         groups: int,
     ) -> None:
@@ -212,7 +230,10 @@ class Decoder(nn.Module):
         # The level that a stride led to; rows stay where they are up to the first stride that takes them.
         kernels = [CURVE, *((3, 3) if s[0] > 1 else CURVE for s in strides)]
         inputs = [*widths[1:], widths[-1]]
-        levels = [_level(a, b, blocks + 1, groups, k) for a, b, k in zip(inputs, widths, kernels, strict=True)]
+        levels = [
+            _level(a, b, blocks + 1, groups, looks, k)
+            for a, b, looks, k in zip(inputs, widths, attends, kernels, strict=True)
+        ]
         self.levels = nn.ModuleList(reversed(levels))
         self.up = nn.ModuleList(_Upsample(w, s) for w, s in reversed(list(zip(widths[1:], strides, strict=True))))
         self.norm, self.head = Norm(widths[0], 1e-6, groups), WrapConv(widths[0], channels, CURVE)
@@ -236,10 +257,12 @@ class _Upsample(nn.Module):
         return self.conv(F.interpolate(x, scale_factor=self.stride, mode="bilinear", align_corners=True))  # type: ignore[no-any-return]
 
 
-def _level(inputs: int, outputs: int, blocks: int, groups: int, kernel: Grid = (3, 3)) -> nn.Sequential:
-    return nn.Sequential(
-        *(Residual(inputs if i == 0 else outputs, outputs, kernel, groups=groups) for i in range(blocks))
-    )
+def _level(inputs: int, outputs: int, blocks: int, groups: int, attends: bool, kernel: Grid = (3, 3)) -> nn.Sequential:
+    parts: list[nn.Module] = []
+    for i in range(blocks):
+        parts.append(Residual(inputs if i == 0 else outputs, outputs, kernel, groups=groups))
+        parts += [Attention(outputs, groups=groups)] if attends else []
+    return nn.Sequential(*parts)
 
 
 def _middle(channels: int, attention: bool, groups: int) -> nn.Sequential:
