@@ -38,18 +38,8 @@ EXEMPT: dict[str, str] = {}
 """{layout: why its reader is not fuzzed}."""
 
 
-def needs(name: str) -> Any:
-    """A reader's name as a parameter; skipped where its library cannot be imported."""
-    library = TARGETS[name].library
-    try:
-        missing = bool(library) and not importlib.import_module(library)
-    except (ImportError, OSError):
-        missing = True
-    return pytest.param(name, marks=pytest.mark.skipif(missing, reason=f"{library} cannot be imported"))
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", map(needs, TARGETS))
+@pytest.mark.parametrize("name", TARGETS)
 def test_mutated_files_are_read_soundly_or_refused(name: str) -> None:
     report = fuzz(name, TARGETS[name], range(CASES))
     found = "\n".join(f"python tools/fuzz.py --reader {name} --case {f.number}: {f}" for f in report.flaws)
@@ -64,7 +54,7 @@ def test_every_reader_is_fuzzed() -> None:
     assert {f".{name}" for name in TARGETS} >= set(SUFFIXES)
 
 
-@pytest.mark.parametrize("name", map(needs, TARGETS))
+@pytest.mark.parametrize("name", TARGETS)
 def test_a_number_gives_the_same_case(tmp_path: Path, name: str) -> None:
     def contents(cases: Cases, number: int) -> dict[str, bytes]:
         root = cases.place(number)
@@ -82,7 +72,7 @@ def test_a_number_gives_the_same_case(tmp_path: Path, name: str) -> None:
     assert contents(first, 0) == forwards[0]
 
 
-@pytest.mark.parametrize("name", map(needs, TARGETS))
+@pytest.mark.parametrize("name", TARGETS)
 def test_mutators_read_the_valid_files_and_change_them(tmp_path: Path, name: str) -> None:
     """One that always raised would be replaced by flipped bits without a word."""
     files = seed_files(TARGETS[name], tmp_path / "valid")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors.torch
 import torch
 import yaml
 from banks import SENSOR, some_image, write_bank
@@ -17,7 +18,15 @@ from layouts import some_camera, some_scan, write_kitti_raw, write_nuscenes
 from lidar_synth.bank import ShardReader
 from lidar_synth.files import write_named_matrices
 from lidar_synth.formats import READERS, WRITERS, layout_of
-from lidar_synth.generate.checkpoint import VELOCITY, Header, Part, load_checkpoint, read_header, save_checkpoint
+from lidar_synth.generate.checkpoint import (
+    VELOCITY,
+    Header,
+    Part,
+    load_checkpoint,
+    read_header,
+    save_checkpoint,
+    weights_hash,
+)
 from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
@@ -36,14 +45,12 @@ class Target:
         read: reads the folder and returns all that it found, for ``checks``.
         files: patterns of the names of the files that are mutated.
         mend: makes checksums of the folder fit again after a mutation, where they can be; done for half of the cases.
-        library: that has to be importable.
     """
 
     make: Callable[[Path], object]
     read: Callable[[Path], Any]
     files: tuple[str, ...] = ("*",)
     mend: Callable[[Path], object] | None = None
-    library: str = ""
 
 
 def scans(**fields: bool) -> list[Scan]:
@@ -64,26 +71,48 @@ def write(to: str, root: Path) -> None:
     writer.finish()
 
 
-def write_ascii_pcd(root: Path) -> None:
-    """A PCD file of text, which other tools write."""
+def some_rows() -> np.ndarray:
+    """(N, 4) float32 x, y, z, reflectance of a scan, every point twice, one half behind the other."""
     scan = scans()[0]
-    rows = np.column_stack([scan.points, scan.reflectance])
-    header = (
-        f"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
-        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA ascii\n"
-    )
-    root.mkdir(parents=True, exist_ok=True)
-    (root / "text.pcd").write_text(header + "".join(" ".join(f"{v:.6g}" for v in row) + "\n" for row in rows))
+    return np.tile(np.column_stack([scan.points, scan.reflectance])[:50], (2, 1))
 
 
 def make_pcd(root: Path) -> None:
-    """Binary as the package writes it, text, and compressed by open3d."""
-    import open3d
-
+    """Binary as the package writes it; and, as other tools do, text and LZF."""
     write("pcd", root)
-    write_ascii_pcd(root)
-    cloud = open3d.t.io.read_point_cloud(str(root / "000000.pcd"))
-    open3d.t.io.write_point_cloud(str(root / "packed.pcd"), cloud, compressed=True)
+    rows = some_rows()
+    told = f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\n"
+    head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n{told}"
+    (root / "text.pcd").write_text(head + "DATA ascii\n" + lines_of(rows))
+    columns = [column.tobytes() for column in rows.T.astype("<f4")]
+    packed = b"".join(lzf(column[: len(column) // 2]) for column in columns)
+    sizes = len(packed).to_bytes(4, "little") + sum(map(len, columns)).to_bytes(4, "little")
+    (root / "packed.pcd").write_bytes(head.encode() + b"DATA binary_compressed\n" + sizes + packed)
+
+
+def lines_of(rows: np.ndarray) -> str:
+    return "".join(" ".join(f"{value:g}" for value in row) + "\n" for row in rows)
+
+
+def lzf(plain: bytes) -> bytes:
+    """LZF of these bytes twice, one behind the other: runs of bytes as they are, then references to them."""
+    runs = [plain[i : i + 32] for i in range(0, len(plain), 32)]
+    packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
+    back = len(plain) - 1
+    assert len(plain) % 100 == 0, "the references are to 100 bytes each"
+    return packed + bytes([7 << 5 | back >> 8, 100 - 9, back & 255]) * (len(plain) // 100)
+
+
+def make_ply(root: Path) -> None:
+    """Binary as the package writes it; and, as other tools do, text and the other order of bytes, with faces."""
+    write("ply", root)
+    rows = some_rows()
+    fields = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    head = f"ply\nformat {{}} 1.0\ncomment by hand\nelement vertex {len(rows)}\n{fields}"
+    faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (root / "text.ply").write_text(head.format("ascii") + faces + lines_of(rows) + "3 0 1 2\n")
+    body = rows.astype(">f4").tobytes() + b"\x03" + np.arange(3, dtype=">i4").tobytes()
+    (root / "big.ply").write_bytes((head.format("binary_big_endian") + faces).encode() + body)
 
 
 def make_npy(root: Path) -> None:
@@ -197,12 +226,25 @@ def mend_index(root: Path) -> None:
     (root / "index.json").write_text(json.dumps(values))
 
 
+def mend_checkpoint(root: Path) -> None:
+    """The sums of the weights and of the header as they are."""
+    path = root / "model.safetensors"
+    tensors = safetensors.torch.load_file(path)
+    with safetensors.safe_open(path, "pt") as file:
+        values = json.loads(file.metadata()["lidar_synth"])
+    values["weights"] = weights_hash(tensors)
+    values.pop("checksum", None)
+    text = json.dumps(values, sort_keys=True, allow_nan=False)
+    values["checksum"] = hashlib.sha256(text.encode()).hexdigest()
+    safetensors.torch.save_file(tensors, path, {"lidar_synth": json.dumps(values)})
+
+
 TARGETS: dict[str, Target] = {
     "bin": Target(partial(write, "kitti"), partial(read, "folder")),
     "npy": Target(make_npy, partial(read, "folder")),
     "npz": Target(partial(write, "npz"), partial(read, "folder")),
-    "pcd": Target(make_pcd, partial(read, "folder"), library="open3d"),
-    "ply": Target(partial(write, "ply"), partial(read, "folder"), library="open3d"),
+    "pcd": Target(make_pcd, partial(read, "folder")),
+    "ply": Target(make_ply, partial(read, "folder")),
     "range": Target(partial(write, "range"), partial(read, "range")),
     "range_npy": Target(make_range_arrays, partial(read, "range", sensor=SENSOR)),
     "png": Target(partial(write, "png"), partial(read, "png")),
@@ -216,6 +258,6 @@ TARGETS: dict[str, Target] = {
     "bank_index": Target(make_bank, partial(read, "bank"), files=("index.json",), mend=mend_index),
     "bank_shard": Target(make_bank, read_shard, files=("shard-00000.h5",)),
     "sensor": Target(make_sensors, read_sensors),
-    "checkpoint": Target(make_checkpoint, read_checkpoint),
+    "checkpoint": Target(make_checkpoint, read_checkpoint, mend=mend_checkpoint),
 }
 """By name. A reader of ``READERS`` is read by ``partial(read, LAYOUT)``; a test sees that none is left out."""
