@@ -38,7 +38,7 @@ LONGEST_YAML = 1 << 18
 LONGEST_PLAIN = 3000
 """Characters of a value in it without quotes."""
 
-MOST_NODES, DEEPEST = 100_000, 64
+MOST_NODES, DEEPEST = 20_000, 64
 """Values in a YAML text, each alias counted as all that it stands for, and levels of them."""
 
 ARRAYS = "arrays of numbers written by numpy, none of them pickled"
@@ -207,7 +207,7 @@ def _array(
 ) -> NDArray[Any]:
     """The array whose values stand in ``content`` from ``start`` on."""
     held = len(content) - start
-    if prod(shape) * dtype.itemsize != held or len(shape) > 8:
+    if prod(shape) * dtype.itemsize != held or len(shape) > 8 or prod(max(n, 1) for n in shape) >= 1 << 58:
         raise DataError(
             f"{where} holds {held} bytes for {dtype} of shape {shape}", "as many as its shape says", SKIP_HINT
         )

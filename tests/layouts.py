@@ -5,29 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 from banks import write_bank
 from conftest import random_scan
 
-from lidar_synth.errors import LibraryError
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.calibration import AXES_CAMERA_FROM_SENSOR, Calibration
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.viz.window import import_open3d
-
-
-def _open3d_is_missing() -> bool:
-    try:
-        import_open3d()
-    except LibraryError:
-        return True
-    return False
-
-
-needs_open3d = pytest.mark.skipif(_open3d_is_missing(), reason="open3d or a system library behind it is missing")
-
 
 WRITTEN_AS = {
     "kitti": "folder",
