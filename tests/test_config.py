@@ -142,7 +142,7 @@ def test_the_papers_latent_recipes() -> None:
 
 @pytest.mark.parametrize("name", ["kitti360_codec", "semantic_kitti_codec"])
 def test_the_codec_recipes_have_the_numbers_of_lidms_public_configuration(name: str) -> None:
-    """autoencoder_c2_p4.yaml: the quantiser's beta 0.25 weighs the codes, disc_weight 0.6, base_learning_rate 4.5e-6."""
+    """autoencoder_c2_p4.yaml: beta 0.25 of the quantiser on the codes, disc_weight 0.6, base_learning_rate 4.5e-6."""
     config = load_config(TrainConfig, CONFIGS / f"{name}.yaml")
     losses, recipe = config.losses, config.recipe
     assert (losses.commitment, losses.codebook, losses.adversarial, losses.adaptive) == (1.0, 0.25, 0.6, True)

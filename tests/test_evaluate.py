@@ -3,17 +3,23 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
+from banks import some_image, write_bank
+from click.testing import Result
 from conftest import random_scan
 from typer.testing import CliRunner
 
 from lidar_synth.cli import app
-from lidar_synth.cli.sample import NOTE
 from lidar_synth.errors import ConfigError
 from lidar_synth.evaluate import PROTOCOLS
+from lidar_synth.evaluate.leakage import seen_by
 from lidar_synth.formats import WRITERS
-from lidar_synth.geometry.sensor import presets
+from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.geometry.sensor import Sensor, presets
+from lidar_synth.recordings import NOTE, frames_of
 from lidar_synth.town.export import SETTINGS
 
 
@@ -65,3 +71,176 @@ def test_what_the_model_was_trained_on_is_no_reference(folders: tuple[Path, Path
         else:
             assert result.exception is None, result.output
     assert CliRunner().invoke(app, [*call, "--training-data"]).exit_code == 0
+
+
+# --- sets of drives and frames, whatever their names --------------------------------------------------------------
+
+
+KITTI_360 = presets()["hdl64e_kitti360"]
+DRIVE = "2013_05_28_drive_{:04d}_sync/{:010d}"
+
+
+@pytest.fixture(scope="module")
+def kitti360(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scans of each of three drives."""
+    root = tmp_path_factory.mktemp("kitti360")
+    writer = WRITERS["kitti360"](root)
+    for drive in (0, 2, 3):
+        for frame in (5, 6):
+            writer.write(random_scan(KITTI_360, 2000, seed=drive + frame), frame, name=DRIVE.format(drive, frame))
+    writer.finish()
+    return root
+
+
+@pytest.fixture(scope="module")
+def odometry(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("semantic_kitti")
+    writer = WRITERS["semantic_kitti"](root)
+    for sequence in ("00", "08"):
+        writer.write(random_scan(presets()["hdl64e_semantic_kitti"], 2000), 0, name=f"{sequence}/000003")
+    writer.finish()
+    return root
+
+
+@pytest.fixture
+def fake(folders: tuple[Path, Path], tmp_path: Path) -> Path:
+    return shutil.copytree(folders[1], tmp_path / "fake")
+
+
+def judge(real: Path, fake: Path, *options: str) -> Result:
+    return CliRunner().invoke(app, ["evaluate", str(real), str(fake), "--protocol", "town", "--json", *options])
+
+
+def refused(result: Result) -> str | None:
+    """The message, or None where the two were compared."""
+    if result.exception is None:
+        return None
+    assert isinstance(result.exception, ConfigError), result.exception
+    return str(result.exception)
+
+
+LIDM_SOURCE = {"source": "https://github.com/hancyran/LiDAR-Diffusion", "split": "lidm/train"}
+OLDER: dict[str, dict[str, Any]] = {
+    "own lidm/train": {"data": {"path": "/data", "layout": "kitti360", "split": "lidm/train"}},
+    "own r2flow/train": {"data": {"path": "/data", "layout": None, "split": "r2flow/train"}},
+    "own SemanticKITTI": {"data": {"path": "/data", "layout": "semantic_kitti", "split": "train"}},
+    "imported R2Flow": {"data": "KITTI-360", "split": "r2flow/train"},
+    "imported LiDM": {"data": "KITTI-360", **LIDM_SOURCE},
+    "imported LiDM of maps": {"data": "SemanticKITTI", **LIDM_SOURCE},
+}
+"""Provenances of version 0.1.0, which name splits."""
+
+
+@pytest.mark.parametrize(
+    ("model", "split", "shared"),
+    [
+        ("own lidm/train", "r2flow/test", ["0000", "0002"]),
+        ("own lidm/train", "lidm/val", []),
+        ("own r2flow/train", "r2flow/test", []),
+        ("own r2flow/train", "lidm/val", ["0003"]),
+        ("imported R2Flow", "r2flow/train", ["0003"]),
+        ("imported R2Flow", "r2flow/test", []),
+        ("imported R2Flow", "lidm/train", []),  # it has drives 00 and 02 of it here
+        ("imported LiDM", "r2flow/test", ["0000", "0002"]),
+        ("imported LiDM", "lidm/val", []),
+        ("imported LiDM of maps", "r2flow/test", ["0000", "0002"]),  # its autoencoder's
+    ],
+)
+def test_overlapping_drives_are_refused(model: str, split: str, shared: list[str], kitti360: Path, fake: Path) -> None:
+    (fake / NOTE).write_text(json.dumps({"trained_on": "?", "seen": seen_by(OLDER[model]).to_list()}))
+    message = refused(judge(kitti360, fake, "--split", split))
+    if not shared:
+        assert message is None
+        return
+    assert message is not None
+    assert all(f"KITTI-360 2013_05_28_drive_{drive}_sync" in message for drive in shared)
+    assert "not trained on" in message
+    assert refused(judge(kitti360, fake, "--split", split, "--training-data")) is None
+
+
+@pytest.mark.parametrize("parent", ["teacher", "weaker", "init", "codec"])
+@pytest.mark.parametrize("model", OLDER)
+def test_what_a_model_was_made_from_counts(model: str, parent: str) -> None:
+    own = {"data": {"town": 5, "seed": 1}}
+    child = own | {f"{parent}_provenance": {"data": "?", "init_provenance": OLDER[model]}}
+    assert seen_by(OLDER[model])
+    assert seen_by(child) == seen_by(own) | seen_by(OLDER[model])
+
+
+def test_sequences_are_parts_of_raw_drives(odometry: Path, fake: Path) -> None:
+    def trained(ids: list[str]) -> None:
+        (fake / NOTE).write_text(json.dumps({"seen": frames_of("kitti_raw", ids).to_list()}))
+
+    trained(["2011_09_30_drive_0028_sync/0000001103"])
+    assert "KITTI 2011_09_30_drive_0028 (frame 1103)" in str(refused(judge(odometry, fake, "--split", "val")))
+    trained(["2011_09_30_drive_0028_sync/0000000003", "2011_10_03_drive_0027_sync/0000000003"])
+    assert refused(judge(odometry, fake, "--split", "val")) is None
+    assert "2011_10_03_drive_0027 (frame 3)" in str(refused(judge(odometry, fake)))
+    (fake / NOTE).write_text(json.dumps({"seen": seen_by(OLDER["imported LiDM"]).to_list()}))
+    assert refused(judge(odometry, fake, "--split", "val")) is None
+    assert refused(judge(odometry, fake, "--split", "train")) is not None
+
+
+def test_an_exported_town_is_not_the_dataset_whose_layout_it_has(kitti360: Path, fake: Path, tmp_path: Path) -> None:
+    town = shutil.copytree(kitti360, tmp_path / "town")
+    (town / SETTINGS).write_text(json.dumps({"seed": 4}))
+    (fake / NOTE).write_text(json.dumps({"seen": seen_by(OLDER["own lidm/train"]).to_list()}))
+    assert refused(judge(town, fake)) is None
+    (fake / NOTE).write_text(json.dumps({"trained_on": {"town": 100, "seed": 4}}))
+    assert "town seed 4 (all frames)" in str(refused(judge(town, fake)))
+
+
+def test_what_is_not_known_is_said(kitti360: Path, fake: Path) -> None:
+    (fake / NOTE).write_text(json.dumps({"trained_on": "KITTI raw"}))
+    result = judge(kitti360, fake)
+    assert result.exception is None
+    assert "does not tell which recordings its model was trained on" in result.stderr
+    (fake / NOTE).write_text(json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]}))
+    assert "whether the two share frames is not known" not in judge(kitti360, fake).stderr
+
+
+def test_kittis_object_set_may_share_frames_with_raw_drives(odometry: Path, fake: Path) -> None:
+    (fake / NOTE).write_text(json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]}))
+    assert "whether the two share frames is not known" in judge(odometry, fake).stderr
+
+
+def test_a_bank_tells_what_its_model_was_trained_on(kitti360: Path, tmp_path: Path) -> None:
+    bank = tmp_path / "bank"
+    write_bank(bank, [some_image(i) for i in range(2)], provenance=OLDER["own lidm/train"])
+    assert "2013_05_28_drive_0002_sync" in str(refused(judge(kitti360, bank, "--split", "r2flow/test")))
+
+
+def test_a_run_records_the_frames_that_it_saw(kitti360: Path, fake: Path, tmp_path: Path) -> None:
+    """Its own and its start's; other frames of the same drive are not refused."""
+    sensor = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0).to_dict()
+    (tmp_path / "sensor.yaml").write_text(yaml.safe_dump({sensor.pop("name"): sensor}))
+    network = {"width": 16, "time_width": 16, "depths": [1], "heads": [2], "patch": [2, 2], "window": [3, 3]}
+    values = {
+        "output": str(tmp_path / "first"), "licence": "MIT", "sensor": str(tmp_path / "sensor.yaml"),
+        "data": {"licence": "none", "path": str(kitti360), "split": "r2flow/train"},
+        "network": {"arguments": network}, "recipe": {"iterations": 1, "batch": 2}, "samples": {"every": 0},
+    }  # fmt: skip
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
+    assert CliRunner().invoke(app, ["train", str(tmp_path / "config.yaml")]).exception is None
+    first = tmp_path / "first" / "first.safetensors"
+    drive = "2013_05_28_drive_0003_sync"
+    provenance = read_header(first)[0].provenance
+    assert provenance["seen"] == [{"dataset": "KITTI-360", "drives": {drive: [[5, 6]]}}]
+    town = ["data={town: 2, seed: 9, licence: MIT}", f"init={first}", f"output={tmp_path / 'second'}"]
+    assert CliRunner().invoke(app, ["train", str(tmp_path / "config.yaml"), *town]).exception is None
+    second = read_header(tmp_path / "second" / "second.safetensors")[0].provenance
+    assert second["seen"] == [*provenance["seen"], {"dataset": "town", "drives": {"seed 9": None}}]
+    scans = tmp_path / "scans"
+    made = CliRunner().invoke(
+        app, ["sample", str(scans), "--model", str(tmp_path / "second" / "second.safetensors"), "--count", "1"]
+    )
+    assert made.exception is None, made.output
+    note = json.loads((scans / NOTE).read_text())
+    assert note["seen"] == second["seen"]
+    assert f"KITTI-360 {drive} (2 frames from 5 to 6)" in str(refused(judge(kitti360, scans, "--split", "lidm/val")))
+    later = tmp_path / "later"
+    writer = WRITERS["kitti360"](later)
+    writer.write(random_scan(KITTI_360, 2000), 0, name=DRIVE.format(3, 7))
+    writer.finish()
+    (fake / NOTE).write_text((scans / NOTE).read_text())
+    assert refused(judge(later, fake, "--split", "lidm/val")) is None

@@ -1,12 +1,14 @@
 """``lidar-synth evaluate``: one set of scans beside another."""
 
 import json
-import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from lidar_synth.recordings import Recordings
 
 
 def evaluate(
@@ -21,8 +23,9 @@ def evaluate(
 ) -> None:
     """Says how far two sets of scans lie apart: Jensen-Shannon distance and MMD from above, features on request.
 
-    The same names mean different things in different papers: figures of two protocols are not comparable, and a
-    reference that the model was trained on flatters it and is refused.
+    The same names mean different things in different papers: figures of two protocols are not comparable. A reference
+    that shares frames with what the model was trained on flatters it and is refused, whatever the names of the splits;
+    the training data of the model's teacher and autoencoder count.
 
     \b
     Examples:
@@ -31,14 +34,15 @@ def evaluate(
     """
     from lidar_synth.evaluate import PROTOCOLS
     from lidar_synth.evaluate import evaluate as compare
+    from lidar_synth.evaluate.leakage import measured
     from lidar_synth.evaluate.segmentation import load_judge
-    from lidar_synth.formats import open_scans
+    from lidar_synth.formats import layout_of, open_scans
 
     if protocol not in PROTOCOLS:
         raise typer.BadParameter(f"{protocol!r} is none of {', '.join(PROTOCOLS)}", param_hint="--protocol")
-    if not training_data:
-        _refuse_training_data(real, split, fake)
     sources = open_scans(real, sensor=sensor, split=split), open_scans(fake, sensor=sensor)
+    if not training_data:
+        _refuse_training_data(measured(sources[0], layout_of(real), real, split), real, fake)
     extractors = {"the town segmenter": load_judge().features} if segmenter else {}
     scores = compare(*sources, protocol, extractors, progress=not as_json)
     if as_json:
@@ -47,25 +51,25 @@ def evaluate(
         typer.echo("\n".join(map(str, scores)))
 
 
-def _refuse_training_data(real: Path, split: str | None, fake: Path) -> None:
+def _refuse_training_data(reference: "Recordings", real: Path, fake: Path) -> None:
     """Where generated scans say what their model was trained on, that is no reference."""
-    from lidar_synth.cli.sample import NOTE
     from lidar_synth.errors import ConfigError
-    from lidar_synth.files import read_text
-    from lidar_synth.town.export import SETTINGS
+    from lidar_synth.evaluate.leakage import overlap, seen_by_model_of, undecided
 
-    note, town = fake / NOTE, real / SETTINGS
-    if not note.is_file():
+    seen = seen_by_model_of(fake)
+    if seen is None:
         return
-    trained = json.loads(read_text(note)).get("trained_on")
-    if not isinstance(trained, dict):
-        return
-    if path := trained.get("path"):
-        same = Path(os.path.expandvars(path)).resolve() == real.resolve() and trained.get("split") == split
-    else:
-        same = town.is_file() and json.loads(read_text(town)).get("seed") == trained.get("seed")
-    if same:
+    if shared := overlap(seen, reference):
         raise ConfigError(
-            f"{real} as a reference for {fake}", "scans that the model was not trained on",
+            f"{real} as a reference for {fake}, whose model was trained on {shared} of it",
+            "scans that the model was not trained on",
             "Another split, or a town of another --seed; --training-data to compare nevertheless.",
-        )  # fmt: skip
+        )
+    if not seen:
+        typer.echo(
+            f"{fake} does not tell which recordings its model was trained on: not compared with {real}", err=True
+        )
+    elif undecided(seen, reference):
+        typer.echo(
+            "KITTI's object set was drawn from the raw drives; whether the two share frames is not known", err=True
+        )

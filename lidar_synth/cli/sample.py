@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-NOTE = ".sample.json"
-"""What stands beside generated scans: how they were made, and what the model was trained on."""
+from lidar_synth.recordings import NOTE
 
 
 def sample(
@@ -42,6 +41,7 @@ def sample(
     from tqdm import tqdm
 
     from lidar_synth.bake.conditions import conditions, conditions_for
+    from lidar_synth.evaluate.leakage import seen_by
     from lidar_synth.formats import WRITERS
     from lidar_synth.formats.source import choose
     from lidar_synth.formats.writer import claim
@@ -56,7 +56,9 @@ def sample(
         "condition": condition, "condition_layout": condition_layout, "condition_split": condition_split,
         "guidance": guidance,
     }  # fmt: skip
-    claim(writer.root / NOTE, settings | {"trained_on": generator.header.provenance["data"]})
+    provenance = generator.header.provenance
+    trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}
+    claim(writer.root / NOTE, settings | trained)
     missing = [i for i in range(count) if not writer.complete(i)]
     with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
         for first in range(0, len(missing), generator.batch):

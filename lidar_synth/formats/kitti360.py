@@ -42,21 +42,9 @@ from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.recordings import KITTI360_SPLITS
 
-
-def _drives(*drives: int) -> tuple[str, ...]:
-    return tuple(f"2013_05_28_drive_{n:04d}_sync" for n in drives)
-
-
-SPLITS: dict[str, tuple[str, ...] | None] = {
-    "r2flow/train": _drives(3, 4, 5, 6, 7, 9, 10),
-    "r2flow/test": _drives(0, 2),
-    "lidm/train": _drives(0, 2, 4, 5, 6, 7, 8, 9, 10),
-    "lidm/val": _drives(3),
-    "lidm-camera/train": _drives(0, 4, 5, 6, 7, 8, 9, 10),
-    "lidm-camera/val": _drives(3),
-    "all": None,
-}
+SPLITS = KITTI360_SPLITS
 """Drives of each split, by the work that introduced it; None = all that are there. They leak into each other: what
 R2Flow tests on, LiDM trains on."""
 
@@ -156,7 +144,7 @@ class KITTI360Writer(Writer):
 
     def _place(self, index: int, name: str | None) -> str:
         match = re.fullmatch(r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,10})", name or "")
-        drive, frame = (_drives(int(match[1]))[0], int(match[2])) if match else (self.drive, index)
+        drive, frame = (f"2013_05_28_drive_00{match[1]}_sync", int(match[2])) if match else (self.drive, index)
         return (scans_folder(Path(), drive) / f"{frame:010d}.bin").as_posix()
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:

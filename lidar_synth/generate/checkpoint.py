@@ -18,8 +18,8 @@ The header stands in the file's metadata under ``lidar_synth`` and says all that
     checksum        sha256 of all other keys, as JSON with sorted keys
 
 A tensor's name is its part, a dot, and its name in the network. The hash of a checkpoint is its checksum, which covers
-the header and, through ``weights``, the tensors. Version 1 has no checksum: its hash is the sha256 of the header's text,
-and a changed byte of its header can go unnoticed. Nothing is ever unpickled.
+the header and, through ``weights``, the tensors. Version 1 has no checksum: its hash is the sha256 of the header's
+text, and a changed byte of its header can go unnoticed. Nothing is ever unpickled.
 """
 
 import hashlib

@@ -260,7 +260,8 @@ def _compile(networks: dict[str, nn.Module]) -> None:
     networks[VELOCITY].compile()
     if (autoencoder := networks.get(CODEC)) is not None:
         # ``Module.compile`` is for what ``forward`` does; a codec is asked to decode.
-        setattr(autoencoder, "decode", torch.compile(autoencoder.decode))  # noqa: B010  # mypy: a method
+        codec: Any = autoencoder
+        codec.decode = torch.compile(codec.decode)
 
 
 def shipped_models() -> dict[str, Path]:

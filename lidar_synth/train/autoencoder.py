@@ -53,8 +53,8 @@ class Losses:
         geometric: of the points.
         mask: of the decoder's mask.
         adversarial: of the discriminator's verdict.
-        adaptive: multiply ``adversarial`` by the ratio of two norms: of the gradient that all reconstruction terms have at
-            the decoder's last layer, and of the verdict's gradient there (Esser et al., Eq. 7).
+        adaptive: multiply ``adversarial`` by the ratio of two norms at the decoder's last layer: of the gradient of all
+            reconstruction terms, and of the verdict's gradient (Esser et al., Eq. 7).
         discriminator_width: channels of the discriminator.
         noise: standard deviation of what is added to the latents of an "autoencoder", which lie in (-1, 1).
         rare: how much more the cells of rare classes count for an "autoencoder": each by the share of its class in the
@@ -192,7 +192,8 @@ class Autoencoding(nn.Module):
         if not (torch.is_grad_enabled() and last.requires_grad):
             return fooled.new_zeros(())
         one, other = (torch.autograd.grad(x, last, retain_graph=True)[0].norm() for x in (reconstruction, fooled))
-        return (one / (other + 1e-4)).clamp(max=1e4)
+        balance: Tensor = (one / (other + 1e-4)).clamp(max=1e4)
+        return balance
 
 
 def _code(bits: Tensor) -> Tensor:

@@ -44,7 +44,7 @@ from lidar_synth.train import (
 )
 from lidar_synth.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.train.selection import load_selection, save_selection, selection_settings
-from lidar_synth.train.start import fresh_networks, provenance_of, start_networks
+from lidar_synth.train.start import fresh_networks, provenance_of, start_networks, with_recordings
 from lidar_synth.train.teaching import taught_flow
 
 if TYPE_CHECKING:
@@ -91,10 +91,12 @@ def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -
         ConfigError: where the configuration does not fit the checkpoints that it names.
     """
     if isinstance(config, DistillConfig):
-        return plan_student(config, accelerator)
-    if config.decoder:
-        return plan_decoder(config, accelerator)
-    return plan_autoencoder(config) if config.autoencodes else plan_teacher(config, accelerator)
+        plan = plan_student(config, accelerator)
+    elif config.decoder:
+        plan = plan_decoder(config, accelerator)
+    else:
+        plan = plan_autoencoder(config) if config.autoencodes else plan_teacher(config, accelerator)
+    return replace(plan, header=with_recordings(config, plan.header))
 
 
 def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> Plan:

@@ -1,7 +1,9 @@
 """What a training run starts with: fresh networks, or those of a checkpoint, and the header of what will come of it."""
 
 import json
+import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,12 +12,15 @@ from torch import nn
 
 from lidar_synth import __version__
 from lidar_synth.errors import ConfigError
+from lidar_synth.evaluate.leakage import inherited, recordings_of, town
 from lidar_synth.flow.solvers import uniform_grid
+from lidar_synth.formats import BankScans, ScanFiles, layout_of
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, Part, load_checkpoint
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.models import build_network
-from lidar_synth.train.config import Network, Run, TrainConfig
+from lidar_synth.recordings import Recordings
+from lidar_synth.train.config import Data, Network, Run, TrainConfig
 
 LOOKING = ("hdit", "denoiser", "sight", "autoencoder")
 """Architectures that take the angles of rays."""
@@ -123,6 +128,26 @@ def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path
     for key in set(keys) & config.model_fields_set:
         if json.dumps(asked[key], sort_keys=True) != json.dumps(held[key], sort_keys=True):
             raise ConfigError(f"{key} {asked[key]}", f"that of {path}: {held[key]}", f"Or leave out {key}.")
+
+
+def with_recordings(config: Run, header: Header) -> Header:
+    """The header with all recordings that the weights will know: of this run and of what it begins with.
+
+    Raises:
+        FileError, DataError: where the scans cannot be opened.
+    """
+    seen = inherited(header.provenance) | _recordings(config.data, header.sensor)
+    return replace(header, provenance=header.provenance | {"seen": seen.to_list()})
+
+
+def _recordings(data: Data, sensor: Sensor) -> Recordings:
+    if data.path is None:
+        return town(data.seed)
+    source = data.open(sensor)
+    assert isinstance(source, ScanFiles)
+    if isinstance(source, BankScans):  # maybe at a URL, which has no layout to look for
+        return recordings_of(source, "bank", data.path)
+    return recordings_of(source, data.layout or layout_of(Path(os.path.expandvars(data.path))), data.path)
 
 
 def provenance_of(config: Run) -> dict[str, Any]:

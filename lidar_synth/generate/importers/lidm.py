@@ -33,11 +33,23 @@ from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.models import assemble
 from lidar_synth.models.lidm.diffusion import schedule_times
 from lidar_synth.parsing import read_yaml
+from lidar_synth.recordings import KITTI360, KITTI360_SPLITS, Recordings, frames_of, whole
 
 STEPS = 50
 """Of the uniform time grid that the checkpoint names: the peer samples in 50."""
 CAMERA_SIZE = (376, 1408)
 """Rows and columns of KITTI-360's rectified images, which the peer cuts into views."""
+SOURCE = "https://github.com/hancyran/LiDAR-Diffusion"
+IMAGES = "KITTI-360 and KITTI odometry"
+_LABELLED = ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10")
+SEEN = {
+    "SemanticKITTI": frames_of("semantic_kitti", _LABELLED),
+    "KITTI-360": whole(KITTI360, KITTI360_SPLITS["lidm/train"] or ()),
+    IMAGES: whole(KITTI360, KITTI360_SPLITS["lidm/train"] or ())
+    | frames_of("semantic_kitti", (*_LABELLED, *map(str, range(11, 22)))),
+}
+"""What the peer trains on, by the names that a provenance has under ``data`` (its lidm/data/kitti.py). All of its
+autoencoders are trained on range images of both datasets, with the sequences of the odometry benchmark's test set."""
 OFFSET = 1.0001
 """The peer's logarithmic scale is log2(d + 0.0001 + 1)."""
 
@@ -167,17 +179,35 @@ def _sensor(data: Mapping[str, Any]) -> Sensor:
 
 
 def _semantic_kitti(data: Mapping[str, Any]) -> bool:
-    return "SemanticKITTI" in data["train"]["target"]
+    return _data(data["train"]) == "SemanticKITTI"
+
+
+def _data(train: Mapping[str, Any]) -> str:
+    """The key of ``SEEN`` of a configuration's training data."""
+    if "SemanticKITTI" in train["target"]:
+        return "SemanticKITTI"
+    return IMAGES if "KITTIImage" in train["target"] else "KITTI-360"
+
+
+def seen(data: str, generates: bool) -> Recordings:
+    """The recordings that weights know.
+
+    Args:
+        data: a key of ``SEEN``; of another one nothing is known.
+        generates: a diffusion model; its autoencoder, which its file repeats, knows ``IMAGES``.
+    """
+    return SEEN.get(data, Recordings()) | (SEEN[IMAGES] if generates else Recordings())
 
 
 def _provenance(config: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    data = config["data"]["params"]
+    name = _data(config["data"]["params"]["train"])
     return {
-        "data": "SemanticKITTI" if _semantic_kitti(data) else "KITTI-360",
+        "data": name,
         "data_licence": "CC BY-NC-SA 3.0",
         "split": "lidm/train",
+        "seen": seen(name, generates="ddconfig" not in config["model"]["params"]).to_list(),
         "licence": "as LiDM's repository: MIT",
-        "source": "https://github.com/hancyran/LiDAR-Diffusion",
+        "source": SOURCE,
         "file": path.name,
         "file_sha256": sha256(path),
         "recipe": config["model"],

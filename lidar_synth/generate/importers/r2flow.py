@@ -28,6 +28,7 @@ from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.models import assemble
 from lidar_synth.models.positions import BASES, LEARNED
+from lidar_synth.recordings import KITTI360, KITTI360_SPLITS, whole
 
 HEADS = (2, 4, 8, 16)
 MAPPING_DEPTH = 2
@@ -137,10 +138,14 @@ def _time_grid(cfg: Mapping[str, Any]) -> tuple[float, ...]:
 
 def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
     cfg = content["cfg"]
+    # Of its split of KITTI raw nothing is published.
+    known = whole(KITTI360, KITTI360_SPLITS["r2flow/train"] or ())
+    seen = {"seen": known.to_list()} if cfg["data"]["dataset"] == "kitti_360" else {}
     return {
         "data": DATA[cfg["data"]["dataset"]][0],
         "data_licence": "CC BY-NC-SA 3.0",
         "split": "r2flow/train",
+        **seen,
         "licence": "as R2Flow's repository: MIT",
         "source": "https://github.com/kazuto1011/r2flow",
         "file": path.name,

@@ -145,8 +145,8 @@ class VQVAE(nn.Module):
         return (self._encode(x) - _channel(self.shift)) / _channel(self.scale)
 
     def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
-        """Latents (B, *latent_shape), moved to their codes, to images (B, C, H, W), -1 where the mask says that there is
-        no return; nothing is left to ``chance``."""
+        """Latents (B, *latent_shape), moved to their codes, to images (B, C, H, W), -1 where the mask says that there
+        is no return; nothing is left to ``chance``."""
         check_shape(z, self.latent_shape, "a latent")
         z = z.to(self.to_latent.weight.dtype) * _channel(self.scale) + _channel(self.shift)
         output = self._decode(self.codebook(z)[0])

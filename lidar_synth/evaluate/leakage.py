@@ -1,0 +1,147 @@
+"""What a model was trained on, and whether that is what it is measured on.
+
+A checkpoint's provenance holds under ``seen`` all recordings that its weights know: its own training data and those of
+its teacher, its start and its autoencoder. Provenances without it, of version 0.1.0, name a split or a path instead; a
+split whose drives are known stands for them, a path for itself.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lidar_synth.bank import Bank, is_bank
+from lidar_synth.files import read_text
+from lidar_synth.formats import BankScans
+from lidar_synth.formats.semantic_kitti import SPLITS as SEMANTIC_KITTI_SPLITS
+from lidar_synth.formats.source import ScanFiles
+from lidar_synth.generate.importers import lidm
+from lidar_synth.recordings import (
+    FILES,
+    KITTI,
+    KITTI360,
+    KITTI360_SPLITS,
+    KITTI_OBJECT,
+    NOTE,
+    PLACES,
+    TOWN,
+    Recordings,
+    frames_of,
+    whole,
+)
+from lidar_synth.town.export import SETTINGS
+
+
+def seen_by(provenance: Mapping[str, Any]) -> Recordings:
+    """All recordings that weights know by their provenance, through teachers, starts and autoencoders.
+
+    Raises:
+        DataError: on recordings that are none.
+    """
+    own = Recordings.from_list(provenance["seen"]) if "seen" in provenance else _older(provenance)
+    return own | inherited(provenance)
+
+
+def inherited(provenance: Mapping[str, Any]) -> Recordings:
+    """The recordings known to the checkpoints that weights were made from; raises as ``seen_by``."""
+    seen = Recordings()
+    for key, value in provenance.items():
+        if key.endswith("_provenance") and isinstance(value, Mapping):
+            seen |= seen_by(value)
+    return seen
+
+
+def seen_by_model_of(path: Path) -> Recordings | None:
+    """What the model of generated scans was trained on; None where nothing beside the scans tells.
+
+    Args:
+        path: a folder of ``lidar-synth sample``, or a bank.
+
+    Raises:
+        FileError, DataError: where what stands beside them is damaged.
+    """
+    if (path / NOTE).is_file():
+        note = json.loads(read_text(path / NOTE))
+        known = {"data": note.get("trained_on")} | ({"seen": note["seen"]} if "seen" in note else {})
+        return seen_by(known)
+    if is_bank(path):
+        return _of_bank(Bank(path))
+    return None
+
+
+def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recordings:
+    """The recordings that a source on disk holds.
+
+    Args:
+        source: as ``open_scans`` gives it.
+        layout: its layout, a name of ``READERS``.
+        path: where it is, as it was typed; stands for scans that no dataset is known of.
+
+    Raises:
+        FileError, DataError: where the settings of an exported town are damaged.
+    """
+    settings = Path(os.path.expandvars(path)) / SETTINGS
+    if settings.is_file():  # in the layout of a dataset, with names like its own
+        return town(json.loads(read_text(settings)).get("seed", 0))
+    if isinstance(source, BankScans):  # what its model knows comes with its scans
+        return whole(FILES, [str(path)]) | _of_bank(source.bank)
+    return frames_of(layout, source.ids) if layout in PLACES else whole(FILES, [str(path)])
+
+
+def measured(source: ScanFiles, layout: str, path: Path, split: str | None) -> Recordings:
+    """What a model must not have been trained on: the recordings of a reference, and its path."""
+    return recordings_of(source, layout, path) | whole(FILES, [str(path)] + ([f"{path}#{split}"] if split else []))
+
+
+def overlap(seen: Recordings, reference: Recordings) -> Recordings:
+    """The recordings of a reference that a model has seen; paths are compared as the places that they lead to."""
+    return _resolved(seen) & _resolved(reference)
+
+
+def undecided(seen: Recordings, reference: Recordings) -> bool:
+    """Whether one of the two is of KITTI's object set and the other of the raw drives that it was drawn from."""
+    some, others = ({dataset for dataset, _ in part.drives} for part in (seen, reference))
+    return (KITTI in some and KITTI_OBJECT in others) or (KITTI_OBJECT in some and KITTI in others)
+
+
+def town(seed: int) -> Recordings:
+    """The town of a seed; the streets of its scans are the same in every layout."""
+    return whole(TOWN, [f"seed {seed}"])
+
+
+def _of_bank(bank: Bank) -> Recordings:
+    seen = Recordings()
+    for facts in bank.index.sources:
+        seen |= seen_by(facts.provenance)
+    return seen
+
+
+def _older(provenance: Mapping[str, Any]) -> Recordings:
+    """By a provenance without recordings: what its split, town or path stands for."""
+    if provenance.get("source") == lidm.SOURCE:
+        return lidm.seen(str(provenance.get("data")), generates=True)
+    data, split = provenance.get("data"), provenance.get("split")
+    layout, path = None, None
+    if isinstance(data, Mapping):
+        if data.get("town") is not None:
+            return town(data.get("seed", 0))
+        layout, path, split = data.get("layout"), data.get("path"), data.get("split")
+    elif data == "KITTI-360":
+        layout = "kitti360"
+    if layout in (None, "kitti360") and (drives := KITTI360_SPLITS.get(str(split))):
+        return whole(KITTI360, drives)
+    if layout == "semantic_kitti" and (drives := SEMANTIC_KITTI_SPLITS.get(str(split))):
+        return frames_of(layout, drives)
+    return whole(FILES, [f"{path}#{split}" if split else str(path)] if path else [])
+
+
+def _resolved(recordings: Recordings) -> Recordings:
+    """With the places that paths lead to."""
+    result = Recordings()
+    for (dataset, drive), frames in recordings.drives.items():
+        if dataset == FILES:
+            path, mark, split = drive.partition("#")
+            drive = f"{Path(os.path.expandvars(path)).resolve()}{mark}{split}"
+        result |= Recordings({(dataset, drive): frames})
+    return result

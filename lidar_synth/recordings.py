@@ -1,0 +1,196 @@
+"""Which recorded frames a set of scans holds, so that no model is measured on what it was trained on.
+
+A frame is a dataset, a drive of it and a number. Names of splits do not tell: what LiDM trains on (``lidm/train``) and
+what R2Flow tests on (``r2flow/test``) share two drives of KITTI-360. Nor do names of datasets: the sequences of
+SemanticKITTI are those of KITTI's odometry benchmark, which were cut from KITTI's raw drives. Both are kept as raw
+drives here, by the table of the odometry devkit's readme (``ODOMETRY``). KITTI-360 was recorded two years later and
+shares nothing with them.
+
+KITTI's object set was drawn from the raw drives too, in random order; which frame is which stands only in its devkit
+(mapping/), so that it counts as a dataset of its own.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from lidar_synth.errors import DataError
+
+KITTI360, KITTI, KITTI_OBJECT, TOWN, FILES = "KITTI-360", "KITTI", "KITTI object", "town", "files"
+"""Datasets. A drive of the town is a seed; one of ``FILES``, a path whose scans no dataset is known of."""
+
+Frames = tuple[tuple[int, int], ...] | None
+"""Frames of a drive: first and last of each run of them, rising; None = all."""
+
+
+def _drives(*drives: int) -> tuple[str, ...]:
+    return tuple(f"2013_05_28_drive_{n:04d}_sync" for n in drives)
+
+
+KITTI360_SPLITS: dict[str, tuple[str, ...] | None] = {
+    "r2flow/train": _drives(3, 4, 5, 6, 7, 9, 10),
+    "r2flow/test": _drives(0, 2),
+    "lidm/train": _drives(0, 2, 4, 5, 6, 7, 8, 9, 10),
+    "lidm/val": _drives(3),
+    "lidm-camera/train": _drives(0, 4, 5, 6, 7, 8, 9, 10),
+    "lidm-camera/val": _drives(3),
+    "all": None,
+}
+"""Drives of KITTI-360's splits, by the work that introduced each; None = all that are there."""
+
+ODOMETRY = {
+    "00": ("2011_10_03_drive_0027", 0, 4540),
+    "01": ("2011_10_03_drive_0042", 0, 1100),
+    "02": ("2011_10_03_drive_0034", 0, 4660),
+    "03": ("2011_09_26_drive_0067", 0, 800),
+    "04": ("2011_09_30_drive_0016", 0, 270),
+    "05": ("2011_09_30_drive_0018", 0, 2760),
+    "06": ("2011_09_30_drive_0020", 0, 1100),
+    "07": ("2011_09_30_drive_0027", 0, 1100),
+    "08": ("2011_09_30_drive_0028", 1100, 5170),
+    "09": ("2011_09_30_drive_0033", 0, 1590),
+    "10": ("2011_09_30_drive_0034", 0, 1200),
+}
+"""Raw drive, first and last frame of each sequence of the odometry benchmark; those of 11 to 21 are not published."""
+
+NOTE = ".sample.json"
+"""The file beside generated scans that says how they were made, and what their model has seen."""
+
+_MOST_RUNS = 200  # of a drive; more are kept as one from the first frame to the last
+_SHOWN = 6  # drives in a message
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """A set of recorded frames; ``|`` joins two, ``&`` gives what they share.
+
+    Args:
+        drives: {(dataset, drive): frames}.
+    """
+
+    drives: Mapping[tuple[str, str], Frames] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.drives)
+
+    def __or__(self, other: "Recordings") -> "Recordings":
+        joined = dict(self.drives)
+        for key, frames in other.drives.items():
+            held = joined.get(key, ())
+            joined[key] = None if frames is None or held is None else _merged([*held, *frames])
+        return Recordings(joined)
+
+    def __and__(self, other: "Recordings") -> "Recordings":
+        shared = {key: _shared(self.drives[key], other.drives[key]) for key in self.drives if key in other.drives}
+        return Recordings({key: frames for key, frames in shared.items() if frames != ()})
+
+    def __str__(self) -> str:
+        named = [
+            f"{dataset} {drive} ({_told(frames)})"
+            for (dataset, drive), frames in sorted(self.drives.items(), key=lambda d: d[0])
+        ]
+        more = f" and {len(named) - _SHOWN} more drives" if len(named) > _SHOWN else ""
+        return ", ".join(named[:_SHOWN]) + more
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """Plain values, as a checkpoint's provenance holds them: for each dataset its drives, and for each drive the
+        first and the last frame of its runs, or null for the whole drive."""
+        values: dict[str, dict[str, list[list[int]] | None]] = {}
+        for (dataset, drive), frames in sorted(self.drives.items(), key=lambda d: d[0]):
+            values.setdefault(dataset, {})[drive] = None if frames is None else [list(run) for run in frames]
+        return [{"dataset": dataset, "drives": drives} for dataset, drives in values.items()]
+
+    @classmethod
+    def from_list(cls, values: Any) -> "Recordings":
+        """The inverse of ``to_list``.
+
+        Raises:
+            DataError: on values that are none of it.
+        """
+        try:
+            drives = {(str(p["dataset"]), str(d)): frames for p in values for d, frames in p["drives"].items()}
+            return cls({k: None if v is None else _merged((int(a), int(b)) for a, b in v) for k, v in drives.items()})
+        except (TypeError, KeyError, ValueError, AttributeError) as error:
+            raise DataError(
+                f"recordings {str(values)[:200]} ({error!r})", "datasets, their drives and frames"
+            ) from error
+
+
+def whole(dataset: str, drives: Iterable[str]) -> Recordings:
+    """All frames of some drives."""
+    return Recordings({(dataset, drive): None for drive in drives})
+
+
+def frames_of(layout: str, ids: Iterable[str]) -> Recordings:
+    """The recordings behind the ids of scans, or of whole drives.
+
+    Args:
+        layout: one of ``PLACES``; nothing is known of the scans of others.
+        ids: ``drive/frame`` of each scan as the layout's reader names them, or ``drive`` for all of its frames.
+    """
+    numbers: dict[str, set[str]] = {}
+    for name in ids if layout in PLACES else ():
+        drive, _, frame = name.partition("/")
+        numbers.setdefault(drive, set()).add(frame)
+    result = Recordings()
+    for drive, frames in numbers.items():
+        dataset, recorded, first, last = PLACES[layout](drive)
+        known: Frames = None if last is None else ((first, last),)
+        if all(frame.isdecimal() for frame in frames):
+            known = _runs([first + int(frame) for frame in frames])
+        result |= Recordings({(dataset, recorded): known})
+    return result
+
+
+Place = tuple[str, str, int, int | None]
+"""Dataset, drive, and the numbers that the first and the last frame have in it (None = to its end)."""
+
+
+def _sequence(name: str) -> Place:
+    if name not in ODOMETRY:
+        return KITTI, f"odometry {name}", 0, None
+    drive, first, last = ODOMETRY[name]
+    return KITTI, drive, first, last
+
+
+PLACES: dict[str, Callable[[str], Place]] = {
+    "kitti360": lambda drive: (KITTI360, drive, 0, None),
+    "kitti_raw": lambda drive: (KITTI, drive.removesuffix("_sync").removesuffix("_extract"), 0, None),
+    "semantic_kitti": _sequence,
+    "kitti_object": lambda part: (KITTI_OBJECT, part, 0, None),
+}
+"""Where a drive of a layout was recorded."""
+
+
+def _runs(numbers: Sequence[int]) -> Frames:
+    """Numbers of frames as runs."""
+    runs = _merged([(n, n) for n in numbers])
+    return runs if len(runs) <= _MOST_RUNS else ((runs[0][0], runs[-1][1]),)
+
+
+def _merged(runs: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+    """Rising runs, those that touch joined."""
+    joined: list[tuple[int, int]] = []
+    for first, last in sorted(runs):
+        if joined and first <= joined[-1][1] + 1:
+            joined[-1] = (joined[-1][0], max(last, joined[-1][1]))
+        else:
+            joined.append((first, last))
+    return tuple(joined)
+
+
+def _shared(some: Frames, others: Frames) -> Frames:
+    """Frames that are in both."""
+    if some is None or others is None:
+        return others if some is None else some
+    both = ((max(a, c), min(b, d)) for a, b in some for c, d in others)
+    return _merged([(first, last) for first, last in both if first <= last])
+
+
+def _told(frames: Frames) -> str:
+    if frames is None:
+        return "all frames"
+    count = sum(last - first + 1 for first, last in frames)
+    if count == 1:
+        return f"frame {frames[0][0]}"
+    return f"{count} frames from {frames[0][0]} to {frames[-1][1]}"
