@@ -210,12 +210,12 @@ def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
 
 
 @contextmanager
-def named(path: Path) -> Iterator[None]:
+def naming(where: str | Path) -> Iterator[None]:
     """Name a file in the errors of what is made from its values."""
     try:
         yield
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{where}: {error}") from error
 
 
 def read_named_matrices(path: Path) -> dict[str, NDArray[np.float64]]:

@@ -20,7 +20,7 @@ import numpy as np
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files import (
     list_files,
-    named,
+    naming,
     png_size,
     read_named_matrices,
     read_text,
@@ -183,7 +183,7 @@ def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> C
     if sizes != {"P2": 12, "R0_rect": 9, "Tr_velo_to_cam": 12}:
         raise DataError(f"{path} has {sizes} values", "P2 with 12, R0_rect with 9 and Tr_velo_to_cam with 12")
     camera_from_sensor = homogeneous(matrices["R0_rect"]) @ homogeneous(matrices["Tr_velo_to_cam"])
-    with named(path):
+    with naming(path):
         return Calibration(matrices["P2"].reshape(3, 4), camera_from_sensor, image_size, matrices)
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import list_files, named, png_size, read_file, read_named_matrices
+from lidar_synth.files import list_files, naming, png_size, read_file, read_named_matrices
 from lidar_synth.formats.calibration import Calibration, homogeneous, read_image_size
 from lidar_synth.formats.points import FARTHEST, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -130,7 +130,7 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
         values, names, occlusion, truncation, instances = zip(*found, strict=True)
         if not (np.abs(values) <= FARTHEST).all():  # NaN is not
             raise DataError(f"{path}: a box of frame {frame} with {values}", f"metres within {FARTHEST:g}, and radians")
-        with named(path):
+        with naming(path):
             boxes[frame] = Boxes(
                 np.array(values, np.float32),
                 names,

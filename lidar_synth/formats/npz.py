@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError, LidarSynthError
 from lidar_synth.files import SKIP_HINT, write_file
 from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Boxes, RangeImage, Scan
@@ -110,7 +111,8 @@ def range_image(distance: NDArray[Any], sensor: Sensor, channels: dict[str, NDAr
 
     Raises:
         DataError: on text, NaN, infinite or negative ranges, which would be cells without a return in silence; on a
-            shape that is not the sensor's.
+            shape that is not the sensor's; on labels that are no train ids, and shares outside of [0, 1]. Cells without
+            a return may hold anything: they become what ``RangeImage`` says.
     """
     check_numbers(distance, f"{where}: range")
     with np.errstate(over="ignore"):
@@ -118,6 +120,14 @@ def range_image(distance: NDArray[Any], sensor: Sensor, channels: dict[str, NDAr
     bad = ~(np.isfinite(image.range) & (image.range >= 0))
     if bad.any():
         raise DataError(f"{where}: {bad.sum()} cells whose range is negative or no number", "metres, 0 = no return")
+    for name in [n for n in image.channels if n in POINT_FIELDS]:
+        values = image.channels[name].copy()
+        values[~image.mask] = IGNORE if name == "label" else 0
+        image.channels[name] = values
+        if name in ("reflectance", "confidence") and not ((values >= 0) & (values <= 1)).all():
+            raise DataError(f"{where}: {name} from {values.min()} to {values.max()}", "0 to 1")
+        if name == "label" and not ((values < len(NAMES)) | (values == IGNORE)).all():
+            raise DataError(f"{where}: labels {np.unique(values)[-8:].tolist()}", "train ids 0..18, or 255 = ignore")
     return image
 
 

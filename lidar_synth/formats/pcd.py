@@ -90,10 +90,11 @@ def _header(text: str, where: str) -> tuple[list[Field], int]:
         raise DataError(
             f"{fault} ({ {key: len(header[key]) for key in _PER_FIELD} })", "one value per field", SKIP_HINT
         )
-    numbers = [*header["SIZE"], *header["COUNT"], *header["WIDTH"], *header["HEIGHT"], *header["POINTS"]]
-    if any(not re.fullmatch("[0-9]{1,12}", number) for number in numbers):
-        raise DataError(f"{fault}: sizes that are none", "whole numbers", SKIP_HINT)
-    [width], [height], [points] = (list(map(int, header[key])) or [0] for key in ("WIDTH", "HEIGHT", "POINTS"))
+    single = [header[key] for key in ("WIDTH", "HEIGHT", "POINTS")]
+    numbers = sum(single, [*header["SIZE"], *header["COUNT"]])
+    if any(len(row) != 1 for row in single) or any(not re.fullmatch("[0-9]{1,12}", number) for number in numbers):
+        raise DataError(f"{fault}: sizes that are none", "whole numbers, one each of WIDTH, HEIGHT, POINTS", SKIP_HINT)
+    width, height, points = (int(number) for [number] in single)
     if width * height != points:
         raise DataError(f"{where}: WIDTH {width}, HEIGHT {height} and POINTS {points}", "WIDTH x HEIGHT = POINTS")
     fields = []

@@ -22,7 +22,7 @@ from lidar_synth.classes import SEMANTIC_KITTI
 from lidar_synth.errors import DataError
 from lidar_synth.files import (
     list_files,
-    named,
+    naming,
     numbers,
     png_size,
     read_matrix,
@@ -168,7 +168,7 @@ def read_calibration(folder: Path) -> Calibration | None:
     if any(matrices.get(name, np.zeros(0)).size != 12 for name in ("P2", "Tr")):
         return None
     size = next((png_size(p) for p in sorted((folder / "image_2").glob("*.png"))), None)
-    with named(folder / "calib.txt"):
+    with naming(folder / "calib.txt"):
         return Calibration(matrices["P2"].reshape(3, 4), homogeneous(matrices["Tr"]), size, matrices)
 
 

@@ -219,11 +219,12 @@ class _Bounded(BufferedReader):
 
 
 class _Member(tarfile.TarInfo):
-    """A member whose size is not negative: older versions of tarfile never come to its end (CVE-2025-8194)."""
+    """A member of a size that a file can have: older versions of tarfile never come to the end of a negative one
+    (CVE-2025-8194), and no version seeks beyond 2^63."""
 
     def _block(self, count: int) -> int:
-        if count < 0:
-            raise tarfile.ReadError("a member of negative size")
+        if not 0 <= count < 1 << 62:
+            raise tarfile.ReadError(f"a member of {count} bytes")
         return super()._block(count)  # type: ignore[misc,no-any-return]
 
 
