@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from layouts import MAKERS, nuscenes_arrays, some_scan, write_all, write_nuscenes
+from layouts import MAKERS, nuscenes_arrays, some_scan, write_all, write_nuscenes, write_tars
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
@@ -490,3 +490,23 @@ def test_clouds_need_no_open3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_bad_names_for_a_writer(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="drive 'a/b'"):
         WRITERS["kitti360"](tmp_path, drive="a/b")  # type: ignore[call-arg]
+
+
+def test_a_tar_member_larger_than_any_file(tmp_path: Path) -> None:
+    [path] = write_tars(tmp_path)[:1]
+    content = bytearray(path.read_bytes())
+    content[124:136] = b"\x80" + (2**63 - 1).to_bytes(11, "big")
+    content[148:156] = b" " * 8
+    content[148:156] = b"%06o\x00 " % sum(content[:512])
+    path.write_bytes(content)
+    with pytest.raises(
+        DataError, match=rf"{path.name} is cut, damaged or no tar file \(a member of 9223372036854775807"
+    ):
+        open_scans(path)
+
+
+def test_a_cloud_with_two_widths(tmp_path: Path) -> None:
+    [path] = write_all("pcd", tmp_path, [some_scan()])
+    path.write_bytes(path.read_bytes().replace(b"HEIGHT 1\n", b"HEIGHT 1 1\n"))
+    with pytest.raises(DataError, match=r"one each of WIDTH, HEIGHT, POINTS"):
+        open_scans(path)[0]
