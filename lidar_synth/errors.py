@@ -30,6 +30,11 @@ class LidarSynthError(Exception):
         super().__init__(given + (f"; expected {expected}" if expected else "") + (f". {hint}" if hint else ""))
 
 
+def shorten(text: str, most: int) -> str:
+    """A text for a message: at most so many characters of it."""
+    return text if len(text) <= most else f"{text[:most]} ..."
+
+
 class DataError(LidarSynthError, ValueError):
     """A file, array or scan whose content is not what it has to be."""
 

@@ -5,22 +5,33 @@ A file is written beside its place and renamed, so that a reader never meets hal
 
 import hashlib
 import os
+import re
 import secrets
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.errors import DataError, FileError, shorten
+
+LARGEST_IMAGE = 65535
+"""Pixels of an image's width or height at most."""
 
 _BLOCK = 1 << 20  # bytes read at a time
 STRAY = "allow_pickle"
 """Name of an array that is none: numpy before 2.2 stores the option of that name."""
 
 SKIP_HINT = "Copy the file again, or leave it out with on_bad='skip'."
+
+LONGEST_NAME = 200
+"""Bytes of a file's name; file systems take 255, and a file that is being written has a longer name for a while."""
+
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+
+_NOT_ON_WINDOWS = re.compile(r'[<>:"|?*]|[. ]$|^(?i:con|prn|aux|nul|com\d|lpt\d)(\.|$)')
 
 
 def part_of(path: Path) -> Path:
@@ -45,7 +56,8 @@ def write_file(
     part = part_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
+        part.unlink(missing_ok=True)
+        with part.open("xb") as file:  # a new file, never one that a link of this name leads to
             if callable(content):
                 content(file)
             else:
@@ -77,16 +89,26 @@ def _linked(part: Path, path: Path) -> bool:
     return True
 
 
-def read_file(path: Path) -> bytes:
+def read_file(path: Path, expected: str = "a file of the dataset", at_most: int | None = None) -> bytes:
     """The bytes of a file.
+
+    Args:
+        path: the file.
+        expected: what it should be, for the error.
+        at_most: bytes; a longer file is refused unread.
 
     Raises:
         FileError: where it cannot be read.
+        DataError: where it is longer.
     """
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            content = file.read(-1 if at_most is None else at_most + 1)
     except OSError as error:
-        raise unreadable(path, error) from error
+        raise unreadable(path, error, expected) from error
+    if at_most is not None and len(content) > at_most:
+        raise DataError(f"{path} is longer than {at_most} bytes", expected)
+    return content
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
@@ -116,9 +138,61 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-def unreadable(path: Path, error: OSError) -> FileError:
+def unreadable(path: Path, error: OSError, expected: str = "a file of the dataset") -> FileError:
     """The error for a path that cannot be read."""
-    return FileError(f"{path} cannot be read ({error.strerror or error})", "a file of the dataset")
+    return FileError(f"{path} cannot be read ({error.strerror or error})", expected)
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The path under a folder of a name that comes from elsewhere: from a bank, an archive or a table.
+
+    Args:
+        folder: where the path has to stay.
+        name: parts with / between them.
+
+    Raises:
+        DataError: on a name that leads out of the folder, that another name could share its file with, or that a file
+            cannot have everywhere.
+    """
+    if fault := _name_fault(name):
+        raise DataError(
+            f"the name {shorten(repr(name), 100)} for a file under {folder}: {fault}",
+            "a relative path such as town/7/12",
+        )
+    return folder / name
+
+
+def _name_fault(name: str) -> str:
+    """What is wrong with a name as the path of a file; "" where nothing is."""
+    parts = name.split("/")
+    if _UNPRINTABLE.search(name):
+        return "it has a control character or half a character"
+    if "\\" in name or re.match("[A-Za-z]:", name) or name.startswith("/"):
+        return "it is an absolute path, or has a backslash"
+    if any(part.startswith(".") or not part for part in parts):
+        return "a part of it is empty, or begins with a dot"
+    if len(name.encode()) > 1000 or max(len(part.encode()) for part in parts) > LONGEST_NAME:
+        return f"it is longer than 1000 bytes, or one of its parts than {LONGEST_NAME}"
+    if os.name == "nt" and any(_NOT_ON_WINDOWS.search(part) for part in parts):
+        return "Windows has another meaning for it"
+    return ""
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse an output folder with a link that leads out of it: what is written there would land elsewhere.
+
+    Raises:
+        FileError: naming the link.
+    """
+    home = folder.resolve()
+    for parent, names, _ in os.walk(folder):
+        for path in (Path(parent, name) for name in names):
+            if path.is_symlink() and not path.resolve().is_relative_to(home):
+                raise FileError(
+                    f"{path} is a link to {path.resolve()}",
+                    f"folders that lie in {folder}",
+                    "Remove the link, or choose another output folder.",
+                )
 
 
 def list_files(folder: Path, *suffixes: str) -> list[Path]:
@@ -148,15 +222,15 @@ def read_values(path: Path, dtype: str) -> NDArray[Any]:
     return np.frombuffer(content, dtype)
 
 
-def read_text(path: Path) -> str:
-    """The text of a file.
+def read_text(path: Path, expected: str = "a file of the dataset", at_most: int | None = None) -> str:
+    """The text of a file; the arguments are those of ``read_file``.
 
     Raises:
         FileError: where it cannot be read.
-        DataError: where it is no text.
+        DataError: where it is no text, or longer.
     """
     try:
-        return read_file(path).decode()
+        return read_file(path, expected, at_most).decode()
     except UnicodeDecodeError as error:
         raise DataError(f"{path} is not a text file ({error.reason})", "UTF-8 text") from error
 
@@ -170,9 +244,20 @@ def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
     """
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
     try:
+        if any(len(row) != columns for row in rows):
+            raise ValueError("a line of another length")
         return np.array(rows, np.float64).reshape(-1, columns)
     except ValueError as error:
         raise DataError(f"{path} does not hold rows of {columns} numbers", f"{columns} numbers per line") from error
+
+
+@contextmanager
+def naming(where: str | Path) -> Iterator[None]:
+    """Name a file in the errors of what is made from its values."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
 
 
 def read_named_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -204,16 +289,16 @@ def write_named_matrices(path: Path, matrices: Mapping[str, NDArray[np.float64]]
 
 
 def png_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) of a PNG, from its header; None where there is no such file."""
+    """(width, height) of a PNG, from its header; None where there is no such file, or its header is damaged."""
     try:
         with path.open("rb") as file:
             header = file.read(24)
     except OSError:
         return None
-    if header[:8] != b"\x89PNG\r\n\x1a\n":
+    if len(header) < 24 or header[:8] != b"\x89PNG\r\n\x1a\n":
         return None
     width, height = np.frombuffer(header[16:], ">u4").tolist()
-    return width, height
+    return (width, height) if 1 <= min(width, height) <= max(width, height) <= LARGEST_IMAGE else None
 
 
 def numbers(values: Iterable[float]) -> str:

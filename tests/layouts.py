@@ -1,39 +1,18 @@
 """Small datasets in every layout that can be written, for tests of readers, conversion and bad input."""
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pytest
 from banks import write_bank
 from conftest import random_scan
 
-from lidar_synth.errors import LibraryError
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.calibration import AXES_CAMERA_FROM_SENSOR, Calibration
-from lidar_synth.formats.pcd import import_open3d
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import load_sensor
-
-
-def _open3d_is_missing() -> bool:
-    try:
-        import_open3d()
-    except LibraryError:
-        return True
-    return False
-
-
-needs_open3d = pytest.mark.skipif(_open3d_is_missing(), reason="open3d or a system library behind it is missing")
-
-
-def formats(names: Iterable[str] = WRITERS) -> list[Any]:
-    """Writers' names as parameters; those that need open3d are skipped where it does not import."""
-    return [pytest.param(name, marks=needs_open3d) if name in ("pcd", "ply") else name for name in names]
-
 
 WRITTEN_AS = {
     "kitti": "folder",

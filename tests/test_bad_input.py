@@ -6,15 +6,18 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from layouts import MAKERS, formats, nuscenes_arrays, some_scan, write_all, write_nuscenes
+from layouts import MAKERS, nuscenes_arrays, some_scan, write_all, write_nuscenes, write_tars
 
-from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files import write_file
-from lidar_synth.formats import READERS, WRITERS, NuScenes, SemanticKITTI, open_scans
+from lidar_synth.formats import READERS, WRITERS, NuScenes, RangeImages, SemanticKITTI, open_scans
 from lidar_synth.formats.points import read_points
+from lidar_synth.geometry.scan import Boxes
+from lidar_synth.geometry.sensor import Sensor
 
 RAW = ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw", "folder"]
 """Layouts that hold KITTI's .bin files."""
@@ -211,6 +214,9 @@ def test_a_source_without_one_good_scan(tmp_path: Path) -> None:
     assert len(source.skipped) == 3 and list(source) == []
 
 
+DRIVE = "data_poses/2013_05_28_drive_0000_sync/poses.txt"
+
+
 @pytest.mark.parametrize(
     ("layout", "file", "text", "message"),
     [
@@ -222,6 +228,19 @@ def test_a_source_without_one_good_scan(tmp_path: Path) -> None:
         ("kitti360", "calibration/perspective.txt", "P_rect_00: 1", "KeyError.*expected P_rect_00, R_rect_00"),
         ("kitti360", "data_3d_bboxes/train/2013_05_28_drive_0000_sync.xml", "<a><b>", "no element|mismatched|unclosed"),
         ("kitti_raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<a>", "no element|tracklet"),
+        ("kitti_object", "training/label_2/000000.txt", "Car 0 0 " + "nan " * 12, "line 1 has the values .*finite"),
+        ("kitti_object", "training/label_2/000000.txt", "Car 0 9 " + "1 " * 12, "occlusion of 0 to 3"),
+        ("kitti_object", "training/label_2/000000.txt", "Car 0 0 " + "0 " * 12, "a size above 0"),
+        ("kitti_object", "training/label_2/000000.txt", "Car 0 0 " + "1e30 " * 12, "finite numbers"),
+        ("semantic_kitti", "sequences/00/poses.txt", "1 0 0 0 0 2 0 0 0 0 1 0", "1 of 1 transforms are not rigid"),
+        ("semantic_kitti", "sequences/00/poses.txt", "inf " * 12, "not rigid"),
+        ("semantic_kitti", "sequences/00/poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0 " * 2, "rows of 12 numbers"),
+        ("semantic_kitti", "sequences/00/calib.txt", f"P2: {'1 ' * 12}\nTr: {'1 ' * 12}", "not rigid"),
+        ("kitti360", DRIVE, "7 " + "nan " * 12, "not rigid"),
+        ("kitti360", DRIVE, "7.5 1 0 0 0 0 1 0 0 0 0 1 0", "frames that are no numbers of one"),
+        ("kitti360", DRIVE, "7 1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "or some twice"),
+        ("kitti360", "calibration/calib_cam_to_pose.txt", "image_00: " + "1 " * 11, "'image_00': 11"),
+        ("kitti360", "calibration/calib_cam_to_velo.txt", "1 0 0 0 0 1 0 0 0 0 0 0", "cam_to_velo: .*not rigid"),
     ],
 )
 def test_damaged_text_files_are_named(tmp_path: Path, layout: str, file: str, text: str, message: str) -> None:
@@ -233,7 +252,92 @@ def test_damaged_text_files_are_named(tmp_path: Path, layout: str, file: str, te
         open_scans(tmp_path, layout=layout)[0]
 
 
-@pytest.mark.parametrize("kind", formats(["npz", "npy", "pcd", "ply", "png"]))
+@pytest.mark.parametrize(
+    ("layout", "file", "old", "new", "message"),
+    [
+        ("kitti_raw", "tracklet_labels.xml", "<boost", '<?xml version="1.0" encoding="x"?><boost', "unknown encoding"),
+        ("kitti_raw", "tracklet_labels.xml", "<tx>10</tx>", "<tx>1e400</tx>", "a box of frame 1 with .*inf"),
+        ("kitti_raw", "tracklet_labels.xml", "<h>1.2</h>", "<h>0</h>", "size that is not positive"),
+        ("kitti360", "*.xml", "encoding='utf-8'", "encoding='x'", "unknown encoding"),
+        ("kitti360", "*.xml", "<instanceId>1<", "<instanceId>99999999999<", "out of bounds|too large"),
+        ("kitti360", "*.xml", "<data>", "<data>nan ", "cannot reshape|no boxes"),
+        ("kitti_object", "calib/000000.txt", "R0_rect: 1", "R0_rect: 2", "not rigid"),
+        ("kitti_object", "calib/000000.txt", "R0_rect: 1.0", "R0_rect: nan 1.0", "'R0_rect': 10"),
+    ],
+)
+def test_a_changed_value_is_refused_by_the_name_of_its_file(
+    tmp_path: Path, layout: str, file: str, old: str, new: str, message: str
+) -> None:
+    MAKERS[layout](tmp_path)
+    [path, *_] = sorted(tmp_path.rglob(file))
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(DataError, match=f"{re.escape(path.name)}.*({message})"):
+        list(open_scans(tmp_path, layout=layout))
+
+
+def test_a_picture_of_no_size_is_no_picture(tmp_path: Path) -> None:
+    """A camera's size comes from its picture's header, and a black picture of that size is written where none is."""
+    write_all("kitti_object", tmp_path, [some_scan()])
+    path = tmp_path / "training" / "image_2" / "000000.png"
+    content = path.read_bytes()
+    camera = open_scans(tmp_path).calibration(0)
+    assert camera is not None and camera.image_size == (1242, 375)
+    for width in (0, 2**31):
+        path.write_bytes(content[:16] + width.to_bytes(4, "big") + content[20:])
+        camera = open_scans(tmp_path).calibration(0)
+        assert camera is not None and camera.image_size is None
+
+
+def test_names_of_frames_stay_in_their_folder(tmp_path: Path) -> None:
+    MAKERS["kitti_object"](tmp_path)
+    (tmp_path / "ImageSets" / "train.txt").write_text("000000\n../velodyne/000001\n")
+    with pytest.raises(DataError, match=r"train.txt lists '../velodyne/000001'; expected names of frames"):
+        open_scans(tmp_path, split="train")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("confidence", 1.5, "confidence from .* to 1.5"),
+        ("confidence", np.nan, "confidence from nan"),
+        ("pose", np.eye(4) * 2, "its pose: 1 of 1 transforms are not rigid"),
+    ],
+)
+@pytest.mark.parametrize("to", ["npz", "range", "webdataset"])
+def test_values_of_a_scan_that_none_has(tmp_path: Path, to: str, name: str, value: Any, message: str) -> None:
+    scan = some_scan()
+    scan.confidence = np.ones(len(scan), np.float32)
+    if name == "pose":
+        scan.pose = value
+    else:
+        scan.confidence[:] = value
+    write_all(to, tmp_path, [scan])
+    with pytest.raises(DataError, match=message):
+        open_scans(tmp_path)[0]
+
+
+@pytest.mark.parametrize("name", ["truncation", "image_box", "alpha", "dont_care"])
+def test_boxes_with_values_that_are_no_numbers(name: str) -> None:
+    with pytest.raises(DataError, match="non-finite"):
+        Boxes(np.ones((1, 7)), ("Car",), **{name: np.full((1, 4) if "_" in name else 1, np.nan)})
+
+
+def test_cells_without_a_return_may_hold_anything(tmp_path: Path) -> None:
+    """Others' range images have -1 or 255 there; cells with a return are checked."""
+    sensor = Sensor("small", 4, 1, 80, rows=2, fov_up=3, fov_down=-25)
+    image = np.stack([[[5, 0, 5, 5]] * 2, [[0.5, -1, 1, 0]] * 2]).astype("f4")
+    np.save(tmp_path / "image.npy", image)
+    found = RangeImages(tmp_path, sensor=sensor).image(0).reflectance
+    assert found is not None and found.tolist() == [[0.5, 0, 1, 0]] * 2
+    image[1, 0, 2] = 64.5
+    np.save(tmp_path / "image.npy", image)
+    with pytest.raises(DataError, match=r"image.npy: reflectance from 0.0 to 64.5; expected 0 to 1"):
+        RangeImages(tmp_path, sensor=sensor).image(0)
+
+
+@pytest.mark.parametrize("kind", ["npz", "npy", "pcd", "ply", "png"])
 def test_damaged_files_with_a_header(tmp_path: Path, kind: str) -> None:
     scan = some_scan()
     if kind == "npy":
@@ -290,7 +394,7 @@ def test_a_folder_of_two_kinds(tmp_path: Path) -> None:
         READERS["folder"](tmp_path)  # type: ignore[call-arg, arg-type]
 
 
-@pytest.mark.parametrize("to", formats())
+@pytest.mark.parametrize("to", WRITERS)
 def test_a_target_that_cannot_be_written(tmp_path: Path, to: str) -> None:
     """A file stands where the folder should be: refused for root too, whom no permission stops."""
     (tmp_path / "out").write_text("in the way")
@@ -299,7 +403,7 @@ def test_a_target_that_cannot_be_written(tmp_path: Path, to: str) -> None:
     assert (tmp_path / "out").read_text() == "in the way"
 
 
-@pytest.mark.parametrize("to", formats())
+@pytest.mark.parametrize("to", WRITERS)
 def test_a_disk_that_is_full_leaves_no_half_scan(tmp_path: Path, to: str) -> None:
     """The system refuses every byte beyond a limit, as a full disk does."""
     resource = pytest.importorskip("resource", reason="needs POSIX limits")
@@ -376,18 +480,33 @@ def test_the_hint_finds_the_number_of_fields(tmp_path: Path) -> None:
     assert read_points(tmp_path / "five.bin", fields=5).shape == (3, 5)
 
 
-def test_without_open3d_the_error_names_the_line_that_installs_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_clouds_need_no_open3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)  # as if its import failed
-    with pytest.raises(LibraryError, match="open3d cannot be imported.*Type: apt-get install libusb-1.0-0 libgl1"):
-        WRITERS["pcd"](tmp_path).write(some_scan(), 0)
-    (tmp_path / "scan.ply").write_text("ply")
-    with pytest.raises(LibraryError, match="for .pcd and .ply files"):
-        open_scans(tmp_path / "scan.ply", on_bad="skip")[0]
-    WRITERS["kitti"](tmp_path).write(some_scan(), 0)
+    for to in ("pcd", "ply"):
+        write_all(to, tmp_path / to, [some_scan()])
+        assert len(open_scans(tmp_path / to)[0]) == len(some_scan())
 
 
 def test_bad_names_for_a_writer(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="drive 'a/b'"):
         WRITERS["kitti360"](tmp_path, drive="a/b")  # type: ignore[call-arg]
+
+
+def test_a_tar_member_larger_than_any_file(tmp_path: Path) -> None:
+    [path] = write_tars(tmp_path)[:1]
+    content = bytearray(path.read_bytes())
+    content[124:136] = b"\x80" + (2**63 - 1).to_bytes(11, "big")
+    content[148:156] = b" " * 8
+    content[148:156] = b"%06o\x00 " % sum(content[:512])
+    path.write_bytes(content)
+    with pytest.raises(
+        DataError, match=rf"{path.name} is cut, damaged or no tar file \(a member of 9223372036854775807"
+    ):
+        open_scans(path)
+
+
+def test_a_cloud_with_two_widths(tmp_path: Path) -> None:
+    [path] = write_all("pcd", tmp_path, [some_scan()])
+    path.write_bytes(path.read_bytes().replace(b"HEIGHT 1\n", b"HEIGHT 1 1\n"))
+    with pytest.raises(DataError, match=r"one each of WIDTH, HEIGHT, POINTS"):
+        open_scans(path)[0]

@@ -521,3 +521,25 @@ def test_the_golden_bank_is_still_read() -> None:
     known = json.loads((golden / "numbers.json").read_text())
     assert bank.identity == known["identity"]
     assert [numbers(bank, i) for i in range(len(bank))] == known["scans"]
+
+
+@pytest.mark.parametrize(("name", "code"), [("label", 127), ("label", 19), ("confidence", 16)])
+def test_codes_that_no_writer_writes_are_refused_whatever_the_checksum(tmp_path: Path, name: str, code: int) -> None:
+    [path] = write_bank(tmp_path, [some_image()], fields=("reflectance", "label", "confidence"))
+    with h5py.File(path, "r+") as file:
+        values = file[name][0]
+        values[2, 3] = code
+        file[name][0] = values
+        arrays = {n: np.ascontiguousarray(file[n][0]) for n in ("range", "reflectance", "label", "confidence")}
+        file["crc"][0] = checksum(int(file["seed"][0]), int(file["index"][0]), arrays)
+    with ShardReader(path, "the shard") as shard, pytest.raises(DataError, match=f"the shard: scan 0: .*{code}"):
+        shard.read(0)
+
+
+def test_a_number_in_the_place_of_text_takes_no_memory(tmp_path: Path) -> None:
+    """bytes(2**40) would be a terabyte of zeros."""
+    [path] = write_bank(tmp_path, [some_image()])
+    with h5py.File(path, "r+") as file:
+        file.attrs["model"] = 2**40
+    with pytest.raises(DataError, match="model is a int64"):
+        ShardReader(path, "the shard")

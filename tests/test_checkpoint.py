@@ -378,3 +378,14 @@ def test_a_full_disk_leaves_the_old_checkpoint(saved: Path, monkeypatch: pytest.
 def test_other_names_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"ends in \.safetensors"):
         save_checkpoint(tmp_path / "model.pth", HEADER, {VELOCITY: network()})
+
+
+@pytest.mark.parametrize("change", [lambda t: t.double() * 1e300, lambda t: t.to(torch.complex64)])
+def test_weights_that_no_float32_holds_are_refused(saved: Path, change: Any) -> None:
+    def one(tensors: dict[str, Tensor]) -> None:
+        name = next(key for key, tensor in tensors.items() if tensor.ndim == 2)
+        tensors[name] = change(tensors[name])
+
+    replace_weights(saved, one)
+    with pytest.raises(DataError, match="has NaN or infinity in"):
+        load_checkpoint(saved)

@@ -63,7 +63,7 @@ GOOD = {"name": "x", "columns": 8, "range_min": 1.0, "range_max": 9.0, "rows": 4
     [
         ({"columns": 7}, "an even number"),
         ({"range_max": 0.5}, "range_min < range_max"),
-        ({"range_max": float("nan")}, "range_min < range_max"),
+        ({"range_max": float("nan")}, "range_max = nan; expected a finite number"),
         ({"fov_down": 3.0}, "fov_up > fov_down"),
         ({"rows": None}, "either all of rows"),
         ({"elevations": [2.0, 1.0]}, "or elevations"),

@@ -104,6 +104,18 @@ class Encoding:
                 channels[name] = arrays[name].copy()
         return RangeImage(self.metres(arrays["range"]), self.sensor, channels)
 
+    def check(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Refuse codes that ``encode`` never gives.
+
+        Raises:
+            DataError: naming the array.
+        """
+        for name in set(LEVELS) & set(arrays):
+            if LEVELS[name] < arrays[name].max(initial=0):
+                raise DataError(f"a {name} with the code {arrays[name].max()}", f"at most {LEVELS[name]}")
+        if "label" in arrays:
+            _train_ids(arrays["label"])
+
     def metres(self, codes: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Ranges (any shape) of their codes, 0 = no return."""
         near, far = self.sensor.range_min * (1 + _INSIDE), self.sensor.range_max * (1 - _INSIDE)

@@ -375,7 +375,7 @@ def _plain(name: str, value: Any) -> Any:
     """The inverse of ``_attribute``."""
     if isinstance(value, float):
         return float(value)
-    if not isinstance(value, str | bytes):
-        raise TypeError(f"{name} is no text")
+    if not isinstance(value, str | bytes):  # bytes(NUMBER) would take as many bytes as the number says
+        raise ValueError(f"{name} is a {type(value).__name__}")
     text = value if isinstance(value, str) else value.decode()
     return text if name in _TEXT else _from_json(text)

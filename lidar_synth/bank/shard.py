@@ -31,6 +31,7 @@ from lidar_synth.bank.index import FORMAT, REPAIR, Entry, Facts
 from lidar_synth.bank.layout import Layout, read_attributes, read_layout, with_hdf5
 from lidar_synth.bank.storage import LocalFile, Storage
 from lidar_synth.errors import DataError, LidarSynthError
+from lidar_synth.files import naming
 
 _GAP = 16 << 10  # bytes between two chunks that are read along rather than asked for separately
 
@@ -149,6 +150,8 @@ class ShardReader:
                 raise ValueError("its CRC does not match")
             if (seed, index) != (self.entry.seed, self.entry.first + position):
                 raise ValueError(f"it is scan {index} of seed {seed}")
+        with naming(f"{self.name}: scan {position}"):
+            self.encoding.check(arrays)
         return arrays, packed
 
     def _packed(self, position: int) -> dict[str, bytes]:

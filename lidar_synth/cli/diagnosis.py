@@ -44,7 +44,7 @@ class Finding:
 
 OPTIONAL = {
     "embreex": "the town and whatever else casts rays",
-    "open3d": "PCD and PLY files and the 3-D window of lidar-synth view",
+    "open3d": "the 3-D window of lidar-synth view",
 }
 """What the parts that a machine can do without are for; every other dependency is required."""
 

@@ -17,7 +17,6 @@ from lidar_synth.formats.folder import SUFFIXES, Folder, KITTIWriter, NPZWriter,
 from lidar_synth.formats.kitti360 import KITTI360, KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObject, KITTIObjectWriter
 from lidar_synth.formats.kitti_raw import DRIVES, KITTIRaw
-from lidar_synth.formats.npz import read_arrays
 from lidar_synth.formats.nuscenes import SUFFIX, NuScenes
 from lidar_synth.formats.png import PNGWriter, RangePNG
 from lidar_synth.formats.range_images import RangeImages, RangeWriter
@@ -27,6 +26,7 @@ from lidar_synth.formats.webdataset import SUFFIX as TAR
 from lidar_synth.formats.webdataset import WebDataset, WebDatasetWriter
 from lidar_synth.formats.writer import Writer
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.parsing import read_arrays
 
 __all__ = [
     "KITTI360",

@@ -7,8 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.files import LARGEST_IMAGE
 
 Matrix = NDArray[np.float64]
+
+NOT_RIGID = 0.01
+"""By how much a product R R^T may be off the identity: KITTI's files have rotations of six digits."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +27,7 @@ class Calibration:
             them back loses nothing.
 
     Raises:
-        DataError: on another shape.
+        DataError: on another shape, a transform that is not rigid, or an image of a size that no camera takes.
     """
 
     projection: Matrix
@@ -37,6 +41,9 @@ class Calibration:
             if value.shape != shape or not np.isfinite(value).all():
                 raise DataError(f"calibration: {name} of shape {value.shape}", f"{shape}, all values finite")
             object.__setattr__(self, name, value)
+        check_rigid(self.camera_from_sensor, "calibration: camera_from_sensor")
+        if self.image_size is not None and not all(1 <= n <= LARGEST_IMAGE for n in self.image_size):
+            raise DataError(f"calibration: an image of {self.image_size} pixels", f"1 to {LARGEST_IMAGE} each way")
 
     @property
     def image_from_sensor(self) -> Matrix:
@@ -64,6 +71,41 @@ class Calibration:
         with np.errstate(divide="ignore", invalid="ignore"):
             pixels = np.where(depth[:, None] > 0, homogeneous[:, :2] / depth[:, None], np.nan)
         return pixels, depth
+
+
+def check_rigid(transforms: Matrix, where: str) -> None:
+    """Refuse what moves and turns nothing rigidly: a pose or a calibration with a wrong number.
+
+    Args:
+        transforms: (..., 4, 4), or (..., 3, 4) without the last row.
+        where: what to name in the error.
+
+    Raises:
+        DataError: on values that are not finite, or a left part that is no rotation to within ``NOT_RIGID``.
+    """
+    rotations = transforms[..., :3, :3].reshape(-1, 3, 3)
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(rotations @ rotations.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2), initial=0)
+        sound = (off < NOT_RIGID) & (np.linalg.det(rotations) > 0)
+    sound &= np.isfinite(transforms).all(axis=(-1, -2)).reshape(-1)
+    if not sound.all():
+        first = int(np.flatnonzero(~sound)[0])
+        raise DataError(
+            f"{where}: {np.count_nonzero(~sound)} of {len(sound)} transforms are not rigid, the first is number "
+            f"{first}: {transforms.reshape(-1, *transforms.shape[-2:])[first].tolist()}",
+            "finite numbers whose left 3 x 3 part is a rotation",
+        )
+
+
+def read_image_size(values: Matrix, where: str) -> tuple[int, int]:
+    """(width, height) in pixels of a line of a calibration file.
+
+    Raises:
+        DataError: on anything but two whole numbers that a camera may have.
+    """
+    if values.shape != (2,) or not ((values >= 1) & (values <= LARGEST_IMAGE) & (values == np.rint(values))).all():
+        raise DataError(f"{where}: an image of {values.tolist()} pixels", f"two whole numbers, 1 to {LARGEST_IMAGE}")
+    return int(values[0]), int(values[1])
 
 
 def homogeneous(matrix: Matrix) -> Matrix:

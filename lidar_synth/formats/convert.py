@@ -103,8 +103,7 @@ def convert(
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
     claim(writer.root / SETTINGS, _settings(source, writer, as_sensor, unfold))
-    missing = [i for i in range(len(source)) if not writer.complete(i, name_of(source, i))]
-    report = Report(kept=len(source) - len(missing))
+    missing, report = _compare(source, writer, on_bad)
     if isinstance(source, ScanFiles):
         report.left_out = writer.carry(source)
     grid = partial(reproject, sensor=as_sensor, unfold=unfold) if unfold or as_sensor is not None else None
@@ -129,6 +128,34 @@ def _count(report: Report, done: Outcome, name: str) -> None:
         report.written += 1
     if done.dropped:
         report.dropped[name] = done.dropped
+
+
+def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], Report]:
+    """Indices of the scans that are not there yet, and what is known before any is read.
+
+    Raises:
+        DataError: on a scan whose name is no path under the output folder, or that of a scan before it, with
+            ``on_bad="error"``.
+    """
+    report, missing = Report(), []
+    taken: set[str] = set()
+    for index in range(len(source)):
+        name = name_of(source, index)
+        try:
+            places = {os.path.normcase(writer.path(index, name))} | ({f"id {name}"} if name is not None else set())
+            if places & taken:
+                raise DataError(f"scan {index} is called {name!r}", "a name, and a file, that no scan before it has")
+            taken |= places
+        except DataError as error:
+            if on_bad == "error":
+                raise
+            report.skipped[f"{name} (scan {index})"] = str(error)
+            continue
+        if writer.complete(index, name):
+            report.kept += 1
+        else:
+            missing.append(index)
+    return missing, report
 
 
 def convert_one(

@@ -3,7 +3,7 @@
 - ``.bin``: float32 x, y, z, reflectance per point, as KITTI's; beside it ``NAME.label`` with SemanticKITTI's labels.
 - ``.npy``: the same as an array (N, 4), or with more columns, of which the first four count.
 - ``.npz``: the package's own, see npz.py.
-- ``.pcd``, ``.ply``: by open3d, see pcd.py.
+- ``.pcd``, ``.ply``: see pcd.py and ply.py.
 
 Files in subfolders belong to it; a scan's id is its path there without the suffix.
 """
@@ -16,14 +16,16 @@ from numpy.typing import NDArray
 from lidar_synth.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.npz import decode_scan, read_arrays, told_sensor, write_scan
-from lidar_synth.formats.pcd import read_cloud, write_cloud
+from lidar_synth.formats.npz import check_numbers, decode_scan, told_sensor, write_scan
+from lidar_synth.formats.pcd import read_pcd, write_pcd
+from lidar_synth.formats.ply import read_ply, write_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import check_scan, read_points, write_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import FileWriter, Picture
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.parsing import read_arrays
 
 SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 
@@ -81,8 +83,7 @@ class Folder(ScanFiles):
             check_scan(scan, str(path))
             return scan
         else:
-            arrays = _columns(path) if suffix == ".npy" else read_cloud(path)
-            scan = Scan(sensor=self.sensor, **arrays)
+            scan = Scan(sensor=self.sensor, **ARRAYS[suffix](path))
             check_scan(scan, str(path), self._reflectance_max)
         if self._reflectance_max != 1:
             scan.reflectance = scan.reflectance / np.float32(self._reflectance_max)
@@ -93,8 +94,14 @@ def _columns(path: Path) -> dict[str, NDArray[np.float32]]:
     array = read_arrays(path)["array"]
     if array.ndim != 2 or array.shape[1] < 4:
         raise DataError(f"{path} holds an array of shape {array.shape}", "(N, 4): x, y, z, reflectance")
-    array = array.astype(np.float32, copy=False)
+    check_numbers(array, str(path))
+    with np.errstate(over="ignore"):
+        array = array.astype(np.float32, copy=False)
     return {"points": array[:, :3], "reflectance": array[:, 3]}
+
+
+ARRAYS = {".npy": _columns, ".pcd": read_pcd, ".ply": read_ply}
+"""Readers of a scan's arrays by suffix."""
 
 
 def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]:
@@ -147,10 +154,13 @@ class PCDWriter(FileWriter):
     suffix = ".pcd"
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
-        write_cloud(path, scan)
+        write_pcd(path, scan)
 
 
-class PLYWriter(PCDWriter):
+class PLYWriter(FileWriter):
     """Writes ``NAME.ply`` with the scan's points and fields; boxes and pose have no place there."""
 
     suffix = ".ply"
+
+    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        write_ply(path, scan)

@@ -152,10 +152,10 @@ class KITTI360Writer(Writer):
             raise ConfigError(f"drive {drive!r}", "a folder's name, 2013_05_28_drive_0000_sync for instance")
         self.drive = drive
 
-    def path(self, index: int, name: str | None = None) -> Path:
-        match = re.fullmatch(r"(?:2013_05_28_drive_00)?(\d\d)(?:_sync)?/(\d+)", name or "")
+    def _place(self, index: int, name: str | None) -> str:
+        match = re.fullmatch(r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,10})", name or "")
         drive, frame = (f"2013_05_28_drive_00{match[1]}_sync", int(match[2])) if match else (self.drive, index)
-        return scans_folder(self.root, drive) / f"{frame:010d}.bin"
+        return (scans_folder(Path(), drive) / f"{frame:010d}.bin").as_posix()
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         drive, frame = path.parents[2].name, path.stem

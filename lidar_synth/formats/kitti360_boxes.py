@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files import numbers, unreadable, write_file
+from lidar_synth.formats.points import FARTHEST
 from lidar_synth.geometry.scan import Boxes
 
 MARGIN = 100
@@ -113,16 +114,24 @@ def read_boxes(path: Path) -> WorldBoxes:
                 frame, first, last = (int(node.findtext(t) or -1) for t in ("timestamp", "start_frame", "end_frame"))
                 windows.append((frame, frame) if frame >= 0 else (first - MARGIN, last + MARGIN))
             node.clear()
+        found = WorldBoxes(
+            np.array(transforms).reshape(-1, 4, 4),
+            np.array(names, np.str_),
+            np.array(instances, np.int32),
+            np.array(windows, np.int64).reshape(-1, 2),
+        )
     except OSError as error:
         raise unreadable(path, error) from error
-    except (ElementTree.ParseError, ValueError) as error:
+    except (ElementTree.ParseError, ValueError, LookupError, OverflowError) as error:
         raise DataError(f"{path}: {error}", "KITTI-360's data_3d_bboxes") from error
-    return WorldBoxes(
-        np.array(transforms).reshape(-1, 4, 4),
-        np.array(names, np.str_),
-        np.array(instances, np.int32),
-        np.array(windows, np.int64).reshape(-1, 2),
-    )
+    sizes = np.linalg.norm(found.transforms[:, :3, :3], axis=1)
+    sound = np.isfinite(found.transforms).all(axis=(1, 2)) & ((sizes > 0) & (sizes <= FARTHEST)).all(axis=1)
+    if not sound.all():
+        wrong = found.transforms[~sound][0].tolist()
+        raise DataError(
+            f"{path}: {np.count_nonzero(~sound)} objects are no boxes, such as {wrong}", "finite sizes above 0"
+        )
+    return found
 
 
 def _matrix(node: ElementTree.Element, tag: str, shape: tuple[int, ...]) -> NDArray[np.float64]:

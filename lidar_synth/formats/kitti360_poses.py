@@ -16,13 +16,17 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files import numbers, read_matrix, read_named_matrices, write_file, write_named_matrices
-from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
+from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneous, ideal_camera, read_image_size
 
 CAMERA = ideal_camera(552.554261, (1408, 376))
 """What ``calibration`` describes where no camera is known: image_00's size and focal length, at the sensor."""
 
 IMU_FROM_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
 """The IMU has x forward, y right, z down; where nothing else is known it stands in the sensor."""
+
+
+SIZES = {"P_rect_00": 12, "R_rect_00": 9, "S_rect_00": 2, "image_00": 12, "cam_to_velo": 12}
+"""Values of each matrix of the calibration."""
 
 
 def read_calibration(root: Path) -> Calibration | None:
@@ -35,14 +39,18 @@ def read_calibration(root: Path) -> Calibration | None:
     paths = [folder / name for name in ("perspective.txt", "calib_cam_to_velo.txt", "calib_cam_to_pose.txt")]
     if not all(path.is_file() for path in paths):
         return None
-    named = read_named_matrices(paths[0]) | read_named_matrices(paths[2])
+    found = read_named_matrices(paths[0]) | read_named_matrices(paths[2])
+    found["cam_to_velo"] = read_matrix(paths[1], 12).reshape(-1)
     try:
-        matrices = {n: named[n] for n in ("P_rect_00", "R_rect_00", "S_rect_00", "image_00")}
-        matrices["cam_to_velo"] = read_matrix(paths[1], 12)[0]
+        matrices = {name: found[name] for name in SIZES}
+        if wrong := {name: values.size for name, values in matrices.items() if values.size != SIZES[name]}:
+            raise ValueError(f"{wrong} values, not {SIZES}")
+        for name in ("image_00", "cam_to_velo"):
+            check_rigid(homogeneous(matrices[name]), name)
         camera_from_sensor = homogeneous(matrices["R_rect_00"]) @ np.linalg.inv(homogeneous(matrices["cam_to_velo"]))
-        width, height = matrices["S_rect_00"].astype(int).tolist()
-        return Calibration(matrices["P_rect_00"].reshape(3, 4), camera_from_sensor, (width, height), matrices)
-    except (KeyError, ValueError, IndexError) as error:
+        size = read_image_size(matrices["S_rect_00"], "S_rect_00")
+        return Calibration(matrices["P_rect_00"].reshape(3, 4), camera_from_sensor, size, matrices)
+    except (KeyError, ValueError) as error:
         raise DataError(f"{folder}: {error!r}", "P_rect_00, R_rect_00, S_rect_00, image_00 and 12 numbers") from error
 
 
@@ -73,14 +81,24 @@ def imu_from_sensor(camera: Calibration | None) -> NDArray[np.float64]:
 
 
 def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, NDArray[np.float64]]:
-    """{frame: (4, 4) velodyne to world}; empty without ``poses.txt`` or calibration. Not every frame has one."""
+    """{frame: (4, 4) velodyne to world}; empty without ``poses.txt`` or calibration. Not every frame has one.
+
+    Raises:
+        DataError: on a line without 13 numbers, a frame that is no number of one or stands there twice, or a pose that
+            is not rigid.
+    """
     path = root / "data_poses" / drive / "poses.txt"
     if camera is None or not path.is_file():
         return {}
     lines = read_matrix(path, 13)
     matrices = np.tile(np.eye(4), (len(lines), 1, 1))
     matrices[:, :3] = lines[:, 1:].reshape(-1, 3, 4)
-    return dict(zip(lines[:, 0].astype(int).tolist(), matrices @ imu_from_sensor(camera), strict=True))
+    frames = lines[:, 0]
+    whole = (frames >= 0) & (frames < 1e10) & (frames == np.rint(frames))
+    if not whole.all() or len(np.unique(frames)) < len(frames):
+        raise DataError(f"{path} has frames that are no numbers of one, or some twice", "each frame once, from 0 on")
+    check_rigid(matrices, str(path))
+    return dict(zip(frames.astype(int).tolist(), matrices @ imu_from_sensor(camera), strict=True))
 
 
 def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -> None:

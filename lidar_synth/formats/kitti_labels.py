@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.points import FARTHEST
 from lidar_synth.geometry.scan import Boxes
 
 
@@ -22,7 +23,7 @@ def read_label_2(path: Path, camera: Calibration) -> Boxes:
 
     Raises:
         FileError: where it cannot be read.
-        DataError: on a line without 15 fields (16 with a score), or a value that is no number.
+        DataError: on a line without 15 fields (16 with a score), or a value that no label has.
     """
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
     bad = [row for row in rows if len(row) not in (15, 16)]
@@ -33,6 +34,7 @@ def read_label_2(path: Path, camera: Calibration) -> Boxes:
     except ValueError as error:
         raise DataError(f"{path}: {error}", "15 fields: a name and 14 numbers") from error
     ignored = np.array([row[0] == "DontCare" for row in rows], bool)
+    _check_values(values, ignored, path)
     truncation, occlusion, alpha, image_box, size, floor, turn = np.split(values, [1, 2, 3, 7, 10, 13], axis=1)
     keep = ~ignored
     return Boxes(
@@ -44,6 +46,19 @@ def read_label_2(path: Path, camera: Calibration) -> Boxes:
         alpha=alpha[keep, 0].astype(np.float32),
         dont_care=image_box[ignored].astype(np.float32),
     )
+
+
+def _check_values(values: NDArray[np.float64], ignored: NDArray[np.bool_], path: Path) -> None:
+    """Refuse values that no label has: what is not finite or far beyond any sensor, and sizes and occlusions."""
+    within = np.abs(values) <= FARTHEST  # NaN is not
+    sizes = (values[:, 7:10] > 0).all(axis=1) | ignored
+    sound = within.all(axis=1) & np.isin(values[:, 1], (-1, 0, 1, 2, 3)) & sizes
+    if not sound.all():
+        line = int(np.flatnonzero(~sound)[0])
+        raise DataError(
+            f"{path}: line {line + 1} has the values {values[line].tolist()}",
+            "finite numbers, a size above 0 and an occlusion of 0 to 3",
+        )
 
 
 def boxes_from_camera(

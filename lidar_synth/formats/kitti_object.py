@@ -20,6 +20,7 @@ import numpy as np
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files import (
     list_files,
+    naming,
     png_size,
     read_named_matrices,
     read_text,
@@ -88,7 +89,10 @@ class KITTIObject(ScanFiles):
         parts = choose("KITTI object split", split, SPLITS)
         image_set = root / "ImageSets" / f"{split}.txt"
         if split != "all" and image_set.is_file():
-            ids = [f"{parts[0]}/{frame}" for frame in read_text(image_set).split()]
+            frames = read_text(image_set).split()
+            if bad := [frame for frame in frames if not re.fullmatch(r"\w[\w.-]*", frame)]:
+                raise DataError(f"{image_set} lists {bad[0][:100]!r}", "names of frames, 000123 for instance")
+            ids = [f"{parts[0]}/{frame}" for frame in frames]
         elif split in ("train", "val"):
             raise ConfigError(
                 f"split {split!r}, but there is no {image_set}",
@@ -145,10 +149,10 @@ class KITTIObjectWriter(Writer):
         super().__init__(root, calibration=calibration)
         self.part = part
 
-    def path(self, index: int, name: str | None = None) -> Path:
-        match = re.fullmatch(r"(training|testing)/(\d+)", name or "")
+    def _place(self, index: int, name: str | None) -> str:
+        match = re.fullmatch(r"(training|testing)/0*([0-9]{1,10})", name or "")
         part, frame = (match[1], int(match[2])) if match else (self.part, index)
-        return self.root / part / "velodyne" / f"{frame:06d}.bin"
+        return f"{part}/velodyne/{frame:06d}.bin"
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         folder, frame = path.parents[1], path.stem
@@ -181,14 +185,15 @@ def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> C
 
     Raises:
         FileError: where it cannot be read.
-        DataError: where P2, R0_rect or Tr_velo_to_cam is missing.
+        DataError: where P2, R0_rect or Tr_velo_to_cam is missing, or is none.
     """
     matrices = read_named_matrices(path)
     sizes = {name: matrices.get(name, np.zeros(0)).size for name in ("P2", "R0_rect", "Tr_velo_to_cam")}
     if sizes != {"P2": 12, "R0_rect": 9, "Tr_velo_to_cam": 12}:
         raise DataError(f"{path} has {sizes} values", "P2 with 12, R0_rect with 9 and Tr_velo_to_cam with 12")
     camera_from_sensor = homogeneous(matrices["R0_rect"]) @ homogeneous(matrices["Tr_velo_to_cam"])
-    return Calibration(matrices["P2"].reshape(3, 4), camera_from_sensor, image_size, matrices)
+    with naming(path):
+        return Calibration(matrices["P2"].reshape(3, 4), camera_from_sensor, image_size, matrices)
 
 
 def write_calibration(path: Path, camera: Calibration) -> None:

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import list_files, png_size, read_file, read_named_matrices
-from lidar_synth.formats.calibration import Calibration, homogeneous
-from lidar_synth.formats.points import read_points
+from lidar_synth.files import list_files, naming, png_size, read_file, read_named_matrices
+from lidar_synth.formats.calibration import Calibration, homogeneous, read_image_size
+from lidar_synth.formats.points import FARTHEST, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -95,7 +95,7 @@ def read_calibration(folder: Path, image_size: tuple[int, int] | None = None) ->
     """Camera 2 of a day's calibration; None where its two files are not there.
 
     Raises:
-        DataError: where a matrix is missing in them.
+        DataError: where a matrix is missing in them, or is none.
     """
     paths = folder / "calib_velo_to_cam.txt", folder / "calib_cam_to_cam.txt"
     if not all(path.is_file() for path in paths):
@@ -103,11 +103,11 @@ def read_calibration(folder: Path, image_size: tuple[int, int] | None = None) ->
     velo, cam = map(read_named_matrices, paths)
     try:
         to_cam_0 = homogeneous(np.column_stack([velo["R"].reshape(3, 3), velo["T"].reshape(3, 1)]))
-        rectify, projection = homogeneous(cam["R_rect_00"]), cam["P_rect_02"].reshape(3, 4)
-        size = image_size or (int(cam["S_rect_02"][0]), int(cam["S_rect_02"][1]))
-    except (KeyError, ValueError, IndexError) as error:
+        rectify, projection = homogeneous(cam["R_rect_00"].reshape(3, 3)), cam["P_rect_02"].reshape(3, 4)
+        size = image_size or read_image_size(cam["S_rect_02"], "S_rect_02")
+        return Calibration(projection, rectify @ to_cam_0, size)
+    except (KeyError, ValueError) as error:
         raise DataError(f"{paths[0]} and {paths[1]}: {error}", "R and T; R_rect_00, P_rect_02 and S_rect_02") from error
-    return Calibration(projection, rectify @ to_cam_0, size)
 
 
 def read_tracklets(path: Path) -> dict[int, Boxes]:
@@ -132,16 +132,19 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
                 whole = pose.findtext("truncation") == "0"
                 frame = int(tracklet.findtext("first_frame", "")) + k
                 rows[frame].append((box, name, hidden if 0 <= hidden <= 2 else -1, 0 if whole else -1, instance))
-    except (ElementTree.ParseError, ValueError) as error:
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
         raise DataError(f"{path}: {error}", "KITTI's tracklet_labels.xml") from error
     boxes = {}
     for frame, found in sorted(rows.items()):
         values, names, occlusion, truncation, instances = zip(*found, strict=True)
-        boxes[frame] = Boxes(
-            np.array(values, np.float32),
-            names,
-            truncation=np.array(truncation, np.float32),
-            occlusion=np.array(occlusion, np.int8),
-            instance=np.array(instances, np.int32),
-        )
+        if not (np.abs(values) <= FARTHEST).all():  # NaN is not
+            raise DataError(f"{path}: a box of frame {frame} with {values}", f"metres within {FARTHEST:g}, and radians")
+        with naming(path):
+            boxes[frame] = Boxes(
+                np.array(values, np.float32),
+                names,
+                truncation=np.array(truncation, np.float32),
+                occlusion=np.array(occlusion, np.int8),
+                instance=np.array(instances, np.int32),
+            )
     return boxes

@@ -12,19 +12,20 @@ A scan has ``points`` (N, 3) float32 and the fields of ``POINT_FIELDS`` that are
 """
 
 import json
-import zipfile
+from collections.abc import Mapping
 from dataclasses import fields
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT, STRAY, read_file, write_arrays
-from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, RangeImage, Scan
+from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.errors import DataError, LidarSynthError
+from lidar_synth.files import SKIP_HINT, write_arrays
+from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.parsing import parse_json, read_arrays
 
 FACTS = ("sensor", "id", "domain", "pose")
 """Names in a file that are no channels of a range image; so are those that begin with ``BOX``."""
@@ -38,29 +39,11 @@ TYPES = {
 """numpy's types of a scan's fields."""
 
 
-def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an ``.npz``, or the one of an ``.npy`` under the name ``array``.
-
-    Raises:
-        FileError: where it cannot be read.
-        DataError: where it is no such file, is damaged, or holds Python objects.
-    """
-    content = BytesIO(read_file(path))
-    try:
-        loaded = np.load(content, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return {"array": loaded}
-        return {name: loaded[name] for name in loaded.files if name != STRAY}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path}: {error}", "arrays written by numpy, none of them pickled", SKIP_HINT) from error
-
-
 def told_sensor(path: Path) -> Sensor | None:
     """The sensor that an ``.npz`` file of ours tells, without a look at the rest; None where it tells none."""
     try:
-        with np.load(path, allow_pickle=False) as loaded:
-            return Sensor.from_dict(json.loads(str(loaded["sensor"])))
-    except (ValueError, OSError, EOFError, KeyError, TypeError, zipfile.BadZipFile):
+        return _sensor(read_arrays(path, only=["sensor"]))
+    except (LidarSynthError, KeyError):
         return None  # whoever reads the scan will say what is wrong with it
 
 
@@ -88,11 +71,8 @@ def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | No
     try:
         facts = _known(arrays, sensor)
         known: dict[str, Any] = {name: arrays[name] for name in POINT_FIELDS if name in arrays}
-        scan = Scan(arrays["points"], **known, **facts)
-        for name, values in {"points": scan.points, **scan.fields()}.items():
-            if values.dtype != TYPES[name]:
-                raise ValueError(f"{name} is {values.dtype}, not {TYPES[name]}")
-        return scan
+        _check_types({"points": arrays["points"], **known})
+        return Scan(arrays["points"], **known, **facts)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{where}: {error}", "points, reflectance and sensor of a scan") from error
 
@@ -120,9 +100,56 @@ def decode_range_image(
     try:
         facts = _known(arrays, sensor)
         channels = {n: a for n, a in arrays.items() if n not in ("range", *FACTS) and not n.startswith(BOX)}
-        return RangeImage(arrays["range"], facts["sensor"], channels), facts
+        _check_types(channels)
+        return range_image(arrays["range"], facts["sensor"], channels, where), facts
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{where}: {error}", "range and sensor of a range image") from error
+
+
+def range_image(distance: NDArray[Any], sensor: Sensor, channels: dict[str, NDArray[Any]], where: str) -> RangeImage:
+    """A range image whose cells all hold what they may.
+
+    Raises:
+        DataError: on text, NaN, infinite or negative ranges, which would be cells without a return in silence; on a
+            shape that is not the sensor's; on labels that are no train ids, and shares outside of [0, 1]. Cells without
+            a return may hold anything: they become what ``RangeImage`` says.
+    """
+    check_numbers(distance, f"{where}: range")
+    with np.errstate(over="ignore"):
+        image = RangeImage(distance.astype(np.float32, copy=False), sensor, channels)
+    bad = ~(np.isfinite(image.range) & (image.range >= 0))
+    if bad.any():
+        raise DataError(f"{where}: {bad.sum()} cells whose range is negative or no number", "metres, 0 = no return")
+    for name in [n for n in image.channels if n in POINT_FIELDS]:
+        values = image.channels[name].copy()
+        values[~image.mask] = IGNORE if name == "label" else 0
+        image.channels[name] = values
+        if name in ("reflectance", "confidence") and not ((values >= 0) & (values <= 1)).all():
+            raise DataError(f"{where}: {name} from {values.min()} to {values.max()}", "0 to 1")
+        if name == "label" and not ((values < len(NAMES)) | (values == IGNORE)).all():
+            raise DataError(f"{where}: labels {np.unique(values)[-8:].tolist()}", "train ids 0..18, or 255 = ignore")
+    return image
+
+
+def check_numbers(array: NDArray[Any], where: str) -> None:
+    """Refuse text in the place of numbers.
+
+    Raises:
+        DataError: on text.
+    """
+    if array.dtype.kind not in "biuf":
+        raise DataError(f"{where} holds {array.dtype}", "numbers", SKIP_HINT)
+
+
+def _check_types(arrays: Mapping[str, NDArray[Any]]) -> None:
+    for name, values in arrays.items():
+        if values.dtype.kind not in "biuf" or values.dtype != TYPES.get(name, values.dtype):
+            raise ValueError(f"{name} is {values.dtype}, not {TYPES.get(name, 'a number')}")
+
+
+def _sensor(arrays: Mapping[str, NDArray[Any]]) -> Sensor:
+    """The sensor that arrays tell; raises KeyError where they tell none."""
+    return Sensor.from_dict(parse_json(str(arrays["sensor"]), "its sensor", "the keys of sensors.yaml"))
 
 
 def _facts(scan: Scan, sensor: Sensor | None = None) -> dict[str, Any]:
@@ -143,15 +170,36 @@ def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, 
     """The inverse of ``_facts``; a file's own sensor goes before the given one, and has to be the same."""
     known: dict[str, Any] = {"sensor": sensor}
     if "sensor" in arrays:
-        known["sensor"] = Sensor.from_dict(json.loads(str(arrays["sensor"])))
+        known["sensor"] = _sensor(arrays)
         if sensor is not None and sensor.shape != known["sensor"].shape:
             raise ValueError(f"it was made for sensor {known['sensor'].name!r}, not for {sensor.name!r}")
     if known["sensor"] is None:
         raise KeyError("it does not tell its sensor: pass one")
-    known |= {name: kind(arrays[name].item()) for name, kind in (("id", str), ("domain", int)) if name in arrays}
+    for name, kinds in (("id", "U"), ("domain", "iu")):
+        if name in arrays:
+            if arrays[name].shape or arrays[name].dtype.kind not in kinds:
+                raise ValueError(f"{name} is {arrays[name].dtype} of shape {arrays[name].shape}")
+            known[name] = arrays[name].item()
+    if known.get("domain", REAL) not in (REAL, SYNTHETIC):
+        raise ValueError(f"domain is {known['domain']}, not {REAL} (real) or {SYNTHETIC} (synthetic)")
     if "pose" in arrays:
-        known["pose"] = arrays["pose"]
+        known["pose"] = check_pose(arrays["pose"])
     if BOX + "values" in arrays:
         boxes = {f.name: arrays[BOX + f.name] for f in fields(Boxes) if f.name != "names"}
-        known["boxes"] = Boxes(**boxes, names=tuple(arrays[BOX + "names"].tolist()))
+        names = arrays[BOX + "names"]
+        if names.ndim != 1 or (names.size and names.dtype.kind != "U"):
+            raise ValueError(f"the boxes' names are {names.dtype} of shape {names.shape}")
+        known["boxes"] = Boxes(**boxes, names=tuple(names.tolist()))
     return known
+
+
+def check_pose(values: Any) -> NDArray[np.float64]:
+    """A pose, (4, 4) float64.
+
+    Raises:
+        ValueError: on another shape, or values that are no finite numbers.
+    """
+    pose = np.asarray(values)
+    if pose.shape != (4, 4) or pose.dtype.kind not in "iuf" or not np.isfinite(pose).all():
+        raise ValueError(f"pose is {pose.dtype} of shape {pose.shape}, not (4, 4) finite numbers")
+    return pose.astype(np.float64, copy=False)

@@ -12,9 +12,8 @@ without a return (they stand at the origin): they are dropped, with their labels
 do. The package reads this layout and does not write it.
 """
 
-import json
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -22,12 +21,13 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import NUSCENES
 from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT, list_files, read_text, read_values
+from lidar_synth.files import SKIP_HINT, inside, list_files, read_text, read_values
 from lidar_synth.formats.point_labels import mismatch
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.parsing import parse_json
 
 SUFFIX = ".pcd.bin"
 INTENSITY_MAX = 255.0
@@ -106,14 +106,19 @@ def lidarseg_files(root: Path) -> Mapping[str, Path]:
     """{name of a sweep: its label file} by the tables of every version under a dataset's root.
 
     Raises:
-        DataError: where a table is no JSON or lacks a field.
+        DataError: where a table is no JSON, lacks a field or names a file outside of the root.
     """
     files = {}
     for table in sorted(root.glob("*/lidarseg.json")):
         try:
-            names = {row["token"]: row["filename"] for row in json.loads(read_text(table.parent / "sample_data.json"))}
-            for row in json.loads(read_text(table)):
-                files[Path(names[row["sample_data_token"]]).name] = root / row["filename"]
-        except (ValueError, KeyError, TypeError) as error:
+            samples, rows = (_table(table.with_name(name)) for name in ("sample_data.json", table.name))
+            names = {row["token"]: row["filename"] for row in samples}
+            for row in rows:
+                files[PurePosixPath(names[row["sample_data_token"]]).name] = inside(root, row["filename"])
+        except (KeyError, TypeError, AttributeError) as error:
             raise DataError(f"{table}: {error!r}", "nuScenes' tables lidarseg.json and sample_data.json") from error
     return files
+
+
+def _table(path: Path) -> Any:
+    return parse_json(read_text(path), str(path), "a table of nuScenes")

@@ -1,146 +1,162 @@
-"""PCD and PLY files, read and written by open3d's tensor I/O. Lossless for a scan's points and fields.
+"""PCD files, version 0.7 (https://pointclouds.org/documentation/tutorials/pcd_file_format.html). Lossless for a scan.
 
-Reflectance stands in the field ``intensity``, which other tools know, and every other field of a scan under its own
-name. PLY has no unsigned 32-bit type in open3d, so ``raw_label`` is stored as the same bits, signed.
+Read as ``ascii``, ``binary`` and ``binary_compressed``, written as ``binary``. What a header says is compared with the
+file before any value is read: a header that lies would otherwise drop points, or read what is no part of the file.
 """
 
 import re
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from types import ModuleType
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError, FileError, LibraryError
+from lidar_synth.errors import DataError
 from lidar_synth.files import SKIP_HINT, read_file, write_file
+from lidar_synth.formats.cloud import Field, check_fields, check_size, from_records, from_text, to_arrays, to_records
 from lidar_synth.geometry.scan import Scan
 
-STORED = {"label": "u1", "raw_label": "i4", "instance": "i4", "ring": "i4", "confidence": "f4"}
-"""Type on disk of each field of a scan beside reflectance."""
+LONGEST_HEADER = 1 << 16
+"""Bytes."""
 
-HEADER_END = {".pcd": re.compile(rb"^DATA .*\n", re.M), ".ply": re.compile(rb"^end_header\r?\n", re.M)}
+MOST_EXPANSION = 89
+"""LZF makes at most 264 bytes of 3."""
 
-PLY_BYTES = {
-    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
-    "int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8,
-}  # fmt: skip
+_PER_FIELD = ("FIELDS", "SIZE", "TYPE", "COUNT")
 
-IN_MEMORY = {"label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2", "confidence": "f4"}
-
-
-def import_open3d() -> ModuleType:
-    """The library open3d.
-
-    Raises:
-        LibraryError: where it or a system library behind it is missing.
-    """
-    try:
-        import open3d  # type: ignore[import-untyped,unused-ignore]
-    except (ImportError, OSError) as error:
-        raise LibraryError(
-            f"open3d cannot be imported ({error})",
-            "open3d and its system libraries, for .pcd and .ply files",
-            "Type: apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 libudev1",
-        ) from error
-    return open3d  # type: ignore[no-any-return,unused-ignore]
+_SIZES = {"F": "48", "I": "1248", "U": "1248"}
+"""Bytes that a value of each type may have."""
 
 
-def write_cloud(path: Path, scan: Scan) -> None:
-    """A scan as binary ``.pcd`` or ``.ply``, by the path's suffix; ``read_cloud`` is the inverse.
+def write_pcd(path: Path, scan: Scan) -> None:
+    """A scan as binary ``.pcd``; ``read_pcd`` is the inverse.
 
     Raises:
-        LibraryError: without open3d.
         FileError: where it cannot be written.
     """
-    open3d = import_open3d()
-    tensor = open3d.core.Tensor
-    cloud = open3d.t.geometry.PointCloud()
-    cloud.point["positions"] = tensor(np.ascontiguousarray(scan.points))
-    cloud.point["intensity"] = tensor(np.ascontiguousarray(scan.reflectance)[:, None])
-    for name, values in scan.fields().items():
-        if name in STORED:
-            cloud.point[name] = tensor(values.astype(STORED[name])[:, None])
-    # open3d tells the format by the suffix and writes in place, so it writes elsewhere first.
-    with TemporaryDirectory() as folder:
-        part = Path(folder) / f"scan{path.suffix}"
-        try:
-            open3d.t.io.write_point_cloud(str(part), cloud)
-            _check_whole(part)  # open3d says that all is well on a full disk too
-        except (RuntimeError, DataError, FileError) as error:
-            room = f"room for temporary files in {Path(folder).parent}"
-            raise FileError(f"{path} cannot be written by open3d ({error})", room) from error
-        write_file(path, part.read_bytes())
+    records = to_records(scan)
+    types = [records.dtype[name] for name in records.dtype.names or ()]
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(records.dtype.names or ())}",
+        f"SIZE {' '.join(str(t.itemsize) for t in types)}",
+        f"TYPE {' '.join(t.kind.upper() for t in types)}",
+        f"COUNT {' '.join('1' for _ in types)}",
+        f"WIDTH {len(records)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(records)}",
+        "DATA binary\n",
+    ]
+    write_file(path, "\n".join(lines).encode() + records.tobytes())
 
 
-def read_cloud(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a ``.pcd`` or ``.ply``, as a ``Scan`` names them.
+def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a ``.pcd``, as a ``Scan`` names them.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where its header is none or does not fit the file, or it holds no points.
+    """
+    content, where = read_file(path), str(path)
+    end = re.search(rb"^DATA[ \t]+(\w+)[ \t\r]*\n", content[:LONGEST_HEADER], re.M)
+    if end is None:
+        raise DataError(f"{where} has no header of a .pcd file", "a PCD file", SKIP_HINT)
+    fields, count = _header(content[: end.start()].decode("latin-1"), where)
+    check_fields(fields, count, where)
+    body, size = content[end.end() :], count * sum(field.width for field in fields)
+    if end[1] == b"ascii":
+        return to_arrays(from_text(body.decode("latin-1"), fields, count, where))
+    if end[1] == b"binary_compressed":
+        return to_arrays(_from_columns(_decompressed(body, size, where), fields, count))
+    if end[1] != b"binary":
+        raise DataError(f"{where} holds {end[1].decode('latin-1')!r} data", "ascii, binary or binary_compressed")
+    check_size(body, size, where)
+    return to_arrays(from_records(body, fields, count))
+
+
+def _header(text: str, where: str) -> tuple[list[Field], int]:
+    """Fields and number of points; every line is there once, and all agree."""
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    header = {row[0]: row[1:] for row in rows}
+    fault = f"{where}: its header cannot be read"
+    expected = "one line each of FIELDS, SIZE, TYPE, WIDTH, HEIGHT and POINTS"
+    if len(header) < len(rows) or not {"FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS"} <= set(header):
+        raise DataError(f"{fault} (it has {[row[0][:20] for row in rows][:20]})", expected, SKIP_HINT)
+    header.setdefault("COUNT", ["1"] * len(header["FIELDS"]))
+    if len({len(header[key]) for key in _PER_FIELD}) > 1:
+        raise DataError(
+            f"{fault} ({ {key: len(header[key]) for key in _PER_FIELD} })", "one value per field", SKIP_HINT
+        )
+    single = [header[key] for key in ("WIDTH", "HEIGHT", "POINTS")]
+    numbers = sum(single, [*header["SIZE"], *header["COUNT"]])
+    if any(len(row) != 1 for row in single) or any(not re.fullmatch("[0-9]{1,12}", number) for number in numbers):
+        raise DataError(f"{fault}: sizes that are none", "whole numbers, one each of WIDTH, HEIGHT, POINTS", SKIP_HINT)
+    width, height, points = (int(number) for [number] in single)
+    if width * height != points:
+        raise DataError(f"{where}: WIDTH {width}, HEIGHT {height} and POINTS {points}", "WIDTH x HEIGHT = POINTS")
+    fields = []
+    for name, size, kind, count in zip(*(header[key] for key in _PER_FIELD), strict=True):
+        if size not in _SIZES.get(kind, "") or int(count) < 1:
+            given = f"{where}: field {name[:50]!r} of TYPE {kind[:20]}, SIZE {size} and COUNT {count}"
+            raise DataError(given, "F of 4 or 8 bytes, I or U of 1, 2, 4 or 8, at least one value", SKIP_HINT)
+        fields.append(Field(name, f"<{kind.lower()}{size}", int(count)))
+    return fields, points
+
+
+def _from_columns(body: bytes, fields: list[Field], count: int) -> dict[str, NDArray[Any]]:
+    """{name: (N, count)} fields of which each has all its values together, as compression has it."""
+    found, offset = {}, 0
+    for field in fields:
+        found[field.name] = np.frombuffer(body, field.type, count * field.count, offset)
+        offset += count * field.width
+    return found
+
+
+def _decompressed(body: bytes, size: int, where: str) -> bytes:
+    """The ``size`` bytes of a compressed body: two lengths, then LZF."""
+    packed, plain = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
+    if plain != size or size > MOST_EXPANSION * packed:
+        raise DataError(f"{where} says {packed} bytes hold {plain}", f"{size}, by its header", SKIP_HINT)
+    check_size(body, 8 + packed, where)
+    target = np.empty(size, np.uint8)
+    if lzf(np.frombuffer(body, np.uint8, packed, 8), target) != size:
+        raise DataError(f"{where}: its compressed points are damaged", "what LZF compressed", SKIP_HINT)
+    return target.tobytes()
+
+
+@numba.njit(cache=True)
+def lzf(source, target):  # type: ignore[no-untyped-def]  # (N,) and (M,) uint8, compiled
+    """Decompress LZF (http://oldhome.schmorp.de/marc/liblzf.html) into ``target``.
 
     Returns:
-        ``points`` (N, 3) float32; ``reflectance`` (N,) from ``intensity`` or ``reflectance``, 0 where the file has
-        neither; and the other fields of a scan that the file has as ``write_cloud`` writes them (a field ``label`` of
-        another type is another program's, with classes of its own).
-
-    Raises:
-        LibraryError: without open3d.
-        FileError: where it cannot be read.
-        DataError: where it is cut, or open3d finds no points in it.
+        The bytes written, or -1 where the source is damaged or ``target`` too short.
     """
-    open3d = import_open3d()
-    _check_whole(path)
-    try:
-        cloud = open3d.t.io.read_point_cloud(str(path))
-    except RuntimeError as error:
-        raise DataError(f"{path}: open3d cannot read it ({error})", "a PCD or PLY file") from error
-    found = {name: cloud.point[name].numpy() for name in cloud.point}
-    if not len(found.get("positions", ())):
-        raise DataError(f"{path} holds no points that open3d can read", "a PCD or PLY file with x, y, z")
-    intensity = found.get("intensity", found.get("reflectance", np.zeros(len(found["positions"]))))
-    arrays = {"points": found["positions"].astype("f4"), "reflectance": intensity.reshape(-1).astype("f4")}
-    ours = [name for name, kind in STORED.items() if name in found and found[name].dtype == np.dtype(kind)]
-    return arrays | {name: found[name].reshape(-1).astype(IN_MEMORY[name]) for name in ours}
-
-
-def _check_whole(path: Path) -> None:
-    """Refuse a file that holds less than its header says: open3d gives such points whatever was in memory.
-
-    Raises:
-        FileError: where it cannot be read.
-        DataError: where it is cut, or has no header.
-    """
-    content = read_file(path)
-    found = HEADER_END[path.suffix.lower()].search(content)
-    if found is None:
-        raise DataError(f"{path} has no header of a {path.suffix} file", "a PCD or PLY file", SKIP_HINT)
-    rows = [line.split() for line in content[: found.end()].decode(errors="replace").splitlines() if line.strip()]
-    body = content[found.end() :]
-    try:
-        count, width, kind = (_pcd_size if path.suffix.lower() == ".pcd" else _ply_size)(rows)
-        if kind == "binary_compressed":
-            count, width = 1, 8 + int.from_bytes(body[:4], "little")
-        held = len(body.splitlines()) if kind == "ascii" else len(body) // width
-    except (KeyError, ValueError, IndexError, ZeroDivisionError) as error:
-        raise DataError(f"{path}: its header cannot be read ({error!r})", "a PCD or PLY file", SKIP_HINT) from error
-    if held < count:
-        raise DataError(f"{path} has been cut: it is {len(content)} bytes long", "all points of its header", SKIP_HINT)
-
-
-def _pcd_size(rows: list[list[str]]) -> tuple[int, int, str]:
-    """Points, bytes per point and encoding of a PCD's header (https://pointclouds.org/documentation)."""
-    header = {row[0]: row[1:] for row in rows}
-    counts = header.get("COUNT", ["1"] * len(header["SIZE"]))
-    width = sum(int(size) * int(count) for size, count in zip(header["SIZE"], counts, strict=True))
-    return int(header["POINTS"][0]), width, header["DATA"][0]
-
-
-def _ply_size(rows: list[list[str]]) -> tuple[int, int, str]:
-    """The same of a PLY's (http://paulbourke.net/dataformats/ply), up to the end of its vertices."""
-    encoding = next(row[1] for row in rows if row[0] == "format")
-    [start] = [i for i, row in enumerate(rows) if row[:2] == ["element", "vertex"]]
-    width = 0
-    for row in rows[start + 1 :]:
-        if row[0] == "element":
-            break
-        width += PLY_BYTES[row[1]] if row[0] == "property" else 0
-    return int(rows[start][2]), width, encoding
+    read = written = 0
+    while read < len(source):
+        control = int(source[read])
+        read += 1
+        if control < 32:  # the next bytes as they are
+            length = control + 1
+            if read + length > len(source) or written + length > len(target):
+                return -1
+            for i in range(length):
+                target[written + i] = source[read + i]
+            read += length
+        else:  # bytes that were written before
+            length = (control >> 5) + 2
+            if read + 1 + (length == 9) > len(source):
+                return -1
+            if length == 9:
+                length += int(source[read])
+                read += 1
+            start = written - ((control & 31) << 8) - int(source[read]) - 1
+            read += 1
+            if start < 0 or written + length > len(target):
+                return -1
+            for i in range(length):
+                target[written + i] = target[start + i]
+        written += length
+    return written

@@ -12,7 +12,6 @@ the file's own labels, confidence, boxes and pose have no place. Labels are exac
 """
 
 import json
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,16 @@ from numpy.typing import NDArray
 
 from lidar_synth.classes import COLOURS, IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT, list_files, read_file, write_file
+from lidar_synth.files import SKIP_HINT, list_files, write_file
 from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import Picture, Writer
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.parsing import parse_json, read_picture
 
 STEPS = 65535
 """The largest 16-bit value: ``range_max`` in range, 1 in reflectance."""
@@ -77,25 +78,37 @@ class RangePNG(ScanFiles):
     def _decode(self, index: int) -> tuple[RangeImage, dict[str, Any]]:
         path, reflectance, label = (channel_path(self.root, name, self.ids[index]) for name in CHANNELS)
         steps, text = read_png(path)
+        facts = parse_json(text.get(TEXT, ""), f"{path}: its text", "a range image written by this package")
         try:
-            facts = json.loads(text.get(TEXT, ""))
-            sensor, scale = Sensor.from_dict(facts["sensor"]), np.float32(facts["scale"])
+            sensor, scale = Sensor.from_dict(facts["sensor"]), float(facts["scale"])
             if self._given is not None and sensor.shape != self._given.shape:
                 raise ValueError(f"it was made for sensor {sensor.name!r}, not for {self._given.name!r}")
-            channels = {"reflectance": (read_png(reflectance)[0] / np.float32(STEPS)).astype(np.float32)}
+            if facts["domain"] not in (REAL, SYNTHETIC) or not 0 < scale < 1:
+                raise ValueError(f"domain {facts['domain']!r} and scale {scale}")
+            channels = {"reflectance": (_steps(reflectance) / np.float32(STEPS)).astype(np.float32)}
             if label.is_file():
                 channels["label"] = read_png(label)[0]
-            return RangeImage(steps * scale, sensor, channels), facts
-        except (KeyError, TypeError, ValueError) as error:
+                if channels["label"].dtype != np.uint8:
+                    raise ValueError(f"{label.name} of its labels is {channels['label'].dtype}, not uint8")
+            return range_image(_steps(path, steps) * np.float32(scale), sensor, channels, str(path)), facts
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise DataError(f"{path}: {error}", "a range image written by this package") from error
+
+
+def _steps(path: Path, values: NDArray[Any] | None = None) -> NDArray[Any]:
+    """The values of a 16-bit grey picture."""
+    values = read_png(path)[0] if values is None else values
+    if values.dtype.kind not in "iu" or values.ndim != 2 or (values.size and values.max() > STEPS):
+        raise DataError(f"{path} holds {values.dtype} of shape {values.shape}", "a picture of 16-bit grey", SKIP_HINT)
+    return values
 
 
 class PNGWriter(Writer):
     """Writes the scan, projected onto its sensor's grid, as ``range``, ``reflectance`` and ``label`` PNG files."""
 
-    def path(self, index: int, name: str | None = None) -> Path:
+    def _place(self, index: int, name: str | None) -> str:
         # One flat folder per channel, so that others find the pictures of a channel side by side.
-        return channel_path(self.root, "range", (name or f"{index:06d}").replace("/", "_"))
+        return f"range/{(name or f'{index:06d}').replace('/', '_')}.png"
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         image = project(scan)
@@ -121,14 +134,8 @@ def read_png(path: Path) -> tuple[NDArray[Any], dict[str, str]]:
         FileError: where it cannot be read.
         DataError: where it is no picture.
     """
-    from PIL import Image
-
-    content = BytesIO(read_file(path))
-    try:
-        with Image.open(content) as opened:
-            return np.array(opened), dict(getattr(opened, "text", {}))
-    except (OSError, SyntaxError, ValueError) as error:
-        raise DataError(f"{path}: {error}", "a PNG file", SKIP_HINT) from error
+    picture = read_picture(path, "a PNG file")
+    return np.array(picture), dict(getattr(picture, "text", {}))
 
 
 def write_png(path: Path, values: NDArray[Any], text: str = "", palette: bool = False) -> None:

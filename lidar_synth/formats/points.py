@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.files import SKIP_HINT, unreadable, write_file
+from lidar_synth.formats.calibration import check_rigid
 from lidar_synth.geometry.scan import Scan
 
 FARTHEST = 1e5
@@ -137,14 +138,19 @@ def bad_points_kept() -> Iterator[None]:
 
 
 def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
-    """``check_points`` for a scan whose arrays stood apart in its file, and its labels.
+    """``check_points`` for a scan whose arrays stood apart in its file, and what else it holds.
 
     Raises:
-        DataError: as ``check_points``; on labels that are no train ids.
+        DataError: as ``check_points``; on labels that are no train ids, a confidence outside of [0, 1], and a pose that
+            is not rigid.
     """
     check_points(scan.points, scan.reflectance, where, reflectance_max)
     if scan.label is not None and ((scan.label >= len(NAMES)) & (scan.label != IGNORE)).any():
         raise DataError(f"{where}: labels {np.unique(scan.label)[-8:].tolist()}", "train ids 0..18, or 255 = ignore")
+    if scan.confidence is not None and not ((scan.confidence >= 0) & (scan.confidence <= 1)).all():
+        raise DataError(f"{where}: confidence from {scan.confidence.min()} to {scan.confidence.max()}", "0 to 1")
+    if scan.pose is not None:
+        check_rigid(scan.pose, f"{where}: its pose")
 
 
 def _find_bad_value(points: NDArray[np.float32], reflectance: NDArray[np.float32], where: str) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.folder import scan_paths
-from lidar_synth.formats.npz import decode_range_image, read_arrays, write_range_image
+from lidar_synth.formats.npz import check_numbers, decode_range_image, range_image, write_range_image
 from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
@@ -27,6 +27,7 @@ from lidar_synth.formats.writer import FileWriter, Picture
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.parsing import read_arrays
 
 SUFFIXES = (".npz", ".npy")
 
@@ -121,13 +122,15 @@ class RangeImages(ScanFiles):
         if array is None or array.ndim not in (2, 3):
             held = {name: values.shape for name, values in arrays.items()}
             raise DataError(f"{path} holds arrays {held}", "range and sensor, or image (H, W, 6)")
-        array = array.astype(np.float32)
+        check_numbers(array, str(path))
+        with np.errstate(over="ignore"):
+            array = array.astype(np.float32)
         if array.ndim == 3 and array.shape[2] == 6:
             return decode_stack(array, self._convention, self.sensor, str(path))
         if array.ndim == 3 and len(array) != 2:
             raise DataError(f"{path} holds an array of shape {array.shape}", "(H, W), (2, H, W) or (H, W, 6)")
         channels = {"reflectance": array[1]} if array.ndim == 3 else {}
-        return RangeImage(array[0] if array.ndim == 3 else array, self.sensor, channels), {}, None
+        return range_image(array[0] if array.ndim == 3 else array, self.sensor, channels, str(path)), {}, None
 
 
 def decode_stack(
@@ -138,6 +141,8 @@ def decode_stack(
     Raises:
         DataError: where x, y, z and range do not agree, or a value is none of the convention's.
     """
+    if stack.shape[:2] != sensor.shape:
+        raise DataError(f"{where} holds an array of shape {stack.shape}", f"{(*sensor.shape, 6)} for {sensor.name!r}")
     distance = stack[..., 4]
     error = np.abs(np.linalg.norm(stack[..., :3], axis=-1) - distance).max()
     if not error < 1e-3:
@@ -162,7 +167,7 @@ def decode_stack(
         points = np.roll(ahead(points.reshape(-1, 3)).reshape(points.shape), quarter, axis=1)
         distance = np.roll(distance, quarter, axis=1)
         channels = {name: np.roll(values, quarter, axis=1) for name, values in channels.items()}
-    return RangeImage(distance, sensor, channels), {}, points
+    return range_image(distance, sensor, channels, where), {}, points
 
 
 class RangeWriter(FileWriter):

@@ -22,6 +22,7 @@ from lidar_synth.classes import SEMANTIC_KITTI
 from lidar_synth.errors import DataError
 from lidar_synth.files import (
     list_files,
+    naming,
     numbers,
     png_size,
     read_file,
@@ -30,7 +31,7 @@ from lidar_synth.files import (
     write_file,
     write_named_matrices,
 )
-from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
+from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneous, ideal_camera
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import read_points, write_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
@@ -143,10 +144,11 @@ class SemanticKITTIWriter(Writer):
         self.sequence = sequence
         self._carried: set[str] = set()
 
-    def path(self, index: int, name: str | None = None) -> Path:
-        match = re.fullmatch(r"(?:2013_05_28_drive_00)?(\d\d)(?:_sync)?/(\d+)", name or "")
+    def _place(self, index: int, name: str | None) -> str:
+        # Six digits, as the dataset has: poses.txt has a line for every frame up to the last.
+        match = re.fullmatch(r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,6})", name or "")
         sequence, frame = (match[1], int(match[2])) if match else (self.sequence, index)
-        return self.root / "sequences" / sequence / "velodyne" / f"{frame:06d}.bin"
+        return f"sequences/{sequence}/velodyne/{frame:06d}.bin"
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         folder, frame = path.parents[1], path.stem
@@ -200,7 +202,8 @@ def read_calibration(folder: Path) -> Calibration | None:
     if any(matrices.get(name, np.zeros(0)).size != 12 for name in ("P2", "Tr")):
         return None
     size = next((png_size(p) for p in sorted((folder / "image_2").glob("*.png"))), None)
-    return Calibration(matrices["P2"].reshape(3, 4), homogeneous(matrices["Tr"]), size, matrices)
+    with naming(folder / "calib.txt"):
+        return Calibration(matrices["P2"].reshape(3, 4), homogeneous(matrices["Tr"]), size, matrices)
 
 
 def write_calibration(folder: Path, camera: Calibration) -> None:
@@ -211,14 +214,21 @@ def write_calibration(folder: Path, camera: Calibration) -> None:
 
 
 def read_poses(folder: Path, camera: Calibration | None) -> dict[int, NDArray[np.float64]]:
-    """{frame: (4, 4) sensor to world}; empty without ``poses.txt`` or a calibration."""
+    """{frame: (4, 4) sensor to world}; empty without ``poses.txt`` or a calibration. A line of ``nan`` is a frame
+    without a pose.
+
+    Raises:
+        DataError: on a line without 12 numbers, or a pose that is not rigid.
+    """
     if camera is None or not (folder / "poses.txt").is_file():
         return {}
     lines = read_matrix(folder / "poses.txt", 12)
     matrices = np.tile(np.eye(4), (len(lines), 1, 1))
     matrices[:, :3] = lines.reshape(-1, 3, 4)
-    poses = camera.sensor_from_camera @ matrices @ camera.camera_from_sensor
-    return {f: pose for f, pose in enumerate(poses) if np.isfinite(pose).all()}
+    known = np.flatnonzero(~np.isnan(lines).all(axis=1))
+    check_rigid(matrices[known], str(folder / "poses.txt"))
+    poses = camera.sensor_from_camera @ matrices[known] @ camera.camera_from_sensor
+    return dict(zip(known.tolist(), poses, strict=True))
 
 
 def write_poses(folder: Path, camera: Calibration, poses: dict[int, NDArray[np.float64]], frames: int) -> None:

@@ -14,20 +14,20 @@ WebDataset's own ``decode()`` makes arrays and a dictionary of them. The same sc
 """
 
 import json
+import os
 import tarfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from io import BytesIO
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import unquote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidar_synth.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, shorten
 from lidar_synth.files import SKIP_HINT, list_files, unreadable, write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.npz import decode_scan
@@ -36,6 +36,7 @@ from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import NOTES, Picture, Writer, clear_notes
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.parsing import parse_json, parse_npy
 
 SUFFIX = ".tar"
 
@@ -89,8 +90,12 @@ class WebDatasetWriter(Writer):
         self.shard_size = shard_size
         self._there: set[str] | None = None
 
-    def path(self, index: int, name: str | None = None) -> Path:
-        return self.root / NOTES / f"{index:09d}" / f"{_key(index, name)}{SUFFIX}"
+    @property
+    def _base(self) -> Path:
+        return self.root / NOTES
+
+    def _place(self, index: int, name: str | None) -> str:
+        return f"{index:09d}/{_key(index, name)}{SUFFIX}"
 
     def complete(self, index: int, name: str | None = None) -> bool:
         if self._there is None:
@@ -134,32 +139,36 @@ def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
 
 
 def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Scan:
-    where = f"scan {key!r} of {path}"
+    where = f"scan {shorten(key, 100)!r} of {path}"
     try:
         with path.open("rb") as file:
             contents = {name: _content(file, *place) for name, place in members.items()}
-        facts = json.loads(contents.pop("json"))
-        arrays: dict[str, NDArray[Any]] = {
-            name.removesuffix(".npy"): np.load(BytesIO(content), allow_pickle=False)
-            for name, content in contents.items()
-            if name.endswith(".npy")
-        }
-        boxes = Boxes(arrays.pop("boxes"), facts["names"]) if "boxes" in arrays else None
-        points = arrays.pop("points")
-        arrays |= {
-            "points": points[:, :3],
-            "reflectance": points[:, 3],
-            "sensor": np.array(json.dumps(facts["sensor"])),
-        }
-        arrays |= {name: np.array(facts[name]) for name in ("id", "domain", "pose") if name in facts}
     except OSError as error:
         raise unreadable(path, error) from error
-    except (ValueError, KeyError, IndexError, EOFError) as error:
+    facts = parse_json(contents.pop("json", b""), f"{where}: its json", "the members that this package writes")
+    arrays = {
+        name.removesuffix(".npy"): parse_npy(content, f"{where}: {name}")
+        for name, content in contents.items()
+        if name.endswith(".npy")
+    }
+    try:
+        boxes = Boxes(arrays.pop("boxes"), _texts(facts["names"])) if "boxes" in arrays else None
+        points = arrays.pop("points")
+        arrays |= {"points": points[:, :3], "reflectance": points[:, 3]}
+        arrays |= {"sensor": np.array(json.dumps(facts["sensor"]))}
+        arrays |= {name: np.array(facts[name]) for name in ("id", "domain", "pose") if name in facts}
+    except (ValueError, KeyError, IndexError, TypeError, RecursionError) as error:
         raise DataError(f"{where}: {error!r}", "the members that this package writes", SKIP_HINT) from error
     scan = decode_scan(arrays, where, sensor)
     scan.boxes, scan.id = boxes, unquote(key)
     check_scan(scan, where)
     return scan
+
+
+def _texts(names: Any) -> list[str]:
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise TypeError("names that are no texts")
+    return names
 
 
 def _content(file: BinaryIO, offset: int, size: int) -> bytes:
@@ -176,9 +185,16 @@ def _scans(path: Path) -> Iterator[tuple[str, Members]]:
     found: dict[str, Members] = {}
     with _open(path) as tar:
         for member in tar:
-            folder, slash, name = member.name.rpartition("/")
+            folder, slash, name = member.name.removeprefix("./").rpartition("/")
             stem, _, kind = name.partition(".")
-            found.setdefault(f"{folder}{slash}{stem}", {})[kind] = (member.offset_data, member.size)
+            if member.isdir():
+                continue
+            if not member.isreg() or member.issparse():
+                raise DataError(f"{path}: {shorten(member.name, 100)!r} is no plain file", "a file of a WebDataset")
+            members = found.setdefault(f"{folder}{slash}{stem}", {})
+            if kind in members:
+                raise DataError(f"{path} holds {shorten(member.name, 100)!r} twice", "each member once", SKIP_HINT)
+            members[kind] = (member.offset_data, member.size)
     yield from found.items()
 
 
@@ -194,13 +210,35 @@ def _members(paths: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
                     yield member.name, content.read()
 
 
+class _Bounded(BufferedReader):
+    """A file that takes no more memory than it has bytes, whatever size its headers ask for."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        length = os.fstat(self.fileno()).st_size
+        return super().read(length if size is None or size < 0 else min(size, length))
+
+
+class _Member(tarfile.TarInfo):
+    """A member of a size that a file can have: older versions of tarfile never come to the end of a negative one
+    (CVE-2025-8194), and no version seeks beyond 2^63."""
+
+    def _block(self, count: int) -> int:
+        if not 0 <= count < 1 << 62:
+            raise tarfile.ReadError(f"a member of {count} bytes")
+        return super()._block(count)  # type: ignore[misc,no-any-return]
+
+
 @contextmanager
 def _open(path: Path) -> Iterator[tarfile.TarFile]:
     """A tar file to read, and its errors in words that help."""
     try:
-        with tarfile.open(path, "r:") as tar:
+        with (
+            path.open("rb", 0) as raw,
+            _Bounded(raw) as file,
+            tarfile.open(fileobj=file, mode="r:", tarinfo=_Member) as tar,
+        ):
             yield tar
-    except tarfile.TarError as error:
+    except (tarfile.TarError, UnicodeDecodeError) as error:
         raise DataError(f"{path} is cut, damaged or no tar file ({error})", "a file of a WebDataset") from error
     except OSError as error:
         raise unreadable(path, error) from error

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import list_files, read_file, read_text, write_file
+from lidar_synth.files import inside, list_files, read_file, read_text, refuse_links, write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.parsing import parse_json, read_picture
 
 Image = NDArray[np.uint8]
 Picture = Image | Path
@@ -41,15 +42,32 @@ class Writer(ABC):
     def __init__(self, root: str | Path, *, calibration: Calibration | None = None) -> None:
         self.root = Path(root)
         self.calibration = calibration
+        self._without_links = False
 
-    @abstractmethod
+    @property
+    def _base(self) -> Path:
+        """The folder in which ``_place`` is; under ``root``."""
+        return self.root
+
     def path(self, index: int, name: str | None = None) -> Path:
-        """The file whose presence says that a scan is whole.
+        """The file whose presence says that a scan is whole; always in ``root``, wherever the name comes from.
 
         Args:
             index: the scan's number in the source.
             name: its id there; a layout keeps what it can of it (frame number, drive) and otherwise counts.
+
+        Raises:
+            DataError: on a name that cannot be a file's under ``root``.
+            FileError: where a link in ``root`` leads out of it.
         """
+        if not self._without_links:
+            refuse_links(self.root)
+            self._without_links = True
+        return inside(self._base, self._place(index, name))
+
+    @abstractmethod
+    def _place(self, index: int, name: str | None) -> str:
+        """What ``path`` is, relative to ``_base``; parts with / between them."""
 
     def write(
         self,
@@ -103,8 +121,8 @@ class FileWriter(Writer):
 
     suffix: str
 
-    def path(self, index: int, name: str | None = None) -> Path:
-        return self.root / f"{name or f'{index:06d}'}{self.suffix}"
+    def _place(self, index: int, name: str | None) -> str:
+        return f"{name or f'{index:06d}'}{self.suffix}"
 
 
 def write_image(path: Path, picture: Picture) -> None:
@@ -118,7 +136,7 @@ def write_image(path: Path, picture: Picture) -> None:
         return
     from PIL import Image as pillow
 
-    opened = pillow.open(picture) if isinstance(picture, Path) else pillow.fromarray(picture)
+    opened = read_picture(picture) if isinstance(picture, Path) else pillow.fromarray(picture)
     write_file(path, lambda file: opened.convert("RGB").save(file, "PNG"))
 
 
@@ -138,11 +156,11 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
     """
     wanted = json.loads(json.dumps(settings))
     if not path.is_file():
-        write_file(path, json.dumps(wanted, indent=1).encode(), overwrite=False)  # another one may be as quick
-    try:
-        there = json.loads(read_text(path))
-    except ValueError as error:
-        raise DataError(f"{path} is damaged ({error})", hint="Choose another output folder.") from error
+        # another one may be as quick
+        write_file(path, json.dumps(wanted, indent=1).encode(), overwrite=False)
+    there = parse_json(read_text(path), f"{path}, which is damaged,", "what this package wrote into an output folder")
+    if not isinstance(there, dict):
+        raise DataError(f"{path} is damaged (it holds {type(there).__name__})", hint="Choose another output folder.")
     other = {name: there[name] for name, value in wanted.items() if there.get(name, value) != value}
     if other:
         raise ConfigError(
@@ -170,7 +188,7 @@ def read_notes(folder: Path) -> dict[int, dict[str, Any]]:
     notes = {}
     for path in list_files(folder / NOTES, ".json") if (folder / NOTES).is_dir() else []:
         try:
-            notes[int(path.stem)] = json.loads(read_text(path))
+            notes[int(path.stem)] = parse_json(read_text(path), str(path))
         except ValueError as error:
             raise DataError(f"{path} is not a note of this package ({error})", hint=f"Remove {path.parent}.") from error
     return notes

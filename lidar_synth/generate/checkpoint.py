@@ -312,7 +312,8 @@ def _checksum(values: Mapping[str, Any]) -> str:
 
 
 def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
-    if bad := [key for key, tensor in tensors.items() if not bool(torch.isfinite(tensor).all())]:
+    """Refuse values that are no finite float32, which is what a network is built from."""
+    if bad := [k for k, v in tensors.items() if v.is_complex() or not bool(torch.isfinite(v.float()).all())]:
         raise DataError(f"{what} has NaN or infinity in {bad}", "finite weights and ray angles")
 
 

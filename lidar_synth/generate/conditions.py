@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_synth.classes import IGNORE, NAMES
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.parsing import read_picture
 
 
 class Condition(Protocol):
@@ -116,16 +117,16 @@ class CameraImage:
         Raises:
             DataError: on a scan without an image, one that cannot be read, or of another size.
         """
-        from PIL import Image, UnidentifiedImageError
+        from PIL import Image
 
         if scan.image_path is None:
             raise DataError(f"scan {scan.id!r} has no camera image", "a scan with an image_path, to condition on")
         try:
-            with Image.open(scan.image_path) as image:
-                size = (image.height, image.width)
-                small = image.convert("RGB").resize((shape[2], shape[1]), Image.Resampling.BICUBIC)
-        except (OSError, UnidentifiedImageError) as error:
+            image = read_picture(scan.image_path)
+        except FileError as error:
             raise DataError(f"the image {scan.image_path} cannot be read ({error})", "a PNG or JPEG") from error
+        size = (image.height, image.width)
+        small = image.convert("RGB").resize((shape[2], shape[1]), Image.Resampling.BICUBIC)
         wanted = tuple(options.get("image") or size)
         if size != wanted:
             raise DataError(

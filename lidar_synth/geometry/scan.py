@@ -72,7 +72,9 @@ class Boxes:
                 raise DataError(f"boxes: {name} has shape {getattr(self, name).shape}", f"{shape}")
         if len(self.names) != count:
             raise DataError(f"boxes: {len(self.names)} names for {count} boxes", "one name per box")
-        if not np.isfinite(self.values).all() or (self.values[:, 3:6] <= 0).any():
+        self.dont_care = np.asarray(self.dont_care, np.float32).reshape(-1, 4)
+        known = (self.values, self.truncation, self.image_box, self.alpha, self.dont_care)
+        if not all(np.isfinite(values).all() for values in known) or (self.values[:, 3:6] <= 0).any():
             raise DataError("boxes with a non-finite value or a size that is not positive", "metres and radians")
 
     def __len__(self) -> int:

@@ -13,14 +13,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.errors import ConfigError, shorten
+from lidar_synth.parsing import parse_yaml, read_yaml
 
 Rays = Literal["centre", "corner"]
 """Where in its cell a ray points: the centre (a point returns to its own cell) or, as the public code of
 R2Flow and LiDM has it, the upper left corner."""
+
+MOST_CELLS = 1 << 22
+"""Rows times columns of a sensor; the largest that are sold have 2^19."""
+
+_OPTIONAL = ("rows", "fov_up", "fov_down")
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,7 @@ class Sensor:
     description: str = ""
 
     def __post_init__(self) -> None:
+        self._check_types()
         linear = (self.rows, self.fov_up, self.fov_down)
         if (self.elevations is None) == (None in linear) or (
             self.elevations is not None and linear != (None, None, None)
@@ -75,28 +81,44 @@ class Sensor:
                               "either all of rows, fov_up and fov_down, or elevations")  # fmt: skip
         for key in ("elevations", "beams"):
             table = getattr(self, key)
-            if table is not None:
-                object.__setattr__(self, key, tuple(float(e) for e in table))
-                if not np.all(np.diff(table) < 0) or max(map(abs, table)) >= 90:
-                    raise self._error(f"{key} = {table}", "degrees within +-90, highest first")
-        if self.rows is not None and not (self.rows >= 2 and 90 >= self.up > self.down >= -90):
-            raise self._error(f"{linear}", "at least 2 rows and 90 >= fov_up > fov_down >= -90")
-        if self.beams is not None and len(self.beams) != self.shape[0]:
-            raise self._error(f"{len(self.beams)} beams", f"one per row ({self.shape[0]})")
-        if self.heights is not None:
-            object.__setattr__(self, "heights", tuple(float(h) for h in self.heights))
-            if len(self.heights) != self.shape[0] or not all(abs(h) < 1 for h in self.heights):
-                raise self._error(
-                    f"heights = {self.heights}", f"one per row ({self.shape[0]}), within 1 m of the origin"
-                )
+            if table is not None and (not np.all(np.diff(table) < 0) or max(map(abs, table)) >= 90):
+                raise self._error(f"{key} = {table}", "degrees within +-90, highest first")
+        rows = self.shape[0]
+        if rows < 2 or (self.rows is not None and not 90 >= self.up > self.down >= -90):
+            raise self._error(f"{rows} rows, {linear[1:]}", "at least 2 rows and 90 >= fov_up > fov_down >= -90")
+        if self.beams is not None and len(self.beams) != rows:
+            raise self._error(f"{len(self.beams)} beams", f"one per row ({rows})")
+        if self.heights is not None and (len(self.heights) != rows or not all(abs(h) < 1 for h in self.heights)):
+            raise self._error(f"heights = {self.heights}", f"one per row ({rows}), within 1 m of the origin")
         if self.columns < 2 or self.columns % 2:
             raise self._error(f"columns = {self.columns}", "an even number")
-        if not 0 <= self.range_min < self.range_max < np.inf:
+        if rows * self.columns > MOST_CELLS:
+            raise self._error(f"{rows} rows and {self.columns} columns", f"at most {MOST_CELLS} cells")
+        if not 0 <= self.range_min < self.range_max:
             raise self._error(f"range_min, range_max = {self.range_min}, {self.range_max}",
                               "0 <= range_min < range_max, metres")  # fmt: skip
 
+    def _check_types(self) -> None:
+        """Refuse what is no text, no whole number or no finite number; lists become tuples of float."""
+        for key in ("name", "description"):
+            if not isinstance(getattr(self, key), str):
+                raise self._error(f"{key} = {getattr(self, key)!r}", "text")
+        for key in ("columns", "range_min", "range_max", "rows", "fov_up", "fov_down"):
+            value, whole = getattr(self, key), key in ("columns", "rows")
+            fits = _is_whole(value) if whole else _is_finite(value)
+            if not fits and not (value is None and key in _OPTIONAL):
+                raise self._error(f"{key} = {value!r}", "a whole number" if whole else "a finite number")
+        for key in ("elevations", "beams", "heights"):
+            table = getattr(self, key)
+            if table is None:
+                continue
+            known = isinstance(table, list | tuple) or (isinstance(table, np.ndarray) and table.ndim == 1)
+            if not known or not len(table) or not all(map(_is_finite, table)):
+                raise self._error(f"{key} = {table!r}", "a list of finite numbers")
+            object.__setattr__(self, key, tuple(float(value) for value in table))
+
     def _error(self, given: str, expected: str) -> ConfigError:
-        return ConfigError(f"sensor {self.name!r}: {given}", expected)
+        return ConfigError(f"sensor {shorten(repr(self.name), 100)}: {shorten(given, 400)}", expected)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -175,13 +197,15 @@ class Sensor:
         Raises:
             ConfigError: on an unknown or missing key, or a value of the wrong kind.
         """
-        known = {f.name for f in fields(cls)}
-        if unknown := set(values) - known:
-            raise ConfigError(f"sensor keys {sorted(unknown)}", f"some of {sorted(known)}")
-        try:
-            return cls(**values)
-        except TypeError as error:
-            raise ConfigError(f"sensor {values.get('name')!r}: {error}", "numbers, as in sensors.yaml") from error
+        known = [f.name for f in fields(cls)]
+        if not isinstance(values, dict):
+            raise ConfigError(f"a sensor of type {type(values).__name__}", f"a mapping of {known}")
+        if unknown := [key for key in values if key not in known]:
+            raise ConfigError(f"sensor keys {shorten(str(unknown), 400)}", f"some of {known}")
+        if missing := [key for key in ("name", "columns", "range_min", "range_max") if key not in values]:
+            given = f"sensor {shorten(repr(values.get('name')), 100)} without {', '.join(missing)}"
+            raise ConfigError(given, "text and numbers, as in sensors.yaml")
+        return cls(**values)
 
 
 @lru_cache(maxsize=16)
@@ -193,20 +217,27 @@ def _ray_directions(sensor: Sensor, rays: Rays) -> NDArray[np.float32]:
     return directions
 
 
-def _read_yaml(text: str, where: str) -> dict[str, dict[str, Any]]:
-    try:
-        entries = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where} is not YAML ({error})") from error
-    if not isinstance(entries, dict) or not all(isinstance(v, dict) for v in entries.values()):
-        raise ConfigError(f"{where} holds {type(entries).__name__}", "a mapping from a sensor's name to its values")
-    return entries
+def _is_finite(value: object) -> bool:
+    known = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    return bool(known and -1e300 < value < 1e300)  # type: ignore[operator]  # no isfinite: an int may have no float
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def _entries(values: Any, where: str) -> dict[Any, dict[str, Any]]:
+    """The sensors of a YAML file by name."""
+    if not isinstance(values, dict) or not all(isinstance(v, dict) for v in values.values()):
+        raise ConfigError(f"{where} holds {type(values).__name__}", "a mapping from a sensor's name to its values")
+    return values
 
 
 @lru_cache(maxsize=1)
 def presets() -> dict[str, Sensor]:
     """The sensors of ``sensors.yaml`` by name."""
-    entries = _read_yaml(files("lidar_synth.geometry").joinpath("sensors.yaml").read_text(), "sensors.yaml")
+    text = files("lidar_synth.geometry").joinpath("sensors.yaml").read_text(encoding="utf-8")
+    entries = _entries(parse_yaml(text, "sensors.yaml"), "sensors.yaml")
     return {name: Sensor.from_dict({"name": name, **values}) for name, values in entries.items()}
 
 
@@ -220,6 +251,7 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
     Raises:
         ConfigError: on an unknown name, or a file without exactly one sensor.
         FileError: on a path that cannot be read.
+        DataError: on a file that is not UTF-8, or longer than a sensor's.
 
     Example:
         >>> from lidar_synth import load_sensor
@@ -239,10 +271,7 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
     path = Path(sensor)
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"sensor {str(sensor)!r}", f"one of {', '.join(presets())}, or a .yaml file")
-    try:
-        entries = _read_yaml(path.read_text(), str(path))
-    except OSError as error:
-        raise FileError(f"sensor file {path} cannot be read ({error.strerror})") from error
+    entries = _entries(read_yaml(path, "a file with a sensor, such as sensors.yaml"), str(path))
     if len(entries) != 1:
         raise ConfigError(f"{path} holds {len(entries)} sensors", "exactly one entry: its name, then its values")
     [(name, values)] = entries.items()

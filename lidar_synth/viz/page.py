@@ -22,6 +22,7 @@ from tqdm import tqdm
 from lidar_synth.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.parsing import read_picture
 from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, known, scales
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Orbit, box_segments, render, ring_segments
@@ -126,7 +127,6 @@ def _uri(pixels: Rgb, kind: str = "PNG") -> str:
 
 
 def _photo(path: Path) -> str:
-    with Image.open(path) as photo:
-        small = photo.convert("RGB")
-        small.thumbnail((1200, 600))
-        return _uri(np.asarray(small), "JPEG")
+    small = read_picture(path).convert("RGB")
+    small.thumbnail((1200, 600))
+    return _uri(np.asarray(small), "JPEG")

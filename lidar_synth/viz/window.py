@@ -4,17 +4,34 @@ import ctypes
 import os
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from lidar_synth.errors import LibraryError
-from lidar_synth.formats.pcd import import_open3d
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.viz.colour import EMPTY, Scale, point_values, scales
 from lidar_synth.viz.render import Orbit, box_segments
 
 _LEFT, _RIGHT = 263, 262  # GLFW's key codes
+
+
+def import_open3d() -> ModuleType:
+    """The library open3d.
+
+    Raises:
+        LibraryError: where it or a system library behind it is missing.
+    """
+    try:
+        import open3d  # type: ignore[import-untyped,unused-ignore]
+    except (ImportError, OSError) as error:
+        raise LibraryError(
+            f"open3d cannot be imported ({error})",
+            "open3d and its system libraries, for the 3-D window",
+            "Type: apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 libudev1",
+        ) from error
+    return open3d  # type: ignore[no-any-return,unused-ignore]
 
 
 def has_screen() -> bool:

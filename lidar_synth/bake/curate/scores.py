@@ -24,10 +24,10 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.evaluate import jensen_shannon_distance
 from lidar_synth.files import write_arrays
 from lidar_synth.formats.convert import in_processes
-from lidar_synth.formats.npz import read_arrays
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Source
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.parsing import read_arrays
 
 FILE = "scores.npz"
 """Name of the file, in the bank's folder."""
@@ -124,7 +124,7 @@ def read_scores(path: Path) -> Scores:
         FileError: where it cannot be read.
         DataError: where it is damaged or something else.
     """
-    arrays = read_arrays(path)
+    arrays = read_arrays(path, most=1 << 32)
     values = {name: arrays[name] for name in MEANINGS if name in arrays}
     shapes = {array.shape for name, array in arrays.items() if name in MEANINGS or name == "twin"}
     if not {"bank", "reference", "twin", "range"} <= set(arrays) or len(shapes) != 1:

@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from torch import Tensor, nn
 
 from lidar_synth.classes import NAMES
-from lidar_synth.errors import DataError
-from lidar_synth.files import read_text, sha256
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files import sha256
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, Part
 from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
@@ -33,6 +32,7 @@ from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.models import assemble
 from lidar_synth.models.lidm.diffusion import schedule_times
+from lidar_synth.parsing import read_yaml
 from lidar_synth.recordings import KITTI360, KITTI360_SPLITS, Recordings, frames_of, whole
 
 STEPS = 50
@@ -88,11 +88,9 @@ def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
 
 def _config(path: Path) -> dict[str, Any]:
     try:
-        config = yaml.safe_load(read_text(path))
-    except yaml.YAMLError as error:
-        raise DataError(
-            f"{path} is not YAML ({error})", "the config.yaml that LiDM releases with its weights"
-        ) from error
+        config = read_yaml(path, "the config.yaml that LiDM releases with its weights")
+    except ConfigError as error:
+        raise DataError(str(error), "the config.yaml that LiDM releases with its weights") from error
     if not isinstance(config, dict):
         raise DataError(f"{path} holds {type(config).__name__}", "the config.yaml that LiDM releases with its weights")
     return config

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ValidationError
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, shorten
 from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.parsing import parse_yaml
 from lidar_synth.train.config.recipes import find_recipe, read_recipe
 from lidar_synth.train.config.sections import Run
 from lidar_synth.train.config.training import DistillConfig, TrainConfig
@@ -99,10 +99,7 @@ def _override(values: dict[str, Any], override: str) -> None:
         values = values.setdefault(level, {})
         if not isinstance(values, dict):
             raise ConfigError(f"override {override!r}: {level} is a single value", "a section")
-    try:
-        values[last] = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"override {override!r}: {text!r} is not YAML", "a number, a word, a [list]") from error
+    values[last] = parse_yaml(text, f"override {override!r}")
 
 
 def _first(kind: type[BaseModel], error: ValidationError) -> str:
@@ -113,7 +110,7 @@ def _first(kind: type[BaseModel], error: ValidationError) -> str:
         return f"unknown key {place!r}; known there: {', '.join(_keys(kind, fault['loc'][:-1]))}"
     if fault["type"] == "missing":
         return f"{place!r} is missing"
-    return f"{place} = {fault['input']!r}: {fault['msg']}"
+    return f"{place} = {shorten(repr(fault['input']), 400)}: {fault['msg']}"
 
 
 def _keys(kind: Any, path: Sequence[int | str]) -> list[str]:

@@ -11,9 +11,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.errors import ConfigError
+from lidar_synth.parsing import read_yaml
 
 SUFFIXES = (".yaml", ".yml")
 
@@ -121,13 +120,7 @@ def _base(path: Path, name: Any) -> Path:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        hint = "lidar-synth recipes lists the published ones."
-        raise FileError(f"{path} cannot be read ({error.strerror})", "a configuration in YAML", hint) from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not YAML ({error})") from error
+    values = read_yaml(path, "a configuration; lidar-synth recipes lists the published ones")
     if not isinstance(values, dict):
         raise ConfigError(f"{path} holds {type(values).__name__}", "keys and values")
     sensor = values.get("sensor")

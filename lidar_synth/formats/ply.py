@@ -1,0 +1,117 @@
+"""PLY files (http://paulbourke.net/dataformats/ply): their vertices as points. Lossless for a scan.
+
+Read as ``ascii`` and in both byte orders, written as ``binary_little_endian``. As with PCD, what the header says is
+compared with the file before any value is read.
+"""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.files import SKIP_HINT, read_file, write_file
+from lidar_synth.formats.cloud import (
+    Field,
+    check_fields,
+    check_size,
+    cut,
+    from_records,
+    from_text,
+    to_arrays,
+    to_records,
+)
+from lidar_synth.geometry.scan import Scan
+
+LONGEST_HEADER = 1 << 16
+"""Bytes."""
+
+TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+
+ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass
+class Element:
+    """One kind of things in the file: ``count`` times ``fields``; ``lists`` where one of them has no fixed length."""
+
+    name: str
+    count: int
+    fields: list[Field] = field(default_factory=list)
+    lists: bool = False
+
+    @property
+    def size(self) -> int:
+        """Bytes of all of them."""
+        return self.count * sum(f.width for f in self.fields)
+
+
+def write_ply(path: Path, scan: Scan) -> None:
+    """A scan as binary ``.ply``; ``read_ply`` is the inverse.
+
+    Raises:
+        FileError: where it cannot be written.
+    """
+    records = to_records(scan)
+    names = {kind: name for name, kind in reversed(TYPES.items())}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(records)}"]
+    lines += [f"property {names[records.dtype[n].str[1:]]} {n}" for n in records.dtype.names or ()]
+    write_file(path, "\n".join([*lines, "end_header\n"]).encode() + records.tobytes())
+
+
+def read_ply(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a ``.ply``'s vertices, as a ``Scan`` names them.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where its header is none or does not fit the file, or it holds no points.
+    """
+    content, where = read_file(path), str(path)
+    end = re.search(rb"^end_header\r?\n", content[:LONGEST_HEADER], re.M)
+    if not content.startswith(b"ply") or end is None:
+        raise DataError(f"{where} has no header of a .ply file", "a PLY file", SKIP_HINT)
+    encoding, elements = _header(content[: end.start()].decode("latin-1"), where)
+    [(position, vertex)] = [(i, e) for i, e in enumerate(elements) if e.name == "vertex"]
+    if vertex.lists or (encoding != "ascii" and any(e.lists for e in elements[:position])):
+        raise DataError(f"{where} has lists in its points or before them", "the element vertex first, without lists")
+    check_fields(vertex.fields, vertex.count, where)
+    body = content[end.end() :]
+    if encoding == "ascii":
+        lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
+        if len(lines) != (wanted := sum(e.count for e in elements)):
+            raise cut(where, len(lines), wanted, "lines")
+        start = sum(e.count for e in elements[:position])
+        return to_arrays(from_text("\n".join(lines[start : start + vertex.count]), vertex.fields, vertex.count, where))
+    size = sum(e.size for e in elements)  # of lists, what they have at least
+    check_size(body, size, where, more=any(e.lists for e in elements))
+    start = sum(e.size for e in elements[:position])
+    return to_arrays(from_records(body[start : start + vertex.size], vertex.fields, vertex.count))
+
+
+def _header(text: str, where: str) -> tuple[str, list[Element]]:
+    """Encoding and elements, in order; one of them is ``vertex``."""
+    encodings, elements = [], []
+    for line in text.splitlines()[1:]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", name, "1.0"] if name in ORDERS:
+                encodings.append(name)
+            case ["element", name, count] if re.fullmatch("[0-9]{1,12}", count) and encodings:
+                elements.append(Element(name, int(count)))
+            case ["property", "list", length, kind, _] if length in TYPES and kind in TYPES and elements:
+                elements[-1].fields.append(Field("", TYPES[length]))
+                elements[-1].lists = True
+            case ["property", kind, name] if kind in TYPES and elements:
+                elements[-1].fields.append(Field(name, ORDERS[encodings[0]] + TYPES[kind]))
+            case _:
+                raise DataError(f"{where}: its header cannot be read ({line[:100]!r})", "a PLY file", SKIP_HINT)
+    if len(encodings) != 1 or [e.name for e in elements].count("vertex") != 1:
+        raise DataError(f"{where}: its header cannot be read", "one format and one element vertex", SKIP_HINT)
+    return encodings[0], elements

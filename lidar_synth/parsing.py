@@ -1,0 +1,244 @@
+"""Bytes of unknown origin into plain values: JSON, YAML, numpy's arrays and pictures, within limits.
+
+A file may declare more than it holds: a size, a depth, an alias of an alias. What it declares is compared with what it
+holds, and with a limit, before memory is taken for it; and whatever is wrong with it is an error of this package.
+"""
+
+import json
+import re
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Collection, Iterable
+from io import BytesIO
+from math import prod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files import SKIP_HINT, STRAY, read_file, read_text
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+MOST_BYTES = 128 << 20
+"""Bytes that may come out of a file by decompression, all its arrays together: 8 million points with reflectance."""
+
+MOST_PIXELS = 1 << 25
+"""Pixels of a picture."""
+
+LONGEST_YAML = 1 << 18
+"""Characters of a YAML text."""
+
+LONGEST_PLAIN = 3000
+"""Characters of a value in it without quotes."""
+
+MOST_NODES, DEEPEST = 20_000, 64
+"""Values in a YAML text, each alias counted as all that it stands for, and levels of them."""
+
+ARRAYS = "arrays of numbers written by numpy, none of them pickled"
+
+
+def parse_json(text: str | bytes, where: str, expected: str = "JSON") -> Any:
+    """The values of a JSON text.
+
+    Raises:
+        DataError: on what is no JSON, or too deep.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where} is not JSON ({type(error).__name__}: {error})", expected, SKIP_HINT) from error
+
+
+def read_yaml(path: Path, expected: str) -> Any:
+    """The values of a YAML file.
+
+    Args:
+        path: the file.
+        expected: what it should be, for the error.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where it is too long, or not UTF-8.
+        ConfigError: as ``parse_yaml``.
+    """
+    return parse_yaml(read_text(path, expected, LONGEST_YAML), str(path))
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """The plain values of a YAML text.
+
+    Raises:
+        ConfigError: on what is no YAML, on tags, and on more values or levels than a configuration has.
+    """
+    try:
+        fault = _yaml_fault(yaml.parse(text, Loader=yaml.SafeLoader))
+        values = None if fault else yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date such as 2001-99-99 is a ValueError
+        raise ConfigError(f"{where} is not YAML ({error})") from error
+    if fault:
+        raise ConfigError(f"{where} is not YAML of plain values: it has {fault}")
+    return values
+
+
+def _yaml_fault(events: Iterable[Any]) -> str:
+    """Why the events of a YAML text are not to be made into values; "" where they are."""
+    count, opened = 0, []
+    sizes: dict[str, int] = {}
+    for event in events:
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in sizes:
+                return f"the alias *{event.anchor} of nothing before it"
+            count += sizes[event.anchor]
+        elif isinstance(event, yaml.NodeEvent):
+            if event.tag is not None:
+                return f"the tag {event.tag}"
+            count += 1
+            if isinstance(event, yaml.CollectionStartEvent):
+                opened.append((event.anchor, count))
+            elif event.anchor is not None:
+                sizes[event.anchor] = 1
+            if (
+                isinstance(event, yaml.ScalarEvent) and event.style is None and len(event.value) > LONGEST_PLAIN
+            ):  # Python prints no number of 4300 digits
+                return f"a value of {len(event.value)} characters without quotes"
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, first = opened.pop()
+            if anchor is not None:
+                sizes[anchor] = count - first + 1
+        if count > MOST_NODES or len(opened) > DEEPEST:
+            return f"more than {MOST_NODES} values or {DEEPEST} levels"
+    return ""
+
+
+def read_arrays(path: Path, only: Collection[str] | None = None, most: int = MOST_BYTES) -> dict[str, NDArray[Any]]:
+    """The arrays of an ``.npz``, or the one of an ``.npy`` under the name ``array``.
+
+    Args:
+        path: the file.
+        only: names of the arrays that are wanted; by default all.
+        most: bytes that may come out of a compressed file.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where it is no such file, is damaged, declares more than it holds or than ``most``, or holds
+            something else than numbers and text.
+    """
+    content = read_file(path)
+    if not content.startswith(b"PK"):
+        return {"array": parse_npy(content, str(path))}
+    members = _unzip(content, str(path), only, most)
+    members.pop(STRAY, None)
+    return {name: parse_npy(member, f"{path}, array {name!r}") for name, member in members.items()}
+
+
+def _unzip(content: bytes, where: str, only: Collection[str] | None, most: int) -> dict[str, bytes]:
+    """{name without .npy: bytes} of a ZIP file's members."""
+    try:
+        with zipfile.ZipFile(BytesIO(content)) as archive:
+            infos = archive.infolist()
+            fault = _zip_fault(infos, len(content), most)
+            members: dict[str, bytes] = {}
+            for info in [] if fault else infos:
+                name = info.filename.removesuffix(".npy")
+                if only is None or name in only:
+                    with archive.open(info) as file:
+                        members[name] = file.read(info.file_size)  # read() alone would take whatever comes out
+    # The exceptions of zipfile on a damaged file; encrypted members and unknown methods are a RuntimeError.
+    except (zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, OverflowError,
+            RuntimeError) as error:  # fmt: skip
+        raise DataError(f"{where}: {error or type(error).__name__}", ARRAYS, SKIP_HINT) from error
+    if fault:
+        raise DataError(f"{where} {fault}", ARRAYS, SKIP_HINT)
+    return members
+
+
+def _zip_fault(infos: list[zipfile.ZipInfo], size: int, most: int) -> str:
+    """Why the members of a ZIP file of this size are not to be read; "" where they are."""
+    names = [info.filename for info in infos]
+    if len(set(names)) < len(names):
+        return "holds two arrays of one name"
+    if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in infos):
+        return "is compressed by another method than deflate"
+    deflated = sum(info.file_size for info in infos if info.compress_type == zipfile.ZIP_DEFLATED)
+    stored = sum(info.file_size for info in infos) - deflated
+    if deflated > most or stored > size:
+        return f"declares {deflated + stored} bytes of arrays in {size}, more than it can hold or {most} bytes"
+    return ""
+
+
+_DESCRIPTION = re.compile(
+    r"""\{(?:(?:['"]descr['"]:(?:['"](?P<descr>[^'"]*)['"])|['"]fortran_order['"]:(?P<fortran>True|False)"""
+    r"""|['"]shape['"]:\((?P<shape>(?:[0-9]{1,12}L?(?:,|(?=\))))*)\)),?){3}\}"""
+)
+"""The header of numpy's format, without white space: a dictionary of these three, in any order."""
+
+_TYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|U[1-9]\d{0,6})")
+"""The types that are read: truth values, whole and floating-point numbers, and text."""
+
+
+def parse_npy(content: bytes, where: str) -> NDArray[Any]:
+    """The array of an ``.npy`` file (https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html).
+
+    Raises:
+        DataError: where it is none, holds fewer or more bytes than its header says, or something else than numbers
+            and text.
+    """
+    width = {1: 2, 2: 4, 3: 4}.get(content[6], 0) if len(content) > 10 and content[:6] == b"\x93NUMPY" else 0
+    start = 8 + width + int.from_bytes(content[8 : 8 + width], "little")
+    if not width or start > min(len(content), 10_000):
+        raise DataError(f"{where} has no header of numpy's", ARRAYS, SKIP_HINT)
+    header = re.sub(r"\s", "", content[8 + width : start].decode("latin-1"))
+    found = _DESCRIPTION.fullmatch(header)
+    dtype = _TYPE.fullmatch(found["descr"] or "") if found else None
+    if found is None or dtype is None or None in (found["fortran"], found["shape"]):
+        raise DataError(f"{where} holds {header[:200]}", ARRAYS, SKIP_HINT)
+    shape = tuple(int(length) for length in found["shape"].replace("L", "").split(",") if length)
+    return _array(content, start, np.dtype(dtype[0]), shape, found["fortran"] == "True", where)
+
+
+def _array(
+    content: bytes, start: int, dtype: np.dtype[Any], shape: tuple[int, ...], fortran: bool, where: str
+) -> NDArray[Any]:
+    """The array whose values stand in ``content`` from ``start`` on."""
+    held = len(content) - start
+    if prod(shape) * dtype.itemsize != held or len(shape) > 8 or prod(max(n, 1) for n in shape) >= 1 << 58:
+        raise DataError(
+            f"{where} holds {held} bytes for {dtype} of shape {shape}", "as many as its shape says", SKIP_HINT
+        )
+    values = np.frombuffer(content, dtype, offset=start).copy()
+    if dtype.kind == "U":
+        codes = values.view(np.dtype("u4").newbyteorder(dtype.byteorder))
+        if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes < 0xE000))).any():
+            raise DataError(f"{where} holds text that is none", ARRAYS, SKIP_HINT)
+    return values.reshape(shape, order="F" if fortran else "C")
+
+
+def read_picture(path: Path, expected: str = "a PNG or JPEG file") -> "Image":
+    """A picture, decoded.
+
+    Raises:
+        FileError: where it cannot be read.
+        DataError: where it is none, is damaged, or has more than ``MOST_PIXELS``.
+    """
+    from PIL import Image
+
+    content = BytesIO(read_file(path))
+    try:
+        with warnings.catch_warnings(), Image.open(content) as opened:
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            size = opened.size
+            if prod(size) <= MOST_PIXELS:
+                opened.load()
+                return opened
+    # The exceptions of Pillow's readers on damaged files.
+    except (OSError, SyntaxError, ValueError, EOFError, OverflowError, IndexError, KeyError, TypeError, struct.error,
+            zlib.error, Image.DecompressionBombError) as error:  # fmt: skip
+        raise DataError(f"{path} cannot be read ({error or type(error).__name__})", expected, SKIP_HINT) from error
+    raise DataError(f"{path} has {size} columns and rows", f"at most {MOST_PIXELS} pixels", SKIP_HINT)

@@ -1,0 +1,263 @@
+"""The readers that are fuzzed, one line each in ``TARGETS``: how to write a small valid dataset, and how to read it."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+import yaml
+from banks import SENSOR, some_image, write_bank
+from layouts import some_camera, some_scan, write_kitti_raw, write_nuscenes
+
+from lidar_synth.bank import ShardReader
+from lidar_synth.files import write_named_matrices
+from lidar_synth.formats import READERS, WRITERS, layout_of
+from lidar_synth.generate.checkpoint import (
+    VELOCITY,
+    Header,
+    Part,
+    load_checkpoint,
+    read_header,
+    save_checkpoint,
+    weights_hash,
+)
+from lidar_synth.geometry.normalize import NORMALISATIONS
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.models import build_network
+
+SCANS = 8
+"""A reader of a dataset reads this many of its scans at most."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader and what it is given.
+
+    Args:
+        make: writes a small valid dataset into a folder; the same bytes every time.
+        read: reads the folder and returns all that it found, for ``checks``.
+        files: patterns of the names of the files that are mutated.
+        mend: makes checksums of the folder fit again after a mutation, where they can be; done for half of the cases.
+    """
+
+    make: Callable[[Path], object]
+    read: Callable[[Path], Any]
+    files: tuple[str, ...] = ("*",)
+    mend: Callable[[Path], object] | None = None
+
+
+def scans(**fields: bool) -> list[Scan]:
+    """Two scans of a small sensor, with boxes and poses."""
+    made = [some_scan(i, SENSOR, 150) for i in range(2)]  # type: ignore[arg-type]
+    for scan in made:
+        scan.confidence = np.linspace(0, 1, len(scan), dtype=np.float32)
+        scan.ring = (np.arange(len(scan)) % 8).astype(np.int16)
+    return made
+
+
+def write(to: str, root: Path) -> None:
+    """Two scans in one of the package's formats, with a camera and its images where the format has a place for them."""
+    writer = WRITERS[to](root, calibration=some_camera())
+    image = np.full((13, 35, 3), 128, np.uint8)
+    for index, scan in enumerate(scans()):
+        writer.write(scan, index, image=image)
+    writer.finish()
+
+
+def some_rows() -> np.ndarray:
+    """(N, 4) float32 x, y, z, reflectance of a scan, every point twice, one half behind the other."""
+    scan = scans()[0]
+    return np.tile(np.column_stack([scan.points, scan.reflectance])[:50], (2, 1))
+
+
+def make_pcd(root: Path) -> None:
+    """Binary as the package writes it; and, as other tools do, text and LZF."""
+    write("pcd", root)
+    rows = some_rows()
+    told = f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\n"
+    head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n{told}"
+    (root / "text.pcd").write_text(head + "DATA ascii\n" + lines_of(rows))
+    columns = [column.tobytes() for column in rows.T.astype("<f4")]
+    packed = b"".join(lzf(column[: len(column) // 2]) for column in columns)
+    sizes = len(packed).to_bytes(4, "little") + sum(map(len, columns)).to_bytes(4, "little")
+    (root / "packed.pcd").write_bytes(head.encode() + b"DATA binary_compressed\n" + sizes + packed)
+
+
+def lines_of(rows: np.ndarray) -> str:
+    return "".join(" ".join(f"{value:g}" for value in row) + "\n" for row in rows)
+
+
+def lzf(plain: bytes) -> bytes:
+    """LZF of these bytes twice, one behind the other: runs of bytes as they are, then references to them."""
+    runs = [plain[i : i + 32] for i in range(0, len(plain), 32)]
+    packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
+    back = len(plain) - 1
+    assert len(plain) % 100 == 0, "the references are to 100 bytes each"
+    return packed + bytes([7 << 5 | back >> 8, 100 - 9, back & 255]) * (len(plain) // 100)
+
+
+def make_ply(root: Path) -> None:
+    """Binary as the package writes it; and, as other tools do, text and the other order of bytes, with faces."""
+    write("ply", root)
+    rows = some_rows()
+    fields = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    head = f"ply\nformat {{}} 1.0\ncomment by hand\nelement vertex {len(rows)}\n{fields}"
+    faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (root / "text.ply").write_text(head.format("ascii") + faces + lines_of(rows) + "3 0 1 2\n")
+    body = rows.astype(">f4").tobytes() + b"\x03" + np.arange(3, dtype=">i4").tobytes()
+    (root / "big.ply").write_bytes((head.format("binary_big_endian") + faces).encode() + body)
+
+
+def make_npy(root: Path) -> None:
+    """Points as plain arrays."""
+    root.mkdir()
+    for index, scan in enumerate(scans()):
+        np.save(root / f"{index}.npy", np.column_stack([scan.points, scan.reflectance]))
+
+
+def make_range_arrays(root: Path) -> None:
+    """Range images as others' arrays: range, range and reflectance, and six values a cell."""
+    root.mkdir()
+    image = some_image()
+    assert image.reflectance is not None and image.label is not None
+    xyz = SENSOR.ray_directions() * image.range[..., None]
+    classes = (image.label + np.uint8(1)).astype(np.float32)  # 255 = ignore becomes 0 = unlabelled
+    np.save(root / "one.npy", image.range)
+    np.save(root / "two.npy", np.stack([image.range, image.reflectance]))
+    stack = np.dstack([xyz, image.reflectance, image.range, classes])
+    np.save(root / "six.npy", stack.astype(np.float32))
+
+
+def make_kitti_raw(root: Path) -> None:
+    """A drive with tracklets and a day's calibration."""
+    write_kitti_raw(root, 2)
+    camera = some_camera()
+    transform = camera.camera_from_sensor
+    velo = {"R": transform[:3, :3], "T": transform[:3, 3]}
+    cam = {"S_rect_02": np.array(camera.image_size), "R_rect_00": np.eye(3), "P_rect_02": camera.projection}
+    write_named_matrices(root / "2011_09_26" / "calib_velo_to_cam.txt", velo)
+    write_named_matrices(root / "2011_09_26" / "calib_cam_to_cam.txt", cam)
+
+
+def make_bank(root: Path) -> None:
+    """Two shards with every array."""
+    images = [some_image(i) for i in range(3)]
+    write_bank(root, images, shard_size=2, fields=("reflectance", "label", "confidence"), provenance={"data": "none"})
+
+
+def make_sensors(root: Path) -> None:
+    """One sensor with linear beams, one with a table of them."""
+    root.mkdir()
+    linear = {"rows": 8, "fov_up": 3.0, "fov_down": -25.0, "columns": 32, "range_min": 1.45, "range_max": 80.0}
+    table = {"elevations": [4.0, 2.5, 0.0, -10.0], "beams": [4.1, 2.4, 0.1, -9.0], "heights": [0.1, 0.1, 0.0, 0.0],
+             "columns": 32, "range_min": 0.5, "range_max": 120.0, "description": "a table"}  # fmt: skip
+    (root / "linear.yaml").write_text(yaml.safe_dump({"linear": linear}))
+    (root / "table.yaml").write_text("# a comment\n" + yaml.safe_dump({"table": table}))
+
+
+def make_checkpoint(root: Path) -> None:
+    """A small velocity network with every key that a header has."""
+    arguments = {"resolution": [8, 32], "channels": 7, "width": 16, "time_width": 8, "depths": [1, 1], "heads": [2, 2]}
+    header = Header(
+        networks={VELOCITY: Part("hdit", arguments)},
+        sensor=SENSOR,
+        normalisation=NORMALISATIONS["r2flow"],
+        channels=("range", "reflectance", "label"),
+        time_grid=(1.0, 0.86, 0.58, 0.22, 0.0),
+        provenance={"data": "none", "data_licence": "none", "licence": "MIT", "metrics": {"jsd": 0.1}},
+        conditioning={"semantic": {"classes": 19}},
+    )
+    torch.manual_seed(0)
+    network = build_network("hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())})
+    save_checkpoint(root / "model.safetensors", header, {VELOCITY: network})
+
+
+def read(layout: str, root: Path, **options: Any) -> list[Any]:
+    """Scans, images and cameras of a dataset, through the reader and through what recognises its layout."""
+    layout_of(root)
+    source: Any = READERS[layout](root, **options)
+    found: list[Any] = [source.sensor]
+    for index in range(min(len(source), SCANS)):
+        found += [source[index], source.calibration(index)]
+        found += [source.image(index)] if hasattr(source, "image") else []
+    return found
+
+
+def read_shard(root: Path) -> list[Any]:
+    """Every scan of a shard by itself, without an index that knows its size and hash."""
+    found: list[Any] = []
+    with ShardReader(root / "shard-00000.h5", "shard-00000.h5") as shard:
+        for position in range(min(shard.entry.scans, SCANS)):
+            found += [shard.encoding.decode(shard.read(position))]
+            shard.condition(position)
+    return found
+
+
+def read_sensors(root: Path) -> list[Any]:
+    """The sensors, after their rays were made."""
+    found = [load_sensor(path) for path in (root / "linear.yaml", root / "table.yaml")]
+    for sensor in found:
+        sensor.ray_directions()
+    return [*found]
+
+
+def read_checkpoint(root: Path) -> list[Any]:
+    """Header and networks."""
+    path = root / "model.safetensors"
+    return [read_header(path)[0], load_checkpoint(path)]
+
+
+def mend_index(root: Path) -> None:
+    """The sizes, hashes and checksum of a bank's index as its files are."""
+    values = json.loads((root / "index.json").read_text())
+    for entry in values["shards"]:
+        content = (root / entry["file"]).read_bytes()
+        entry |= {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    values.pop("checksum", None)
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"))
+    values["checksum"] = hashlib.sha256(text.encode()).hexdigest()
+    (root / "index.json").write_text(json.dumps(values))
+
+
+def mend_checkpoint(root: Path) -> None:
+    """The sums of the weights and of the header as they are."""
+    path = root / "model.safetensors"
+    tensors = safetensors.torch.load_file(path)
+    with safetensors.safe_open(path, "pt") as file:
+        values = json.loads(file.metadata()["lidar_synth"])
+    values["weights"] = weights_hash(tensors)
+    values.pop("checksum", None)
+    text = json.dumps(values, sort_keys=True, allow_nan=False)
+    values["checksum"] = hashlib.sha256(text.encode()).hexdigest()
+    safetensors.torch.save_file(tensors, path, {"lidar_synth": json.dumps(values)})
+
+
+TARGETS: dict[str, Target] = {
+    "bin": Target(partial(write, "kitti"), partial(read, "folder")),
+    "npy": Target(make_npy, partial(read, "folder")),
+    "npz": Target(partial(write, "npz"), partial(read, "folder")),
+    "pcd": Target(make_pcd, partial(read, "folder")),
+    "ply": Target(make_ply, partial(read, "folder")),
+    "range": Target(partial(write, "range"), partial(read, "range")),
+    "range_npy": Target(make_range_arrays, partial(read, "range", sensor=SENSOR)),
+    "png": Target(partial(write, "png"), partial(read, "png")),
+    "webdataset": Target(partial(write, "webdataset"), partial(read, "webdataset")),
+    "semantic_kitti": Target(partial(write, "semantic_kitti"), partial(read, "semantic_kitti")),
+    "kitti_object": Target(partial(write, "kitti_object"), partial(read, "kitti_object")),
+    "kitti_raw": Target(make_kitti_raw, partial(read, "kitti_raw")),
+    "kitti360": Target(partial(write, "kitti360"), partial(read, "kitti360")),
+    "nuscenes": Target(partial(write_nuscenes, count=2), partial(read, "nuscenes")),
+    "bank": Target(make_bank, partial(read, "bank"), files=("*.h5", "index.json"), mend=mend_index),
+    "bank_index": Target(make_bank, partial(read, "bank"), files=("index.json",), mend=mend_index),
+    "bank_shard": Target(make_bank, read_shard, files=("shard-00000.h5",)),
+    "sensor": Target(make_sensors, read_sensors),
+    "checkpoint": Target(make_checkpoint, read_checkpoint, mend=mend_checkpoint),
+}
+"""By name. A reader of ``READERS`` is read by ``partial(read, LAYOUT)``; a test sees that none is left out."""
