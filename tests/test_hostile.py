@@ -66,10 +66,16 @@ def pcd(body: bytes | None = None, **changes: str) -> bytes:
 
 LYING_PCD = {
     "many values per point": pcd(COUNT="100000 1 1 1"),
+    "many values per point, compressed": pcd(COUNT="1 1 1 100000", DATA="binary_compressed"),
+    "many values per point, in text": pcd(COUNT="1 100000 1 1", DATA="ascii"),
     "more values than memory": pcd(COUNT="1 1 1 999999999999"),
     "more values than memory, in text": pcd(COUNT="1 1 1 999999999999", DATA="ascii"),
     "no values": pcd(COUNT="1 1 1 0"),
     "a field twice": pcd(FIELDS="x x z y"),
+    "a fifth field twice": pcd(
+        FIELDS="x y z intensity intensity", SIZE="4 4 4 4 4", TYPE="F F F F F", COUNT="1 1 1 1 1", WIDTH="8",
+        POINTS="16",
+    ),
     "more points": pcd(POINTS="21"),
     "fewer points": pcd(POINTS="19"),
     "fewer points everywhere": pcd(POINTS="10", WIDTH="5"),
