@@ -129,8 +129,8 @@ class ObjectBank:
             DataError: if it is not a bank of objects, or damaged.
         """
         path = Path(path)
-        arrays: dict[str, Any] = read_arrays(path, most=MOST_BYTES)
         try:
+            arrays: dict[str, Any] = read_arrays(path, most=MOST_BYTES)
             if str(arrays.pop("format")) != FORMAT:
                 raise ValueError("another format")
             sensor = Sensor.from_dict(parse_json(str(arrays.pop("sensor")), "its sensor"))
