@@ -246,3 +246,30 @@ def test_a_long_plan_starts_at_once() -> None:
     stream = MixedStream(train, batch_size=8, endless=False)
     stream.load_state_dict(train.batches(8).state_dict(12_499_999))
     assert len(list(stream)) == 8
+
+
+class EverySecond:
+    """A library that shares batches among two processes, whoever did so before."""
+
+    def __init__(self, batches: Any) -> None:
+        self.batches = batches
+
+    def __iter__(self) -> Iterator[list[int]]:
+        return islice(self.batches, 0, None, 2)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_batches_that_are_shared_twice_are_noticed_at_the_next_pass(
+    workers: int, caught: list[warnings.WarningMessage]
+) -> None:
+    for ranks, shared in ((2, True), (2, False), (1, True)):
+        train = mixed(39)
+        batches = train.batches(4, rank=0, world_size=ranks)
+        sampler: Any = EverySecond(batches) if shared else batches
+        loader = DataLoader(train, batch_sampler=sampler, num_workers=workers, collate_fn=list)
+        list(loader)
+        train.set_epoch(1)
+        list(loader)
+        expected = ["of 26 samples that rank 0 of 2"] if shared and ranks == 2 else []
+        assert [str(w.message)[:30] for w in caught if "library" in str(w.message)] == expected
+        caught.clear()
