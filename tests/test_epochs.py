@@ -93,6 +93,15 @@ def test_a_hook_at_the_beginning_of_an_epoch(workers: int) -> None:
         assert samples(iterator) == planned(train, 1)
 
 
+def test_a_worker_that_is_slow_to_start_knows_where_its_pass_began() -> None:
+    """It has fetched nothing yet, but the others may have."""
+    train = mixed()
+    loader = DataLoader(train, 4, num_workers=1, collate_fn=list, worker_init_fn=lambda _: time.sleep(0.5))
+    iterator = iter(loader)
+    train.set_epoch(1)
+    refused(iterator, LATE)
+
+
 @pytest.mark.parametrize("persistent", [False, True])
 @pytest.mark.parametrize("workers", [0, 2])
 def test_batches_keep_the_epoch_in_which_iterating_began(workers: int, persistent: bool) -> None:
