@@ -93,6 +93,15 @@ def test_a_hook_at_the_beginning_of_an_epoch(workers: int) -> None:
         assert samples(iterator) == planned(train, 1)
 
 
+def test_a_worker_that_is_slow_to_start_knows_where_its_pass_began() -> None:
+    """It has fetched nothing yet, but the others may have."""
+    train = mixed()
+    loader = DataLoader(train, 4, num_workers=1, collate_fn=list, worker_init_fn=lambda _: time.sleep(0.5))
+    iterator = iter(loader)
+    train.set_epoch(1)
+    refused(iterator, LATE)
+
+
 @pytest.mark.parametrize("persistent", [False, True])
 @pytest.mark.parametrize("workers", [0, 2])
 def test_batches_keep_the_epoch_in_which_iterating_began(workers: int, persistent: bool) -> None:
@@ -246,3 +255,30 @@ def test_a_long_plan_starts_at_once() -> None:
     stream = MixedStream(train, batch_size=8, endless=False)
     stream.load_state_dict(train.batches(8).state_dict(12_499_999))
     assert len(list(stream)) == 8
+
+
+class EverySecond:
+    """A library that shares batches among two processes, whoever did so before."""
+
+    def __init__(self, batches: Any) -> None:
+        self.batches = batches
+
+    def __iter__(self) -> Iterator[list[int]]:
+        return islice(self.batches, 0, None, 2)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_batches_that_are_shared_twice_are_noticed_at_the_next_pass(
+    workers: int, caught: list[warnings.WarningMessage]
+) -> None:
+    for ranks, shared in ((2, True), (2, False), (1, True)):
+        train = mixed(39)
+        batches = train.batches(4, rank=0, world_size=ranks)
+        sampler: Any = EverySecond(batches) if shared else batches
+        loader = DataLoader(train, batch_sampler=sampler, num_workers=workers, collate_fn=list)
+        list(loader)
+        train.set_epoch(1)
+        list(loader)
+        expected = ["of 26 samples that rank 0 of 2"] if shared and ranks == 2 else []
+        assert [str(w.message)[:30] for w in caught if "library" in str(w.message)] == expected
+        caught.clear()

@@ -235,6 +235,7 @@ def test_schedules(ratio: object, expected: list[float]) -> None:
     for epoch in range(5):
         assert running_counts(mixed, epoch) == before
         before = tuple(np.add(before, quotas(mixed, epoch)).tolist())  # type: ignore[assignment]
+        assert before[1] == ceil(sum(exact_synthetic(mixed, earlier) for earlier in range(epoch + 1)))
 
 
 def test_a_late_epoch_costs_no_more_than_the_first() -> None:

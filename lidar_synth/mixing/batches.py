@@ -13,7 +13,7 @@ from typing import Any, Protocol, overload
 from torch.utils.data import Sampler
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.mixing.epochs import REPEATED, Position
+from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, Position
 from lidar_synth.mixing.quotas import Mixture
 from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state, make_state, place
 
@@ -29,6 +29,9 @@ class Epochs(Protocol):
 
     @property
     def epoch(self) -> int: ...
+
+    @property
+    def fetched(self) -> int: ...
 
     def set_epoch(self, epoch: int) -> None: ...
 
@@ -143,6 +146,7 @@ class MixedBatches(Sampler[list[int]]):
         self._drawn = (0, 0)  # epoch, and batches taken of it
         self._passed: tuple[int, int] | None = None  # epoch and position where the latest whole pass began
         self._warned = False
+        self._fetched = (0, 0)  # by the dataset before the latest whole pass, and samples of that pass
 
     def __len__(self) -> int:
         """Batches that iterating gives."""
@@ -157,6 +161,11 @@ class MixedBatches(Sampler[list[int]]):
         if self._passed == (epoch, steps.start) and not self._warned:
             self._warned = True
             warnings.warn(REPEATED.format(epoch), stacklevel=2)
+        before, given = self._fetched
+        fetched = self.dataset.fetched - before
+        if self.world_size > 1 and 0 < fetched < given * 2 / 3:
+            warnings.warn(SHARED_TWICE.format(given, self.rank, self.world_size, fetched), stacklevel=2)
+        self._fetched = (0, 0)
         return self._batches(epoch, steps)
 
     def set_epoch(self, epoch: int) -> None:
@@ -198,17 +207,17 @@ class MixedBatches(Sampler[list[int]]):
         go_to(self.dataset, *self._start)
 
     def _batches(self, epoch: int, steps: CutSteps) -> Iterator[list[int]]:
-        told, number = 0, 0
+        told, number, given, before = 0, 0, 0, self.dataset.fetched
         for done, step in enumerate(steps):
             if done * steps.size >= told:
                 rest = (rank_share(steps[i], self.rank, self.world_size) for i in range(done, len(steps)))
                 self.dataset.expect(epoch, chain.from_iterable(rest))
                 told = done * steps.size + AHEAD * self.world_size // 2
             if share := rank_share(step, self.rank, self.world_size):
-                number += 1
+                number, given = number + 1, given + len(share)
                 self._drawn = (epoch, number)
                 yield [Position(position, epoch) for position in share]
-        self._passed = (epoch, steps.start)
+        self._passed, self._fetched = (epoch, steps.start), (before, given)
 
     def _check(self) -> None:
         if self._by_default:

@@ -23,6 +23,13 @@ REPEATED = (
     "epoch {} begins once more: the same scans in the same order as before. Call set_epoch(epoch) before each pass."
 )
 
+SHARED_TWICE = (
+    "of {} samples that rank {} of {} was to train on, {} were fetched. Does another library share the batches among "
+    "processes once more? Then give batches(...) rank=0, world_size=1."
+)
+
+_COUNTERS = 256  # each worker has one of its own, so that none of them has to wait
+
 
 class Position(int):
     """A position that knows its epoch; everywhere else a plain integer.
@@ -59,12 +66,18 @@ class CurrentEpoch:
 
     def __init__(self) -> None:
         self._shared = shared_integers(0, -1, 0)  # the epoch; that of the latest pass; whether a warning was given
+        self._fetched = shared_integers(*[0] * _COUNTERS)  # positions that were fetched, by worker
         self._own = 0  # as this process set it, or as it was when this process started
         self._process = os.getpid()
         self._passes: WeakKeyDictionary[Any, int] = WeakKeyDictionary()  # by what fetches: the epoch
 
     def __int__(self) -> int:
         return int(self._shared[0])
+
+    @property
+    def fetched(self) -> int:
+        """How many positions with an epoch were fetched so far, by all workers."""
+        return int(self._fetched.sum())
 
     @property
     def at_start(self) -> int:
@@ -82,6 +95,8 @@ class CurrentEpoch:
             ConfigError: where another epoch was set since the pass of the DataLoader that fetches it began.
         """
         if isinstance(index, Position):
+            worker = get_worker_info()
+            self._fetched[worker.id % _COUNTERS if worker else 0] += 1
             return index.epoch
         epoch, fetcher = int(self), _running_fetcher()
         if fetcher is None:  # nobody's pass

@@ -186,6 +186,11 @@ class MixedScans(Dataset[Any]):
         """The epoch that indexing refers to."""
         return int(self.current)
 
+    @property
+    def fetched(self) -> int:
+        """How many samples of ``batches`` were fetched so far, by this process and its workers."""
+        return self.current.fetched
+
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch, before a ``DataLoader`` begins to iterate; its workers are told, persistent ones too.
 
