@@ -117,6 +117,7 @@ def test_rows_at_a_time_change_nothing(many: Planted, monkeypatch: pytest.Monkey
     expected = find_alike(many.signatures, progress=False)
     for rows in (97, 5000):
         monkeypatch.setattr(neighbours, "ROWS", rows)
+        monkeypatch.setattr(neighbours, "PAIRS", 300 * rows)
         for one, other in zip(expected, find_alike(many.signatures, progress=False), strict=True):
             assert np.array_equal(one, other)
 

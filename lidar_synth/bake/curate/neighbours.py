@@ -40,6 +40,9 @@ CANDIDATES = 6
 ROWS = 1024
 """Signatures taken at a time."""
 
+PAIRS = 1 << 19
+"""Pairs of sketches compared at a time: 4 MB of keys."""
+
 _STEPS = 4095  # of an entry of a signature, which lies in [0, 1]: sums of 1024 of them are exact in float32
 _SAMPLE = 65_536  # signatures that centre and scale of the sketches are taken from
 _SPREAD = 4  # standard deviations that a byte holds
@@ -83,8 +86,9 @@ def find_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[n
     return likeness, twin
 
 
-def _parts(count: int) -> Iterator[slice]:
-    return (slice(start, min(start + ROWS, count)) for start in range(0, count, ROWS))
+def _parts(count: int, size: int | None = None) -> Iterator[slice]:
+    size = size or ROWS
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
 def _first_copies(signatures: Signatures) -> NDArray[np.int64]:
@@ -127,7 +131,7 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32
     cells = min(count, int(CELLS_PER_ROOT * count**0.5) + 1)
     centres = sketches[np.sort(keyed_rng(count, cells).choice(count, cells, replace=False))]
     probes = np.empty((count, min(PROBES, cells)), np.min_scalar_type(cells))
-    for part in _parts(count):
+    for part in _parts(count, PAIRS // cells + 1):
         keys = _keys(sketches[part], centres, np.arange(cells))
         probes[part] = np.sort(np.partition(keys, probes.shape[1] - 1)[:, : probes.shape[1]]) % _NUMBERS
     order, bounds = _by_cell(probes[:, 0], cells)
@@ -136,8 +140,8 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32
     for probe in probes.T:
         queries, bounds = _by_cell(probe, cells)
         for cell, (a, b) in enumerate(pairwise(bounds)):
-            for start in range(a, b, ROWS):
-                _compare(sketches, queries[start : min(start + ROWS, b)], members[cell], best)
+            for part in _parts(b - a, PAIRS // (len(members[cell]) + 1) + 1):
+                _compare(sketches, queries[a:b][part], members[cell], best)
         steps.update()
     best[best == _NONE] = -1
     np.fmod(best, _NUMBERS, out=best)
