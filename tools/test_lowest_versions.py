@@ -22,7 +22,8 @@ ROOT = Path(__file__).parent.parent
 KEPT = ("torch", "open3d")
 """Dependencies whose version stays that of the environment that runs this."""
 
-TESTS = ("test_formats.py", "test_bad_input.py", "test_bank.py", "test_bank_hostile.py", "test_convert.py",
+TESTS = ("test_formats.py", "test_bad_input.py", "test_bank.py", "test_bank_hostile.py",
+         "test_bank_url.py", "test_convert.py",
          "test_paste.py", "test_curate.py", "test_verify.py", "test_projection.py", "test_sensor.py",
          "test_config.py", "test_checkpoint.py", "test_files.py")  # fmt: skip
 
@@ -52,7 +53,7 @@ def main() -> None:
     """Installs, tests, prints the table; the exit status is that of pytest."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--venv", type=Path, default=ROOT / ".venv-lowest", help="the environment's folder, made anew")
-    parser.add_argument("tests", nargs="*", help="files or options for pytest instead of those of files and banks")
+    parser.add_argument("tests", nargs="*", help="test files, instead of those of files and banks")
     options = parser.parse_args()
     wanted = {name: text for name, text in lowest().items() if name not in KEPT}
     python = install(options.venv.absolute(), wanted)

@@ -22,7 +22,7 @@ T = TypeVar("T")
 Arrays = Mapping[str, tuple[tuple[int, int], np.dtype[Any]]]
 """Shape and type of each array of one scan, as ``Encoding.arrays`` gives them."""
 
-NUMBERS = {"seed": np.dtype("<u8"), "index": np.dtype("<u8"), "crc": np.dtype("<u4")}
+NUMBERS: dict[str, np.dtype[Any]] = {"seed": np.dtype("<u8"), "index": np.dtype("<u8"), "crc": np.dtype("<u4")}
 """Datasets with one number a scan."""
 
 CONDITION = "condition"

@@ -111,7 +111,7 @@ class ShardReader:
                 numbers = [int(attributes.pop(key, np.uint64(0))) for key in ("seed", "first", "scans")]
             found = Facts.from_attributes(attributes, self.name)
             self._check_facts(found, facts)
-            held = self._checked_entry(*numbers, entry)
+            held = self._checked_entry(numbers, entry)
             filters(found.compression)
             with self._reading("its datasets"):
                 layout = read_layout(file, self._file, held.scans, found.encoding.arrays(), found.compression)
@@ -132,7 +132,8 @@ class ShardReader:
             wrong = ", ".join(key for key in others if mine[key] != others[key])
             raise DataError(f"{self.name}: {wrong} are not those of the bank's index", "a shard of it", REPAIR)
 
-    def _checked_entry(self, seed: int, first: int, scans: int, entry: Entry | None) -> Entry:
+    def _checked_entry(self, numbers: list[int], entry: Entry | None) -> Entry:
+        seed, first, scans = numbers
         found = Entry(Path(self.name).name, seed, first, scans)
         entry = found if entry is None else entry
         if (seed, first, scans) != (entry.seed, entry.first, entry.scans):
@@ -164,7 +165,7 @@ class ShardReader:
             if not size or offset + size > self._file.size:
                 raise ValueError(f"there is no {name}" if not size else f"its {name} lies outside the file")
             places[name] = (offset, offset + size)
-        packed = {}
+        packed: dict[str, bytes] = {}
         for names in _side_by_side(places):
             start = min(places[name][0] for name in names)
             content = self._file.read(start, max(places[name][1] for name in names) - start)
