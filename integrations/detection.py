@@ -13,9 +13,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA
 from lidar_synth.geometry.scan import Boxes, Scan

@@ -12,7 +12,7 @@ from lidar_synth.integrations.mmdet3d_lists import write_plane
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.formats import KITTIObject
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA, KITTIObjectWriter

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
 from lidar_synth.bank import Bank, is_bank
-from lidar_synth.classes import IGNORE, NAMES, SEMANTIC_KITTI
+from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import read_text
+from lidar_synth.files.disk import read_text
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.generator import load_generator
 from lidar_synth.geometry.scan import Scan

@@ -23,9 +23,9 @@ from lidar_synth.integrations.mixture import class_ids, id_table, mix, open_synt
 from lidar_synth.integrations.mmdet3d_lists import CLASSES
 from numpy.typing import NDArray
 
-from lidar_synth.classes import SEMANTIC_KITTI
+from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import read_text, write_file
+from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry.scan import Boxes, Scan

@@ -9,7 +9,7 @@ import numpy as np
 from lidar_synth.integrations.detection import difficulty, ground_plane, in_view, plane_in_camera
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import read_text, write_file
+from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats import KITTIObject, SemanticKITTI
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_labels import boxes_to_camera

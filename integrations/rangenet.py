@@ -25,9 +25,9 @@ from lidar_synth.integrations.mixture import (
     refuse_unlabelled,
 )
 
-from lidar_synth.classes import SEMANTIC_KITTI
+from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry.scan import Scan
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
-from lidar_synth.classes import IGNORE
-from lidar_synth.files import sha256
+from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor, load_sensor

@@ -69,7 +69,7 @@ def random_scan(sensor: Sensor, count: int = 3000, seed: int = 0) -> Scan:
     raw = rng.choice([0, 10, 40, 50, 70, 80, 252], count).astype(np.uint32) | (
         rng.integers(0, 50, count).astype(np.uint32) << 16
     )
-    from lidar_synth.classes import SEMANTIC_KITTI
+    from lidar_synth.datasets.classes import SEMANTIC_KITTI
 
     return Scan(
         points=(points * distance[:, None]).astype(np.float32),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from lidar_synth.classes import TRAIN_ID
+from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.geometry.sensor import Sensor
 
 SMALL = Sensor("small", columns=64, rows=16, fov_up=10.0, fov_down=-30.0, range_min=1.0, range_max=80.0)

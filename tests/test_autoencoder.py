@@ -9,7 +9,7 @@ from conftest import random_scan
 from torch import Tensor
 from torch.distributions import Laplace
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow.path import METRICS
 from lidar_synth.generate.codec import make_codec

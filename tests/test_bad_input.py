@@ -13,7 +13,7 @@ import pytest
 from layouts import MAKERS, nuscenes_arrays, some_scan, write_all, write_nuscenes, write_tars
 
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.formats import READERS, WRITERS, NuScenes, RangeImages, SemanticKITTI, open_scans
 from lidar_synth.formats.points import read_points
 from lidar_synth.geometry.scan import Boxes

@@ -27,7 +27,7 @@ from lidar_synth.bake import ENGINES, Plan, Resources, Share, bake, bake_shard
 from lidar_synth.bake.folder import SETTINGS, prepare, write_bank_files
 from lidar_synth.bank import INDEX, Entry, Index
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files import sha256
+from lidar_synth.files.disk import sha256
 from lidar_synth.formats.writer import NOTES
 
 

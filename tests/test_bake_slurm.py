@@ -15,7 +15,7 @@ from lidar_synth.bake import ENGINES, Plan, Resources, bake
 from lidar_synth.bake.folder import SETTINGS, prepare
 from lidar_synth.bake.slurm import LOGS, Part
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 
 submitit = pytest.importorskip("submitit", reason="submitit is not installed: pip install 'lidar_synth[slurm]'")
 cloudpickle = pytest.importorskip("cloudpickle")  # comes with it

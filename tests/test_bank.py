@@ -24,9 +24,9 @@ from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import FORMAT, INDEX, Bank, Encoding, Entry, Index, ShardReader, ShardWriter
 from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
 from lidar_synth.bank.encoding import LEVELS, TYPES
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
-from lidar_synth.files import sha256
+from lidar_synth.files.disk import sha256
 from lidar_synth.formats import WRITERS, BankScans, open_scans
 from lidar_synth.formats.convert import convert
 from lidar_synth.geometry.projection import project, unproject

@@ -12,7 +12,7 @@ import torch
 from mixtures import Endless
 from torch.utils.data import default_collate
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import POINT_FIELDS, Scan
 from lidar_synth.geometry.sensor import presets

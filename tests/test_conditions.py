@@ -14,7 +14,7 @@ from conftest import random_scan
 from PIL import Image
 from torch import Tensor, nn
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.flow.path import guided
 from lidar_synth.generate.conditions import CONDITIONS, batch_of, blank, one_view

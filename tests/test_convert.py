@@ -14,8 +14,8 @@ from banks import some_image, write_bank
 from layouts import MAKERS, WRITTEN_AS, some_scan, write_all
 from typer.testing import CliRunner
 
-from lidar_synth.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.cli.convert import convert as command
+from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import READERS, WRITERS, open_scans
 from lidar_synth.formats.convert import SETTINGS, Report, convert, reproject

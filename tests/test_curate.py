@@ -24,7 +24,7 @@ from lidar_synth.bake.edit import drop, head, merge, split
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import verify
 from lidar_synth.bank import INDEX, Bank, Entry, Index
-from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage

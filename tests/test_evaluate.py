@@ -13,13 +13,13 @@ from conftest import random_scan
 from typer.testing import CliRunner
 
 from lidar_synth.cli import app
+from lidar_synth.datasets.recordings import NOTE, frames_of
 from lidar_synth.errors import ConfigError
 from lidar_synth.evaluate import PROTOCOLS
 from lidar_synth.evaluate.leakage import seen_by
 from lidar_synth.formats import WRITERS
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.geometry.sensor import Sensor, presets
-from lidar_synth.recordings import NOTE, frames_of
 from lidar_synth.town.export import SETTINGS
 
 

@@ -15,7 +15,7 @@ from lidar_synth.bake import Job, bake, make_plan
 from lidar_synth.town import Town, export_town
 
 FURTHER = {
-    "lidar_synth.classes": ("Taxonomy",),
+    "lidar_synth.datasets.classes": ("Taxonomy",),
     "lidar_synth.flow.solvers": ("solve",),
     "lidar_synth.geometry.normalize": ("Normalisation",),
     "lidar_synth.geometry.projection": ("fill_points", "locate", "project_batch"),

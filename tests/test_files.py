@@ -8,7 +8,7 @@ import pytest
 from banks import add_stray, some_image
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import write_arrays
+from lidar_synth.files.disk import write_arrays
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.npz import read_arrays, write_range_image, write_scan
 from lidar_synth.geometry.projection import unproject

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from layouts import MAKERS, WRITTEN_AS, a_pose, some_boxes, some_camera, some_scan, write_all
 
-from lidar_synth.classes import IGNORE, SEMANTIC_KITTI
-from lidar_synth.classes import KITTI360 as KITTI360_CLASSES
+from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
+from lidar_synth.datasets.classes import KITTI360 as KITTI360_CLASSES
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats import KITTI360, READERS, WRITERS, KITTIObject, SemanticKITTI, open_scans
 from lidar_synth.formats.cloud import STORED
@@ -519,7 +519,7 @@ def test_kitti_tracklets_stand_on_their_floor(tmp_path: Path) -> None:
 def test_nuscenes_labels_go_with_their_points(tmp_path: Path) -> None:
     from layouts import nuscenes_arrays
 
-    from lidar_synth.classes import NUSCENES
+    from lidar_synth.datasets.classes import NUSCENES
 
     MAKERS["nuscenes"](tmp_path)
     for i, scan in enumerate(open_scans(tmp_path)):

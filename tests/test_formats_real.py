@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, KITTIRaw, NuScenes, SemanticKITTI, open_scans
 from lidar_synth.formats.kitti360 import SPLITS

@@ -16,7 +16,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import lidar_synth.generate.generator as module
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.flow.solvers import solve, uniform_grid
 from lidar_synth.formats import WRITERS, open_scans

@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Part
 from lidar_synth.generate.importers.lidm import codec_part, convert, unet_part
 from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET

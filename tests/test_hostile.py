@@ -19,12 +19,12 @@ from layouts import some_scan, write_all, write_nuscenes, write_tars
 from limits import in_limits, needs_limits
 
 from lidar_synth.errors import ConfigError, DataError, LidarSynthError
+from lidar_synth.files.parsing import parse_json, parse_npy, parse_yaml, read_arrays, read_picture
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.formats.convert import SETTINGS, convert
 from lidar_synth.formats.pcd import lzf
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.labels.bank import ObjectBank
-from lidar_synth.parsing import parse_json, parse_npy, parse_yaml, read_arrays, read_picture
 from lidar_synth.train.config import TrainConfig, load_config
 
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -39,7 +39,7 @@ from mixtures import Endless, Scans, as_is
 from streets import CAMERA, kitti, semantic_kitti, street, synthetic
 from torch.utils.data import DataLoader, Dataset
 
-from lidar_synth.classes import IGNORE, SEMANTIC_KITTI
+from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.formats import KITTIObject, open_scans
 from lidar_synth.geometry.scan import Scan

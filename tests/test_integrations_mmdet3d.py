@@ -36,7 +36,7 @@ from mmengine.registry import init_default_scope
 from streets import CAMERA, held, kitti, semantic_kitti, street, synthetic
 from torch.utils.data import DataLoader
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.scan import Boxes, Scan

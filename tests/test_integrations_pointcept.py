@@ -34,7 +34,7 @@ from pointcept.datasets.utils import point_collate_fn
 from pointcept.engines.hooks.builder import HOOKS
 from pointcept.utils.config import Config
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import open_scans
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from worlds import CAR, ROAD, SENSOR, car, cast, wall
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import KITTI360, KITTIObject, SemanticKITTI
 from lidar_synth.geometry.projection import locate, project, unproject

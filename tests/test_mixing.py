@@ -17,7 +17,7 @@ from test_generator import SENSOR as GENERATED_SENSOR
 from test_generator import write
 from torch.utils.data import DataLoader
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import KITTI360, SemanticKITTI
 from lidar_synth.generate.generator import Generator, load_generator

@@ -8,7 +8,7 @@ from conftest import random_scan
 from hypothesis import given
 from hypothesis.extra import numpy as hnp
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.normalize import (
     CHANNELS,

@@ -11,7 +11,7 @@ from hypothesis import given
 from pasting import assert_nothing_shares_a_ray
 from worlds import CAR, HEIGHT, car, cast
 
-from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.formats import KITTIObject, SemanticKITTI
 from lidar_synth.geometry.scan import Boxes, Scan

@@ -10,7 +10,7 @@ from conftest import random_scan
 from hypothesis import given, settings
 from hypothesis.extra import numpy as hnp
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import (
     fill_points,

@@ -6,10 +6,19 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
+from lidar_synth.datasets.recordings import (
+    KITTI,
+    KITTI360,
+    KITTI360_SPLITS,
+    ODOMETRY,
+    PLACES,
+    Recordings,
+    frames_of,
+    whole,
+)
 from lidar_synth.errors import DataError
 from lidar_synth.formats import semantic_kitti
 from lidar_synth.generate.importers import lidm
-from lidar_synth.recordings import KITTI, KITTI360, KITTI360_SPLITS, ODOMETRY, PLACES, Recordings, frames_of, whole
 
 Held = dict[str, set[int] | None]
 DRIVES = st.dictionaries(

@@ -8,7 +8,7 @@ import pytest
 from conftest import random_scan
 from hypothesis import given
 
-from lidar_synth.classes import COLOURS, IGNORE, KITTI360, NAMES, NUSCENES, SEMANTIC_KITTI, Taxonomy
+from lidar_synth.datasets.classes import COLOURS, IGNORE, KITTI360, NAMES, NUSCENES, SEMANTIC_KITTI, Taxonomy
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError, LidarSynthError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import presets

@@ -9,7 +9,7 @@ import pytest
 import torch
 from conftest import random_scan
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.evaluate.segmentation import Images, Judge, class_ious, confusion, load_judge, mean_iou
 from lidar_synth.geometry.projection import project

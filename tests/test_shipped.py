@@ -15,8 +15,8 @@ from torch.utils.data import DataLoader
 from lidar_synth import MixedScans, RollingBank, SemanticKITTI, Source, Town, load_generator
 from lidar_synth.bank import Bank
 from lidar_synth.bank.encoding import Encoding
-from lidar_synth.classes import IGNORE
 from lidar_synth.cli.bake import bake
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.generator import Generator, shipped_models
 from lidar_synth.geometry.projection import project

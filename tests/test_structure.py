@@ -6,8 +6,8 @@ from pathlib import Path
 
 import lidar_synth
 
-ORDER = """errors files classes noise geometry models flow generate labels bank formats mixing town evaluate bake
-viz train cli""".split()
+ORDER = """errors files datasets noise geometry models flow generate labels bank formats mixing town evaluate bake viz
+train cli""".split()
 """A module may import only from those before it."""
 
 PACKAGE = Path(lidar_synth.__file__).parent

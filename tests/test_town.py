@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lidar_synth.classes import IGNORE, NAMES, SEMANTIC_KITTI, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI, TRAIN_ID
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.geometry.projection import project, ring_numbers
 from lidar_synth.geometry.scan import SYNTHETIC, Scan

@@ -25,7 +25,7 @@ from lidar_synth.bake.verify import AGREE, regenerate, verify
 from lidar_synth.bank import INDEX, Bank, Index
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files import sha256
+from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.scan import RangeImage
 
 

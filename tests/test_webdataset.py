@@ -10,7 +10,7 @@ import pytest
 from banks import some_image, write_bank
 from layouts import some_scan, write_tars
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WebDataset, open_scans
 from lidar_synth.formats.convert import SETTINGS, Report, convert

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, presets

@@ -16,7 +16,7 @@ import torch
 from model_card import open_codec, town
 from tqdm import tqdm
 
-from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.train import reconstruct

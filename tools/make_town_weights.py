@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import torch
 
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.generate.checkpoint import load_checkpoint, read_header, save_checkpoint
 from lidar_synth.town import Town, export_town
 from lidar_synth.train.config import DistillConfig, TrainConfig, load_config

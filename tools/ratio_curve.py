@@ -18,7 +18,7 @@ from train_segmenter import fit, town
 
 from lidar_synth import MixedScans, Scan, Source, load_generator, open_scans
 from lidar_synth.evaluate.segmentation import class_ious, mean_iou
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 
 RATIOS = (0.0, 0.1, 0.25, 0.5)
 BATCH = 4

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from lidar_synth import MixedScans, Scan, Source, Town, load_generator, open_scans
-from lidar_synth.classes import NAMES
+from lidar_synth.datasets.classes import NAMES
 from lidar_synth.evaluate.segmentation import Judge, class_ious, confusion, mean_iou
 from lidar_synth.models.segmenter import RangeSegmenter
 from lidar_synth.train.segmentation import endless_batches, train_segmenter

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files import part_of, sha256
+from lidar_synth.files.disk import part_of, sha256
 
 
 def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:

@@ -24,7 +24,7 @@ from lidar_synth.bake.lock import alone, shared
 from lidar_synth.bank import INDEX, Entry, Index
 from lidar_synth.bank.card import card_files
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files import read_file, sha256, write_file
+from lidar_synth.files.disk import read_file, sha256, write_file
 from lidar_synth.formats.writer import NOTES, claim
 
 SETTINGS = ".bake.json"

@@ -14,7 +14,7 @@ from lidar_synth.bake.shard import load_checked, write_shard
 from lidar_synth.bake.verify import check_scans, check_shard, check_side_files, job_of, read_index
 from lidar_synth.bank import INDEX, Entry, Facts, Index, ShardReader
 from lidar_synth.errors import DataError, FileError, LidarSynthError
-from lidar_synth.files import part_of, sha256
+from lidar_synth.files.disk import part_of, sha256
 
 
 def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[str, str]:

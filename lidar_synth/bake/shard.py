@@ -14,7 +14,7 @@ from lidar_synth.bake.folder import at_work, finished, publish
 from lidar_synth.bake.job import DTYPES, Job, Plan
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files import part_of
+from lidar_synth.files.disk import part_of
 from lidar_synth.formats import ScanFiles
 from lidar_synth.generate.generator import BATCH, Generator, load_generator
 from lidar_synth.geometry.scan import RangeImage

@@ -13,7 +13,7 @@ from lidar_synth.bake.shard import generate, load_checked, one_computer
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.card import CARD, CROISSANT
 from lidar_synth.errors import DataError, FileError
-from lidar_synth.files import read_file, sha256
+from lidar_synth.files.disk import read_file, sha256
 from lidar_synth.geometry.scan import RangeImage
 
 AGREE = 0.9

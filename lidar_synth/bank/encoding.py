@@ -21,7 +21,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor

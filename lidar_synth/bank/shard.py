@@ -31,7 +31,7 @@ from lidar_synth.bank.index import FORMAT, REPAIR, Entry, Facts
 from lidar_synth.bank.layout import Layout, read_attributes, read_layout, with_hdf5
 from lidar_synth.bank.storage import LocalFile, Storage
 from lidar_synth.errors import DataError, LidarSynthError
-from lidar_synth.files import naming
+from lidar_synth.files.disk import naming
 
 _GAP = 16 << 10  # bytes between two chunks that are read along rather than asked for separately
 

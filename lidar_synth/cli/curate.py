@@ -146,7 +146,7 @@ def _table(bank: "Bank", scores: "Scores", shown: "NDArray[np.int64]", dropped: 
 
 def _plot(path: Path, scores: "Scores", dropped: "NDArray[np.bool_]", bank: Path) -> None:
     from lidar_synth.bake.curate import MEANINGS
-    from lidar_synth.files import write_file
+    from lidar_synth.files.disk import write_file
     from lidar_synth.viz import histograms
 
     title = f"{bank.resolve().name}: {len(dropped)} scans, {dropped.sum()} match the rules (orange)"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from lidar_synth.recordings import Recordings
+    from lidar_synth.datasets.recordings import Recordings
 
 
 def evaluate(

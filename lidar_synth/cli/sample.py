@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_synth.recordings import NOTE
+from lidar_synth.datasets.recordings import NOTE
 
 
 def sample(

@@ -12,12 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.bank import Bank, is_bank
-from lidar_synth.files import read_text
-from lidar_synth.formats import BankScans
-from lidar_synth.formats.semantic_kitti import SPLITS as SEMANTIC_KITTI_SPLITS
-from lidar_synth.formats.source import ScanFiles
-from lidar_synth.generate.importers import lidm
-from lidar_synth.recordings import (
+from lidar_synth.datasets.recordings import (
     FILES,
     KITTI,
     KITTI360,
@@ -30,6 +25,11 @@ from lidar_synth.recordings import (
     frames_of,
     whole,
 )
+from lidar_synth.files.disk import read_text
+from lidar_synth.formats import BankScans
+from lidar_synth.formats.semantic_kitti import SPLITS as SEMANTIC_KITTI_SPLITS
+from lidar_synth.formats.source import ScanFiles
+from lidar_synth.generate.importers import lidm
 from lidar_synth.town.export import SETTINGS
 
 

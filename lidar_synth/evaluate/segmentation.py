@@ -18,9 +18,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import read_file, write_file
+from lidar_synth.files.disk import read_file, write_file
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor

@@ -11,6 +11,7 @@ from typing import Any
 
 from lidar_synth.bank import is_bank, is_url
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.bank import BankScans
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.folder import SUFFIXES, Folder, KITTIWriter, NPZWriter, PCDWriter, PLYWriter
@@ -26,7 +27,6 @@ from lidar_synth.formats.webdataset import SUFFIX as TAR
 from lidar_synth.formats.webdataset import WebDataset, WebDatasetWriter
 from lidar_synth.formats.writer import Writer
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.parsing import read_arrays
 
 __all__ = [
     "KITTI360",

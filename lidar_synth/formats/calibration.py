@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import LARGEST_IMAGE
+from lidar_synth.files.disk import LARGEST_IMAGE
 
 Matrix = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT
+from lidar_synth.files.disk import SKIP_HINT
 from lidar_synth.geometry.scan import Scan
 
 STORED = {"label": "<u1", "raw_label": "<i4", "instance": "<i4", "ring": "<i4", "confidence": "<f4"}

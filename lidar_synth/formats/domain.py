@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.geometry.scan import REAL, SYNTHETIC
 
 MARK = "synthetic.json"

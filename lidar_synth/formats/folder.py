@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import SEMANTIC_KITTI
+from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.npz import check_numbers, decode_scan, told_sensor, write_scan
 from lidar_synth.formats.pcd import read_pcd, write_pcd
@@ -27,7 +28,6 @@ from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import FileWriter, Picture
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.parsing import read_arrays
 
 SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 

@@ -27,9 +27,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import KITTI360 as CLASSES
+from lidar_synth.datasets.classes import KITTI360 as CLASSES
+from lidar_synth.datasets.recordings import KITTI360_SPLITS
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import (
+from lidar_synth.files.disk import (
     list_files,
     read_file,
 )
@@ -42,7 +43,6 @@ from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.recordings import KITTI360_SPLITS
 
 SPLITS = KITTI360_SPLITS
 """Drives of each split, by the work that introduced it; None = all that are there. They leak into each other: what

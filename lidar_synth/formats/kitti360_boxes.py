@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import numbers, unreadable, write_file
+from lidar_synth.files.disk import numbers, unreadable, write_file
 from lidar_synth.formats.points import FARTHEST
 from lidar_synth.geometry.scan import Boxes
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import numbers, read_matrix, read_named_matrices, write_file, write_named_matrices
+from lidar_synth.files.disk import numbers, read_matrix, read_named_matrices, write_file, write_named_matrices
 from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneous, ideal_camera, read_image_size
 
 CAMERA = ideal_camera(552.554261, (1408, 376))

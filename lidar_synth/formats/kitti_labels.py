@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import read_text, write_file
+from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.points import FARTHEST
 from lidar_synth.geometry.scan import Boxes

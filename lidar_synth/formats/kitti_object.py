@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import (
+from lidar_synth.files.disk import (
     list_files,
     naming,
     png_size,

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import list_files, naming, png_size, read_file, read_named_matrices
+from lidar_synth.files.disk import list_files, naming, png_size, read_file, read_named_matrices
 from lidar_synth.formats.calibration import Calibration, homogeneous, read_image_size
 from lidar_synth.formats.points import FARTHEST, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles

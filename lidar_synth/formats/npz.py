@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError, LidarSynthError
-from lidar_synth.files import SKIP_HINT, write_arrays
+from lidar_synth.files.disk import SKIP_HINT, write_arrays
+from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.parsing import parse_json, read_arrays
 
 FACTS = ("sensor", "id", "domain", "pose")
 """Names in a file that are no channels of a range image; so are those that begin with ``BOX``."""

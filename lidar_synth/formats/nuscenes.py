@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import NUSCENES
+from lidar_synth.datasets.classes import NUSCENES
 from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT, inside, list_files, read_text, read_values
+from lidar_synth.files.disk import SKIP_HINT, inside, list_files, read_text, read_values
+from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.point_labels import mismatch
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.parsing import parse_json
 
 SUFFIX = ".pcd.bin"
 INTENSITY_MAX = 255.0

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT, read_file, write_file
+from lidar_synth.files.disk import SKIP_HINT, read_file, write_file
 from lidar_synth.formats.cloud import Field, check_fields, check_size, from_records, from_text, to_arrays, to_records
 from lidar_synth.geometry.scan import Scan
 

@@ -12,7 +12,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT, read_file, write_file
+from lidar_synth.files.disk import SKIP_HINT, read_file, write_file
 from lidar_synth.formats.cloud import (
     Field,
     check_fields,

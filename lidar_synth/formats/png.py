@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import COLOURS, IGNORE
+from lidar_synth.datasets.classes import COLOURS, IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT, list_files, write_file
+from lidar_synth.files.disk import SKIP_HINT, list_files, write_file
+from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
@@ -29,7 +30,6 @@ from lidar_synth.formats.writer import Picture, Writer
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.parsing import parse_json, read_picture
 
 STEPS = 65535
 """The largest 16-bit value: ``range_max`` in range, 1 in reflectance."""

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE, Taxonomy
+from lidar_synth.datasets.classes import IGNORE, Taxonomy
 from lidar_synth.errors import DataError
-from lidar_synth.files import read_values, write_file
+from lidar_synth.files.disk import read_values, write_file
 from lidar_synth.geometry.scan import Scan
 
 

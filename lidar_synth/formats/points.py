@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.files import SKIP_HINT, unreadable, write_file
+from lidar_synth.files.disk import SKIP_HINT, unreadable, write_file
 from lidar_synth.formats.calibration import check_rigid
 from lidar_synth.geometry.scan import Scan
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.folder import scan_paths
 from lidar_synth.formats.npz import check_numbers, decode_range_image, range_image, write_range_image
@@ -27,7 +28,6 @@ from lidar_synth.formats.writer import FileWriter, Picture
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.parsing import read_arrays
 
 SUFFIXES = (".npz", ".npy")
 

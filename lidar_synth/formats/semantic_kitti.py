@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import SEMANTIC_KITTI
+from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import DataError
-from lidar_synth.files import (
+from lidar_synth.files.disk import (
     list_files,
     naming,
     numbers,

@@ -26,9 +26,10 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, shorten
-from lidar_synth.files import SKIP_HINT, list_files, unreadable, write_file
+from lidar_synth.files.disk import SKIP_HINT, list_files, unreadable, write_file
+from lidar_synth.files.parsing import parse_json, parse_npy
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
@@ -36,7 +37,6 @@ from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import NOTES, Picture, Writer, clear_notes
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.parsing import parse_json, parse_npy
 
 SUFFIX = ".tar"
 

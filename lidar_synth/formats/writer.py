@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import inside, list_files, read_file, read_text, refuse_links, write_file
+from lidar_synth.files.disk import inside, list_files, read_file, read_text, refuse_links, write_file
+from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.parsing import parse_json, read_picture
 
 Image = NDArray[np.uint8]
 Picture = Image | Path

@@ -35,10 +35,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from lidar_synth.devices import checked_device
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned
+from lidar_synth.generate.devices import checked_device
 from lidar_synth.geometry.normalize import LABEL_BITS, Normalisation, TensorFormat
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models import assemble

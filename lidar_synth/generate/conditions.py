@@ -20,12 +20,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.parsing import read_picture
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.parsing import read_picture
 
 
 class Condition(Protocol):
@@ -93,7 +93,7 @@ class SemanticMap:
             raise DataError(
                 f"a label map with ids {sorted(set(wrong.tolist()))[:8]}",
                 "train ids 0..18, or 255 = unknown",
-                "SemanticKITTI's file ids become train ids by lidar_synth.classes.SEMANTIC_KITTI.decode.",
+                "SemanticKITTI's file ids become train ids by lidar_synth.datasets.classes.SEMANTIC_KITTI.decode.",
             )
 
 

@@ -15,14 +15,14 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from lidar_synth.classes import IGNORE
-from lidar_synth.devices import checked_device
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow.path import Velocity, guided
 from lidar_synth.flow.solvers import solve, uniform_grid
 from lidar_synth.generate.checkpoint import CODEC, VELOCITY, Header, has_checksum, join, load_checkpoint, read_header
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, blank
+from lidar_synth.generate.devices import checked_device
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan

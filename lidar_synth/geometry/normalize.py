@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor

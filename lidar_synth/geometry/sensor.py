@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, shorten
-from lidar_synth.parsing import parse_yaml, read_yaml
+from lidar_synth.files.parsing import parse_yaml, read_yaml
 
 Rays = Literal["centre", "corner"]
 """Where in its cell a ray points: the centre (a point returns to its own cell) or, as the public code of

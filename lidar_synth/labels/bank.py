@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.errors import DataError
-from lidar_synth.files import write_arrays
+from lidar_synth.files.disk import write_arrays
+from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.geometry.scan import Boxes, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import joined
 from lidar_synth.labels.objects import Object, objects_of
-from lidar_synth.parsing import parse_json, read_arrays
 
 FORMAT = "lidar-synth-objects/1"
 

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import box_frame
 

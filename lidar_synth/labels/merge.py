@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
 from lidar_synth.labels.boxes import joined
 

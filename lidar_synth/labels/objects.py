@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grown, turned, turned_points

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.own import checked_share, trusted

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.scan import Scan

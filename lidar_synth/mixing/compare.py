@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan

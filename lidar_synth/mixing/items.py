@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Scan
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.classes import NAMES
+from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidar_synth.classes import NAMES
+from lidar_synth.datasets.classes import NAMES
 
 ROW_BANDS = 4
 """Bands of rows over which the features are averaged: what is high and what is low stays apart."""

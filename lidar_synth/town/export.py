@@ -9,7 +9,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.formats.convert import in_processes
 from lidar_synth.formats.domain import TOWN
 from lidar_synth.formats.kitti360 import KITTI360Writer

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import SEMANTIC_KITTI
+from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.geometry.scan import SYNTHETIC, Scan

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from lidar_synth.bank.encoding import LEVELS, TYPES, Encoding
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.generate.codec import Codec
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import project

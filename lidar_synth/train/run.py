@@ -22,7 +22,7 @@ import yaml
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.generate.checkpoint import save_checkpoint
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.generator import Generator

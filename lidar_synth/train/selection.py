@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import write_arrays
+from lidar_synth.files.disk import write_arrays
 from lidar_synth.flow.timesteps import Selection
 from lidar_synth.generate.checkpoint import Header
 from lidar_synth.train.config import DistillConfig

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from lidar_synth import __version__
+from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.errors import ConfigError
 from lidar_synth.evaluate.leakage import inherited, recordings_of, town
 from lidar_synth.flow.solvers import uniform_grid
@@ -19,7 +20,6 @@ from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, Pa
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.models import build_network
-from lidar_synth.recordings import Recordings
 from lidar_synth.train.config import Data, Network, Run, TrainConfig
 
 LOOKING = ("hdit", "denoiser", "sight", "autoencoder")

@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.flow.path import METRICS
 from lidar_synth.geometry.normalize import CHANNELS
 from lidar_synth.train.optimizers import OPTIMIZERS

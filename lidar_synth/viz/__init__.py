@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.files import write_file
+from lidar_synth.files.disk import write_file
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.viz.colour import Scale, scales
 from lidar_synth.viz.images import picture

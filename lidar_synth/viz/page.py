@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.parsing import read_picture
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.parsing import read_picture
 from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, known, scales
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Orbit, box_segments, render, ring_segments

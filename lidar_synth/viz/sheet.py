@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lidar_synth.classes import NAMES
+from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, scales

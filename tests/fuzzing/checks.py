@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.formats import Calibration
 from lidar_synth.formats.points import FARTHEST
 from lidar_synth.generate.checkpoint import Checkpoint, Header

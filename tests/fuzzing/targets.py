@@ -16,7 +16,7 @@ from banks import SENSOR, some_image, write_bank
 from layouts import some_camera, some_scan, write_kitti_raw, write_nuscenes
 
 from lidar_synth.bank import ShardReader
-from lidar_synth.files import write_named_matrices
+from lidar_synth.files.disk import write_named_matrices
 from lidar_synth.formats import READERS, WRITERS, layout_of
 from lidar_synth.generate.checkpoint import (
     VELOCITY,

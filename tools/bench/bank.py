@@ -29,7 +29,7 @@ from tqdm import tqdm
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Encoding, Entry, Facts, Index, ShardWriter
 from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
-from lidar_synth.files import sha256
+from lidar_synth.files.disk import sha256
 from lidar_synth.formats.points import read_points
 from lidar_synth.generate.generator import load_generator
 from lidar_synth.geometry.projection import project, unproject

@@ -22,7 +22,7 @@ from timing import machine, time_in_turns
 
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
-from lidar_synth.files import sha256
+from lidar_synth.files.disk import sha256
 from lidar_synth.formats import WRITERS, SemanticKITTI
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan, Source

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.classes import IGNORE, NAMES, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, NAMES, TRAIN_ID
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 

@@ -19,15 +19,15 @@ from lidar_synth.bake.curate.duplicates import most_alike
 from lidar_synth.bake.curate.features import MEASURES, RANGE_BINS, features
 from lidar_synth.bake.curate.store import Store, measure
 from lidar_synth.bank import Bank
-from lidar_synth.classes import NAMES
+from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.evaluate import jensen_shannon_distance
-from lidar_synth.files import write_arrays
+from lidar_synth.files.disk import write_arrays
+from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.convert import in_processes
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Source
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.parsing import read_arrays
 
 FILE = "scores.npz"
 """Name of the file, in the bank's folder."""

@@ -21,9 +21,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lidar_synth.classes import NAMES
+from lidar_synth.datasets.classes import NAMES
+from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, Recordings, frames_of, whole
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import sha256
+from lidar_synth.files.disk import sha256
+from lidar_synth.files.parsing import read_yaml
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, Part
 from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
@@ -32,8 +34,6 @@ from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.models import assemble
 from lidar_synth.models.lidm.diffusion import schedule_times
-from lidar_synth.parsing import read_yaml
-from lidar_synth.recordings import KITTI360, KITTI360_SPLITS, Recordings, frames_of, whole
 
 STEPS = 50
 """Of the uniform time grid that the checkpoint names: the peer samples in 50."""

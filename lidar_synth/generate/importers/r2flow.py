@@ -19,8 +19,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, whole
 from lidar_synth.errors import DataError
-from lidar_synth.files import sha256
+from lidar_synth.files.disk import sha256
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.generate.checkpoint import VELOCITY, Header, Part
 from lidar_synth.generate.importers.pickled import load_pickle, state_of
@@ -28,7 +29,6 @@ from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.models import assemble
 from lidar_synth.models.positions import BASES, LEARNED
-from lidar_synth.recordings import KITTI360, KITTI360_SPLITS, whole
 
 HEADS = (2, 4, 8, 16)
 MAPPING_DEPTH = 2

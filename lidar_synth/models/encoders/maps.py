@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidar_synth.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, FileError, LibraryError
 from lidar_synth.models.convolution import check_shape, pair, reduced
 

@@ -7,9 +7,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from lidar_synth.errors import ConfigError, shorten
+from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.parsing import parse_yaml
 from lidar_synth.train.config.recipes import find_recipe, read_recipe
 from lidar_synth.train.config.sections import Run
 from lidar_synth.train.config.training import DistillConfig, TrainConfig

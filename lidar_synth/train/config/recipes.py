@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.parsing import read_yaml
+from lidar_synth.files.parsing import read_yaml
 
 SUFFIXES = (".yaml", ".yml")
 

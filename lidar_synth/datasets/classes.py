@@ -51,7 +51,7 @@ class Taxonomy:
 
     Example:
         >>> import numpy as np
-        >>> from lidar_synth.classes import SEMANTIC_KITTI
+        >>> from lidar_synth.datasets.classes import SEMANTIC_KITTI
         >>> train = SEMANTIC_KITTI.decode(np.array([10, 252, 40, 0]))  # car, moving car, road, unlabelled
         >>> train
         array([  0,   0,   8, 255], dtype=uint8)

@@ -21,7 +21,7 @@ import yaml
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files import SKIP_HINT, STRAY, read_file, read_text
+from lidar_synth.files.disk import SKIP_HINT, STRAY, read_file, read_text
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -1,0 +1,1 @@
+"""Facts about public datasets: their classes, drives and splits."""

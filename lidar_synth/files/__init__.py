@@ -1,0 +1,1 @@
+"""How bytes come from disk and go to disk: whole files, bounded parsers, clear errors."""
