@@ -3,15 +3,15 @@
 from pathlib import Path
 from typing import Any
 
-from lidar_synth.bake import Job, Plan, make_plan
+from lidar_synth.bake import BakeJob, BakePlan, make_plan
 
 COUNT, SIZE = 10, 3
 """Scans of a bank, and of a shard: 3, 3, 3 and 1."""
 
 
-def plan_in(out: Path, model: Path, **settings: Any) -> Plan:
+def plan_in(out: Path, model: Path, **settings: Any) -> BakePlan:
     """A plan with the tests' settings, or others."""
-    return make_plan(out, Job(**{"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 4} | settings))
+    return make_plan(out, BakeJob(**{"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 4} | settings))
 
 
 def files(root: Path) -> dict[str, bytes]:

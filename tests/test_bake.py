@@ -17,7 +17,7 @@ from test_generator import SENSOR, write
 from typer.testing import CliRunner
 
 import lidar_synth.bake.shard as shard_module
-from lidar_synth.bake import ENGINES, Job, Plan, Resources, Share, bake
+from lidar_synth.bake import ENGINES, BakeJob, BakePlan, Resources, Share, bake
 from lidar_synth.bake.folder import SETTINGS, finish, prepare
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import regenerate
@@ -25,7 +25,7 @@ from lidar_synth.bank import INDEX, Bank, Encoding
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.formats import open_scans
-from lidar_synth.generate.checkpoint import ENCODER, VELOCITY, Header, Part, save_checkpoint
+from lidar_synth.generate.checkpoint import ENCODER, VELOCITY, Header, NetworkSpec, save_checkpoint
 from lidar_synth.generate.generator import load_generator
 from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.models import build_network
@@ -40,7 +40,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def plan(model: Path, tmp_path: Path) -> Plan:
+def plan(model: Path, tmp_path: Path) -> BakePlan:
     return plan_in(tmp_path / "bank", model)
 
 
@@ -52,7 +52,7 @@ def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     return files(plan.out)
 
 
-def test_a_bank_holds_the_models_scans(plan: Plan, model: Path, expected: dict[str, bytes]) -> None:
+def test_a_bank_holds_the_models_scans(plan: BakePlan, model: Path, expected: dict[str, bytes]) -> None:
     index = bake(plan, progress=False)
     assert index is not None and index.scans == COUNT and [e.scans for e in index.shards] == [3, 3, 3, 1]
     assert files(plan.out) == expected
@@ -83,7 +83,8 @@ def write_conditioned(path: Path) -> Path:
         for parameter in network.parameters():
             torch.nn.init.normal_(parameter, std=0.2)
     header = Header(
-        networks={VELOCITY: Part("hdit", arguments), ENCODER: Part("semantic_map", of_maps)}, sensor=SENSOR,
+        networks={VELOCITY: NetworkSpec("hdit", arguments), ENCODER: NetworkSpec("semantic_map", of_maps)},
+        sensor=SENSOR,
         normalisation=NORMALISATIONS["r2flow"], channels=("range",), time_grid=(1.0, 0.5, 0.0),
         provenance={"data": "none", "data_licence": "none", "licence": "MIT"}, conditioning={"semantic": {}},
     )  # fmt: skip
@@ -113,7 +114,7 @@ def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
-def test_processes(plan: Plan, expected: dict[str, bytes], workers: int) -> None:
+def test_processes(plan: BakePlan, expected: dict[str, bytes], workers: int) -> None:
     prepare(plan)
     told: list[int] = []
     ENGINES["processes"](plan, range(4), Resources(workers), told.append)
@@ -123,7 +124,7 @@ def test_processes(plan: Plan, expected: dict[str, bytes], workers: int) -> None
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(4)))[::5])
-def test_shares_in_any_order(plan: Plan, expected: dict[str, bytes], order: tuple[int, ...]) -> None:
+def test_shares_in_any_order(plan: BakePlan, expected: dict[str, bytes], order: tuple[int, ...]) -> None:
     found = [bake(plan, share=Share(k, 4), progress=False) for k in order]
     assert found[:3] == [None, None, None] and found[3] is not None
     assert files(plan.out) == expected
@@ -131,7 +132,7 @@ def test_shares_in_any_order(plan: Plan, expected: dict[str, bytes], order: tupl
 
 @pytest.mark.parametrize("ranks", [(0,), (1, 0), (1, 2, 0)])
 def test_ranks_of_torchrun_in_turn(
-    plan: Plan, expected: dict[str, bytes], ranks: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+    plan: BakePlan, expected: dict[str, bytes], ranks: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ConfigError, match="engine 'torchrun' without 'RANK'.*torchrun --nproc-per-node"):
         bake(plan, "torchrun", progress=False)
@@ -143,7 +144,7 @@ def test_ranks_of_torchrun_in_turn(
     assert index is not None and files(plan.out) == expected
 
 
-def test_torchrun(plan: Plan, model: Path, expected: dict[str, bytes]) -> None:
+def test_torchrun(plan: BakePlan, model: Path, expected: dict[str, bytes]) -> None:
     """Two processes at once, as its own command starts them."""
     options = ["--model", model, "--count", COUNT, "--shard-size", SIZE, "--seed", 4, "--engine", "torchrun"]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2]
@@ -152,7 +153,7 @@ def test_torchrun(plan: Plan, model: Path, expected: dict[str, bytes]) -> None:
 
 
 @pytest.mark.parametrize("engine", ["ray", "slurm"])
-def test_engines_whose_library_is_missing(plan: Plan, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_engines_whose_library_is_missing(plan: BakePlan, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, {"ray": "ray", "slurm": "submitit"}[engine], None)
     with pytest.raises(LibraryError, match=rf"engine '{engine}', but .* pip install 'lidar_synth\[{engine}\]'"):
         bake(plan, engine, progress=False)
@@ -176,7 +177,9 @@ def test_every_engine_is_named_in_the_help() -> None:
         ({"batch": 2}, r"'batch': 1.*'batch': 2"),
     ],
 )
-def test_another_setting_is_refused_and_shown(plan: Plan, model: Path, change: dict[str, Any], message: str) -> None:
+def test_another_setting_is_refused_and_shown(
+    plan: BakePlan, model: Path, change: dict[str, Any], message: str
+) -> None:
     bake(plan, share=Share(0, 4), progress=False)
     before = {path: path.read_bytes() for path in plan.out.glob("*.h5")}
     with pytest.raises(ConfigError, match=message):
@@ -184,7 +187,7 @@ def test_another_setting_is_refused_and_shown(plan: Plan, model: Path, change: d
     assert before == {path: path.read_bytes() for path in plan.out.glob("*.h5")}
 
 
-def test_another_checkpoint_is_refused(plan: Plan, tmp_path: Path) -> None:
+def test_another_checkpoint_is_refused(plan: BakePlan, tmp_path: Path) -> None:
     bake(plan, share=Share(0, 4), progress=False)
     other = write(tmp_path / "other.safetensors", ("range", "reflectance", "label")[:2])
     with pytest.raises(ConfigError, match="'checkpoint'"):
@@ -197,7 +200,7 @@ def test_another_checkpoint_is_refused(plan: Plan, tmp_path: Path) -> None:
         bake(changed, progress=False)
 
 
-def test_a_bank_that_no_bake_made(plan: Plan) -> None:
+def test_a_bank_that_no_bake_made(plan: BakePlan) -> None:
     bake(plan, progress=False)
     (plan.out / SETTINGS).unlink()
     with pytest.raises(ConfigError, match="holds a bank that no bake made"):
@@ -268,7 +271,7 @@ def test_a_configuration_file(model: Path, tmp_path: Path, expected: dict[str, b
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("bake_*.yaml")), ids=lambda p: p.stem)
 def test_published_configurations_load(path: Path) -> None:
-    assert validated(Job, read_values(path, Job), str(path)).count >= 1000
+    assert validated(BakeJob, read_values(path, BakeJob), str(path)).count >= 1000
 
 
 def test_a_dry_run_makes_nothing(model: Path, tmp_path: Path) -> None:
@@ -282,7 +285,7 @@ def test_a_dry_run_makes_nothing(model: Path, tmp_path: Path) -> None:
     assert estimated == pytest.approx(made, rel=0.4)
 
 
-def test_an_index_waits_for_every_shard(plan: Plan) -> None:
+def test_an_index_waits_for_every_shard(plan: BakePlan) -> None:
     bake(plan, share=Share(0, 2), progress=False)
     bake(plan, share=Share(1, 2), progress=False)
     (plan.out / INDEX).unlink()

@@ -23,7 +23,7 @@ from test_generator import write
 import lidar_synth.bake.folder as folder_module
 import lidar_synth.bake.run as run_module
 import lidar_synth.bake.shard as shard_module
-from lidar_synth.bake import ENGINES, Plan, Resources, Share, bake, bake_shard
+from lidar_synth.bake import ENGINES, BakePlan, Resources, Share, bake, bake_shard
 from lidar_synth.bake.folder import SETTINGS, prepare, write_bank_files
 from lidar_synth.bank import INDEX, Entry, Index
 from lidar_synth.errors import ConfigError, FileError
@@ -37,7 +37,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def plan(model: Path, tmp_path: Path) -> Plan:
+def plan(model: Path, tmp_path: Path) -> BakePlan:
     return plan_in(tmp_path / "bank", model)
 
 
@@ -49,7 +49,7 @@ def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     return files(plan.out)
 
 
-def stop_after(plan: Plan, scans: int, stop: Callable[[], object]) -> None:
+def stop_after(plan: BakePlan, scans: int, stop: Callable[[], object]) -> None:
     """Bake in this process; call ``stop`` when so many scans are made."""
     made = 0
 
@@ -59,7 +59,7 @@ def stop_after(plan: Plan, scans: int, stop: Callable[[], object]) -> None:
         if made == scans:
             stop()
 
-    def engine(plan: Plan, numbers: Any, resources: Resources, _: Any) -> None:
+    def engine(plan: BakePlan, numbers: Any, resources: Resources, _: Any) -> None:
         for number in numbers:
             bake_shard(plan, number, progress)
 
@@ -74,7 +74,7 @@ def stop_after(plan: Plan, scans: int, stop: Callable[[], object]) -> None:
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("scans", [1, 5, 10])
 def test_a_signal_keeps_finished_shards(
-    plan: Plan, expected: dict[str, bytes], stop: signal.Signals, scans: int
+    plan: BakePlan, expected: dict[str, bytes], stop: signal.Signals, scans: int
 ) -> None:
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(KeyboardInterrupt):
@@ -147,14 +147,14 @@ def test_a_killed_worker_is_told_of(model: Path, tmp_path: Path, expected: dict[
     assert multiprocessing.active_children() == []
 
 
-def test_what_a_worker_raises_arrives(plan: Plan, model: Path) -> None:
+def test_what_a_worker_raises_arrives(plan: BakePlan, model: Path) -> None:
     prepare(plan)
     (plan.out / SETTINGS).unlink()
     with pytest.raises(FileError, match="has vanished or lost its .bake.json"):
         ENGINES["processes"](plan, range(4), Resources(1), lambda scans: None)
 
 
-def test_a_finished_shard_that_rots_is_made_again(plan: Plan, expected: dict[str, bytes]) -> None:
+def test_a_finished_shard_that_rots_is_made_again(plan: BakePlan, expected: dict[str, bytes]) -> None:
     bake(plan, progress=False)
     path = plan.out / "shard-00001.h5"
     content = bytearray(path.read_bytes())
@@ -165,7 +165,7 @@ def test_a_finished_shard_that_rots_is_made_again(plan: Plan, expected: dict[str
     assert files(plan.out) == expected
 
 
-def test_halves_of_killed_processes_are_removed(plan: Plan, expected: dict[str, bytes]) -> None:
+def test_halves_of_killed_processes_are_removed(plan: BakePlan, expected: dict[str, bytes]) -> None:
     """Not while another process is at work in the folder, and then whoever began them, here or elsewhere."""
     prepare(plan)
     halves = [plan.out / f".shard-0000{k}.h5.abcd.part" for k in range(2)]
@@ -198,7 +198,7 @@ def test_three_bakes_at_once(model: Path, tmp_path: Path, shares: str) -> None:
     assert files(out) == files(whole.out)
 
 
-def test_one_that_ends_while_another_begins_a_shard(plan: Plan, expected: dict[str, bytes]) -> None:
+def test_one_that_ends_while_another_begins_a_shard(plan: BakePlan, expected: dict[str, bytes]) -> None:
     """The other one is between the first scan of its shard and the last when a whole bake comes and goes."""
     ended: list[subprocess.CompletedProcess[str]] = []
 
@@ -214,7 +214,7 @@ def test_one_that_ends_while_another_begins_a_shard(plan: Plan, expected: dict[s
     assert files(plan.out) == expected
 
 
-def test_two_folders_claimed_at_once(plan: Plan, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_folders_claimed_at_once(plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both see an empty folder; the one that is a moment late finds out."""
     late = plan_in(plan.out, model, seed=5)
     looked = Path.is_file
@@ -231,7 +231,9 @@ def test_two_folders_claimed_at_once(plan: Plan, model: Path, monkeypatch: pytes
         prepare(late)
 
 
-def test_two_that_end_at_the_same_time(plan: Plan, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_that_end_at_the_same_time(
+    plan: BakePlan, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each writes the same files; neither needs the notes that the other one clears away."""
     prepare(plan)
     for number in range(4):
@@ -249,7 +251,7 @@ def test_two_that_end_at_the_same_time(plan: Plan, expected: dict[str, bytes], m
 
 
 def test_a_rerun_over_many_shards_parses_the_index_once(
-    plan: Plan, model: Path, monkeypatch: pytest.MonkeyPatch
+    plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """10,000 shards, all but 20 of them there. What a shard holds is not read then; a few bytes do."""
     many = plan_in(plan.out, model, count=10_000, shard_size=1)
@@ -280,7 +282,7 @@ def test_a_rerun_over_many_shards_parses_the_index_once(
 # The disk
 
 
-def test_a_full_disk_by_limit(plan: Plan, expected: dict[str, bytes]) -> None:
+def test_a_full_disk_by_limit(plan: BakePlan, expected: dict[str, bytes]) -> None:
     """A file may not grow beyond what HDF5 needs for one and a half scans."""
     bake(plan, share=Share(0, 4), progress=False)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -325,7 +327,7 @@ def test_a_full_disk(
     assert files(plan.out) == expected
 
 
-def test_space_is_looked_at_before_a_shard(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_space_is_looked_at_before_a_shard(plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = namedtuple("usage", "total used free")
     need = 3 * 8 * 32 * 5 * 0.6
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need - 1))
@@ -372,7 +374,7 @@ def test_a_folder_that_may_not_be_written_any_more(model: Path, expected: dict[s
         assert files(plan.out) == expected
 
 
-def test_a_folder_that_vanishes(plan: Plan, expected: dict[str, bytes]) -> None:
+def test_a_folder_that_vanishes(plan: BakePlan, expected: dict[str, bytes]) -> None:
     for scans in (3, 4):  # at the end of a shard, and within one
         with pytest.raises(FileError, match=r"bank.*(has vanished or lost its .bake.json|No such file)"):
             stop_after(plan, scans, lambda: shutil.rmtree(plan.out))
@@ -381,7 +383,7 @@ def test_a_folder_that_vanishes(plan: Plan, expected: dict[str, bytes]) -> None:
     assert files(plan.out) == expected
 
 
-def test_a_disk_that_is_not_mounted_any_more(plan: Plan) -> None:
+def test_a_disk_that_is_not_mounted_any_more(plan: BakePlan) -> None:
     """An empty folder stands where the bank was; nothing is to be written into it."""
     prepare(plan)
     bake_shard(plan, 0)

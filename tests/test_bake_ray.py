@@ -13,7 +13,7 @@ from bakes import files, plan_in
 from test_generator import write
 
 import lidar_synth.bake.ray_actors as module
-from lidar_synth.bake import ENGINES, Plan, Resources, bake
+from lidar_synth.bake import ENGINES, BakePlan, Resources, bake
 from lidar_synth.bake.folder import SETTINGS, finish, prepare
 from lidar_synth.errors import ConfigError, FileError
 
@@ -28,7 +28,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def plan(model: Path, tmp_path: Path) -> Plan:
+def plan(model: Path, tmp_path: Path) -> BakePlan:
     return plan_in(tmp_path / "bank", model)
 
 
@@ -74,12 +74,12 @@ def comes(what: Callable[[], bool], seconds: float = 200) -> bool:
     return so
 
 
-def writing(plan: Plan) -> set[int]:
+def writing(plan: BakePlan) -> set[int]:
     """Processes that are in the middle of a shard, by the halves in the folder."""
     return {int(part.name.removesuffix(".part").rpartition("-")[2]) for part in plan.out.glob(".*.part")}
 
 
-def test_a_cluster_of_its_own(plan: Plan, model: Path, tmp_path: Path) -> None:
+def test_a_cluster_of_its_own(plan: BakePlan, model: Path, tmp_path: Path) -> None:
     """Without an address the engine starts Ray and ends it; where none is running, 'auto' is refused."""
     with pytest.raises(ConfigError, match="Ray address 'auto' .*; expected a cluster that is up"):
         bake(plan, "ray", Resources(1, "auto"), progress=False)
@@ -127,7 +127,7 @@ def test_actors_and_nodes_that_come_and_go(cluster: Any, model: Path, tmp_path: 
     assert files(plan.out) == files(whole.out)
 
 
-def test_what_an_actor_raises_arrives(cluster: Any, plan: Plan) -> None:
+def test_what_an_actor_raises_arrives(cluster: Any, plan: BakePlan) -> None:
     prepare(plan)
     (plan.out / SETTINGS).unlink()
     with pytest.raises(FileError, match="has vanished or lost its .bake.json"):
@@ -141,7 +141,7 @@ class Dying(module.Baker):
         os._exit(1)
 
 
-def test_actors_that_never_make_a_shard(cluster: Any, plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_actors_that_never_make_a_shard(cluster: Any, plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_LOSSES", 1)
     monkeypatch.setattr(module, "Baker", Dying)
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])

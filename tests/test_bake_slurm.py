@@ -11,9 +11,9 @@ import pytest
 from bakes import COUNT, files, plan_in
 from test_generator import write
 
-from lidar_synth.bake import ENGINES, Plan, Resources, bake
+from lidar_synth.bake import ENGINES, BakePlan, Resources, bake
 from lidar_synth.bake.folder import SETTINGS, prepare
-from lidar_synth.bake.slurm import LOGS, Part
+from lidar_synth.bake.slurm import LOGS, SlurmTask
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import write_file
 
@@ -29,11 +29,11 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def plan(model: Path, tmp_path: Path) -> Plan:
+def plan(model: Path, tmp_path: Path) -> BakePlan:
     return plan_in(tmp_path / "bank", model)
 
 
-def test_jobs_write_the_same_bytes(plan: Plan, model: Path, tmp_path: Path) -> None:
+def test_jobs_write_the_same_bytes(plan: BakePlan, model: Path, tmp_path: Path) -> None:
     whole = plan_in(tmp_path / "whole" / "bank", model)
     bake(whole, progress=False)
     assert bake(plan, "slurm", Resources(3, slurm=LOCAL), progress=False) is not None
@@ -41,10 +41,10 @@ def test_jobs_write_the_same_bytes(plan: Plan, model: Path, tmp_path: Path) -> N
     assert not (plan.out / LOGS).exists()  # a finished bank needs no logs
 
 
-class Slow(Part):
+class Slow(SlurmTask):
     """A part that waits until it is told that its time is over, once, after its first shard."""
 
-    def __call__(self, plan: Plan, numbers: Sequence[int]) -> int:
+    def __call__(self, plan: BakePlan, numbers: Sequence[int]) -> int:
         if (plan.out / "waited").exists():
             return super().__call__(plan, numbers)
         super().__call__(plan, numbers[:1])
@@ -53,7 +53,7 @@ class Slow(Part):
         raise AssertionError("no signal came")
 
 
-def test_a_job_that_runs_out_of_time_goes_on(plan: Plan) -> None:
+def test_a_job_that_runs_out_of_time_goes_on(plan: BakePlan) -> None:
     """What Slurm does before it takes a node away: a signal; submitit puts the job back by its checkpoint."""
     prepare(plan)
     executor = submitit.AutoExecutor(plan.out / LOGS, "local")
@@ -69,7 +69,7 @@ def test_a_job_that_runs_out_of_time_goes_on(plan: Plan) -> None:
     assert (plan.out / "shard-00000.h5").stat().st_mtime_ns == first.st_mtime_ns  # not made twice
 
 
-def test_a_job_that_fails_is_told_of(plan: Plan) -> None:
+def test_a_job_that_fails_is_told_of(plan: BakePlan) -> None:
     prepare(plan)
     (plan.out / SETTINGS).unlink()
     with pytest.raises(FileError, match=r"(?s)Slurm job \d+.* failed .*has vanished or lost its .bake.json"):
@@ -79,7 +79,7 @@ def test_a_job_that_fails_is_told_of(plan: Plan) -> None:
     assert not (plan.out / LOGS).exists()
 
 
-def test_what_cannot_be_submitted(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_submitted(plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", os.devnull)
     with pytest.raises(ConfigError, match=r'Could not detect "srun".*expected a machine that submits to Slurm'):
         bake(plan, "slurm", progress=False)

@@ -21,7 +21,7 @@ from lidar_synth.generate.checkpoint import (
     WITHOUT_CHECKSUM,
     Checkpoint,
     Header,
-    Part,
+    NetworkSpec,
     has_checksum,
     load_checkpoint,
     read_header,
@@ -42,7 +42,7 @@ ARGUMENTS: dict[str, Any] = {
     "heads": [2, 2],
 }
 HEADER = Header(
-    networks={VELOCITY: Part("hdit", ARGUMENTS)},
+    networks={VELOCITY: NetworkSpec("hdit", ARGUMENTS)},
     sensor=SENSOR,
     normalisation=NORMALISATIONS["r2flow"],
     channels=("range", "reflectance", "label"),

@@ -211,7 +211,7 @@ class Offset(VQVAE):
     def encode(self, x: Tensor) -> Tensor:
         return x
 
-    def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
+    def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         fields = TENSORS.decode(z)
         fields["range"] = torch.where(fields["range"] > 0, fields["range"] + self.metres, 0.0)
         fields["range"][:, : self.drop] = 0

@@ -16,7 +16,7 @@ from test_generator import write
 from test_verify import baked, call, flip, names_and_points, shards
 
 import lidar_synth.bake.curate.duplicates as duplicates
-from lidar_synth.bake import Job, bake, make_plan
+from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.bake.curate import FILE, MEANINGS, matching, read_scores, score, write_scores
 from lidar_synth.bake.curate.features import MEASURES, features
 from lidar_synth.bake.curate.scores import FARTHEST
@@ -354,7 +354,7 @@ def test_a_lost_index_never_brings_back_what_was_dropped(good: Path, original: P
 
 def test_a_curated_bank_is_not_baked_into(good: Path, model: Path) -> None:
     with pytest.raises(ConfigError, match="holds a bank that no bake made"):
-        bake(make_plan(good, Job(model=str(model), count=8, shard_size=3)), progress=False)
+        bake(make_plan(good, BakeJob(model=str(model), count=8, shard_size=3)), progress=False)
 
 
 @pytest.mark.parametrize("dropped", [(0, 0), (2, 1), (0, 1, 2), (3,), (-1,)])

@@ -11,7 +11,7 @@ from layouts import write_kitti_raw, write_nuscenes
 from project import ROOT
 
 import lidar_synth
-from lidar_synth.bake import Job, bake, make_plan
+from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.town import Town, export_town
 
 FURTHER = {
@@ -72,7 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> Path:
         export_town(Town(0, scans=3), root / out, layout, camera=False, progress=False)
     write_kitti_raw(root / "KITTI-raw")
     write_nuscenes(root / "nuScenes")
-    bake(make_plan(root / "demo_out" / "bank", Job(count=4, seed=1)), progress=False)
+    bake(make_plan(root / "demo_out" / "bank", BakeJob(count=4, seed=1)), progress=False)
     return root
 
 

@@ -25,7 +25,7 @@ from lidar_synth.generate.checkpoint import (
     ENCODER,
     VELOCITY,
     Header,
-    Part,
+    NetworkSpec,
     has_checksum,
     read_header,
     save_checkpoint,
@@ -55,12 +55,12 @@ def write(path: Path, channels: tuple[str, ...] = tuple(CHANNELS), dropout: floa
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)  # a fresh network answers zero
     header = Header(
-        networks={VELOCITY: Part("hdit", arguments)}, sensor=SENSOR, normalisation=NORMALISATIONS["r2flow"],
+        networks={VELOCITY: NetworkSpec("hdit", arguments)}, sensor=SENSOR, normalisation=NORMALISATIONS["r2flow"],
         channels=channels, time_grid=GRID, provenance={"data": "none", "data_licence": "none", "licence": "MIT"},
     )  # fmt: skip
     networks = {VELOCITY: network}
     if dropout is not None:
-        encoder = Part("semantic_map", {"resolution": SENSOR.shape, "target": SENSOR.shape, "channels": 3})
+        encoder = NetworkSpec("semantic_map", {"resolution": SENSOR.shape, "target": SENSOR.shape, "channels": 3})
         networks[ENCODER] = build_network(*encoder)
         torch.nn.init.normal_(networks[ENCODER].mix.weight, std=2.0)
         conditioning = {"semantic": {"dropout": dropout}}
@@ -230,7 +230,7 @@ CODECS = {
 def write_latent(path: Path, architecture: str) -> Path:
     """A latent model with random weights."""
     given = {"resolution": SENSOR.shape, "channels": 7}
-    codec = Part(architecture, given | CODECS[architecture])
+    codec = NetworkSpec(architecture, given | CODECS[architecture])
     torch.manual_seed(0)
     looks = {"angles": torch.from_numpy(SENSOR.ray_angles())} if architecture == "autoencoder" else {}
     autoencoder = build_network(architecture, codec.arguments | looks)
@@ -239,7 +239,7 @@ def write_latent(path: Path, architecture: str) -> Path:
                  "heads": (2,), "patch": (1, 1), "window": (1, 1)}  # fmt: skip
     flow = build_network("hdit", arguments | {"angles": torch.zeros(2, *resolution)})
     header = Header(
-        networks={VELOCITY: Part("hdit", arguments), CODEC: codec}, sensor=SENSOR, channels=tuple(CHANNELS),
+        networks={VELOCITY: NetworkSpec("hdit", arguments), CODEC: codec}, sensor=SENSOR, channels=tuple(CHANNELS),
         normalisation=NORMALISATIONS["r2flow"], time_grid=GRID,
         provenance={"data": "none", "data_licence": "none", "licence": "MIT"},
     )  # fmt: skip

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lidar_synth.generate.checkpoint import Part
+from lidar_synth.generate.checkpoint import NetworkSpec
 from lidar_synth.generate.importers.r2flow import POSITIONS as PEER_POSITIONS
 from lidar_synth.generate.importers.r2flow import convert
 from lidar_synth.models.hdit.hdit import HDiT
@@ -41,7 +41,7 @@ def golden_network(folder: Path, name: str) -> tuple[HDiT, dict[str, Tensor], fl
         "position": PEER_POSITIONS[config["coords_encoding"]],
     }
     weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}
-    net = convert(weights, Part("hdit", arguments))
+    net = convert(weights, NetworkSpec("hdit", arguments))
     assert isinstance(net, HDiT)
     assert sum(p.numel() for p in net.parameters()) == about["parameters"]
     return net, tensors, about["sensitivity"]["suggested_rel_l2_tolerance"]

@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Part
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
 from lidar_synth.generate.importers.lidm import codec_part, convert, unet_part
 from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET
 from lidar_synth.models.lidm.diffusion import DiffusionUNet
@@ -114,8 +114,8 @@ def test_golden_label_map(golden: Path) -> None:
     assert len(theirs.unique()) == about["config"]["in_channels"]
     labels = torch.where(theirs == 0, IGNORE, theirs.int() - 1).to(torch.uint8)
     arguments = {"resolution": [64, 256], "target": [16, 32], "channels": 8}
-    encoder = convert({COND_STAGE + k: v for k, v in weights.items()}, {ENCODER: Part("semantic_map", arguments)})[
-        ENCODER
-    ]
+    encoder = convert(
+        {COND_STAGE + k: v for k, v in weights.items()}, {ENCODER: NetworkSpec("semantic_map", arguments)}
+    )[ENCODER]
     assert encoder.halvings == [tuple(s) for s in about["config"]["strides"]]
     assert distance(encoder(labels), tensors["output"]) < tolerance(about["f32_vs_f64"])

@@ -242,7 +242,7 @@ def test_configurations_that_do_not_fit(tmp_path: Path, cfg: dict[str, Any], mes
 
 
 def test_fourier_features_have_to_be_octaves() -> None:
-    from lidar_synth.generate.checkpoint import Part
+    from lidar_synth.generate.checkpoint import NetworkSpec
 
     weights = peer_weights("fourier_features")
     octaves = torch.tensor([[2.0**i, 0.0] for i in range(6)] + [[0.0, 2.0**i] for i in range(4)])
@@ -255,10 +255,10 @@ def test_fourier_features_have_to_be_octaves() -> None:
         "depths": list(DEPTHS),
         "position": "fourier_features",
     }
-    convert(weights, Part("hdit", arguments))
+    convert(weights, NetworkSpec("hdit", arguments))
     weights["spatial_pe.0.embedding.phase"][2] = 0.5
     with pytest.raises(DataError, match="octaves"):
-        convert(weights, Part("hdit", arguments))
+        convert(weights, NetworkSpec("hdit", arguments))
 
 
 class Evil:

@@ -11,19 +11,21 @@ import pytest
 from hypothesis import assume, given, settings
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.mixing import Linear, Mixture, Part, Plan, make_schedule, plan
+from lidar_synth.mixing import Linear, MixingPlan, Mixture, PlannedSource, make_schedule, plan
 from lidar_synth.mixing.batches import cut_steps, rank_share
 from lidar_synth.mixing.quotas import deal, exact_synthetic, quotas, running_counts, split
 from lidar_synth.mixing.schedules import Schedule, share_of
 
-ENDLESS = Part(None, identity="model")
+ENDLESS = PlannedSource(None, identity="model")
+OTHER = PlannedSource(None, identity="other")
+THREE, WEIGHED = PlannedSource(3), PlannedSource(3, 1.0)
 
 
 def mixture(real: int = 6, ratio: object = 0.25, **options: object) -> Mixture:
-    return Mixture((Part(real, identity="real"),), (ENDLESS,), make_schedule(ratio), **options)  # type: ignore[arg-type]
+    return Mixture((PlannedSource(real, identity="real"),), (ENDLESS,), make_schedule(ratio), **options)  # type: ignore[arg-type]
 
 
-def rows(made: Plan) -> list[str]:
+def rows(made: MixingPlan) -> list[str]:
     """``r3`` or ``s0`` for one source of each kind."""
     return [f"{'rs'[source]}{index}" for source, index in zip(made.source, made.index, strict=True)]
 
@@ -37,7 +39,13 @@ def test_the_order_is_what_it_always_was() -> None:
     ]
     assert plan(mixture(), 2).hash == "da107b92653538fe9b6b1d5962019e9f6b0890443e66a738e8a9f71af8485751"
     assert rows(plan(mixture(balanced=True), 0)) == ["s1", "r5", "r3", "r2", "s0", "r1", "r0", "r4"]
-    two = Mixture((Part(3), Part(2)), (Part(None), Part(4)), make_schedule(0.5), seed=7, epoch_size="replace")
+    two = Mixture(
+        (PlannedSource(3), PlannedSource(2)),
+        (PlannedSource(None), PlannedSource(4)),
+        make_schedule(0.5),
+        seed=7,
+        epoch_size="replace",
+    )
     made = plan(two, 1)
     assert list(zip(made.source.tolist(), made.index.tolist(), strict=True)) == [(2, 2), (1, 1), (0, 2), (3, 1), (0, 1)]
 
@@ -77,7 +85,7 @@ def test_every_source_gets_its_share_over_epochs(
     real: list[float | None], synthetic: list[float | None], ratio: float, size: str | int, balanced: bool
 ) -> None:
     """After any number of epochs, to within one sample; what a plan gives is what is counted."""
-    parts = tuple(Part(3 + i, w) for i, w in enumerate(real)), tuple(Part(None, w) for w in synthetic)
+    parts = tuple(PlannedSource(3 + i, w) for i, w in enumerate(real)), tuple(PlannedSource(None, w) for w in synthetic)
     mixed = Mixture(*parts, make_schedule(ratio), epoch_size=size, balanced=balanced)  # type: ignore[arg-type]
     given_so_far = np.zeros(len(real + synthetic), int)
     exact = Fraction(0)
@@ -94,7 +102,7 @@ def test_every_source_gets_its_share_over_epochs(
 
 
 def test_rare_sources_and_small_ratios_get_their_turn() -> None:
-    mixed = Mixture((Part(4),), (Part(None, 9.0), Part(None, 1.0)), make_schedule(0.5))
+    mixed = Mixture((PlannedSource(4),), (PlannedSource(None, 9.0), PlannedSource(None, 1.0)), make_schedule(0.5))
     assert running_counts(mixed, 50) == (200, 180, 20)
     assert [quotas(mixture(4, 0.1), epoch) for epoch in range(5)] == [(4, 1), (4, 0), (4, 1), (4, 0), (4, 1)]
     assert running_counts(mixture(4, 0.1), 900) == (3600, 400)
@@ -148,8 +156,8 @@ def test_reuse_is_spread_over_epochs(
 ) -> None:
     """No epoch has a scan twice, and in the long run each is given ``reuse`` times."""
     schedule = make_schedule(Linear(0.0, ratio, 3) if rising else ratio)
-    sources = tuple(Part(None, w) for w in weights)
-    mixed = Mixture((Part(real),), sources, schedule, reuse=reuse, balanced=balanced)
+    sources = tuple(PlannedSource(None, w) for w in weights)
+    mixed = Mixture((PlannedSource(real),), sources, schedule, reuse=reuse, balanced=balanced)
     counts: Counter[tuple[int, int]] = Counter()
     for epoch in range(4 * reuse):
         made = plan(mixed, epoch)
@@ -163,10 +171,10 @@ def test_reuse_is_spread_over_epochs(
 
 
 def test_a_bank_begins_again() -> None:
-    bank = Mixture((Part(6),), (Part(4),), make_schedule(0.4))
+    bank = Mixture((PlannedSource(6),), (PlannedSource(4),), make_schedule(0.4))
     indices = [sorted(plan(bank, e).index[plan(bank, e).domain].tolist()) for e in range(3)]
     assert indices == [[0, 1, 2, 3]] * 3
-    few = Mixture((Part(6),), (Part(4),), make_schedule(0.5), reuse=2)
+    few = Mixture((PlannedSource(6),), (PlannedSource(4),), make_schedule(0.5), reuse=2)
     indices = [sorted(plan(few, e).index[plan(few, e).domain].tolist()) for e in range(3)]
     assert indices == [[0, 0, 1, 1, 2, 3], [0, 0, 1, 1, 2, 3], [0, 1, 2, 2, 3, 3]]
 
@@ -175,10 +183,15 @@ def test_weights_are_kept() -> None:
     assert split([Fraction(1), Fraction(1), Fraction(1)], 10) == (3, 4, 3)
     assert split([Fraction(5), Fraction(3), Fraction(1)], 9) == (5, 3, 1)
     assert split([], 0) == ()
-    parts = (Part(10, 1.0), Part(30, 3.0)), (Part(None, 1.0), Part(None, 2.0), Part(5, 1.0))
+    parts = (
+        (PlannedSource(10, 1.0), PlannedSource(30, 3.0)),
+        (PlannedSource(None, 1.0), PlannedSource(None, 2.0), PlannedSource(5, 1.0)),
+    )
     weighted = Mixture(*parts, make_schedule(0.4), epoch_size=50)
     assert running_counts(weighted, 4) == (30, 90, 20, 40, 20)
-    unweighted = Mixture((Part(10), Part(30)), (ENDLESS, Part(5)), make_schedule(0.4), epoch_size=50)
+    unweighted = Mixture(
+        (PlannedSource(10), PlannedSource(30)), (ENDLESS, PlannedSource(5)), make_schedule(0.4), epoch_size=50
+    )
     assert running_counts(unweighted, 4) == (30, 90, 40, 40)
 
 
@@ -202,8 +215,8 @@ def test_a_balanced_plan_is_exact_in_every_batch(
 @settings(max_examples=40)
 @given(st.lists(st.integers(1, 9), min_size=2, max_size=4), st.integers(1, 12), st.integers(0, 20))
 def test_a_balanced_plan_spreads_several_synthetic_sources(weights: list[int], batch: int, epoch: int) -> None:
-    sources = tuple(Part(None, float(w)) for w in weights)
-    mixed = Mixture((Part(9),), sources, make_schedule(0.5), epoch_size=120, balanced=True)
+    sources = tuple(PlannedSource(None, float(w)) for w in weights)
+    mixed = Mixture((PlannedSource(9),), sources, make_schedule(0.5), epoch_size=120, balanced=True)
     source = plan(mixed, epoch).source
     for start in range(120 - batch + 1):
         for number, weight in enumerate(weights, 1):
@@ -212,7 +225,7 @@ def test_a_balanced_plan_spreads_several_synthetic_sources(weights: list[int], b
 
 
 def test_equal_synthetic_sources_alternate_in_every_batch() -> None:
-    mixed = Mixture((Part(40),), (ENDLESS, ENDLESS), make_schedule(0.5), balanced=True)
+    mixed = Mixture((PlannedSource(40),), (ENDLESS, ENDLESS), make_schedule(0.5), balanced=True)
     batches = plan(mixed, 1).source.reshape(-1, 4)
     assert [np.bincount(batch, minlength=3).tolist() for batch in batches] == [[2, 1, 1]] * 20
 
@@ -261,7 +274,7 @@ def test_the_hash_tells_plans_apart() -> None:
     one = plan(mixture(), 0).hash
     others = [
         plan(mixture(), 1), plan(mixture(seed=1), 0), plan(mixture(ratio=0.5), 0), plan(mixture(balanced=True), 0),
-        plan(Mixture((Part(6, identity="real"),), (Part(None, identity="other"),), make_schedule(0.25)), 0),
+        plan(Mixture((PlannedSource(6, identity="real"),), (OTHER,), make_schedule(0.25)), 0),
     ]  # fmt: skip
     assert one == plan(mixture(), 0).hash
     assert len({one, *(other.hash for other in others)}) == 6
@@ -313,9 +326,9 @@ def test_what_is_left_is_left_for_any_number_of_ranks() -> None:
         (lambda: mixture(real=0), DataError, r"a source without scans"),
         (lambda: Mixture((), (ENDLESS,), make_schedule(0.5), epoch_size=4), DataError, r"no real scans.*ratio=1"),
         (lambda: Mixture((), (ENDLESS,), make_schedule(1.0)), DataError, r"no real scans.*give epoch_size"),
-        (lambda: Mixture((Part(3),), (), make_schedule(0.5)), ConfigError, r"ratio 0.5 .* without a synthetic source"),
-        (lambda: Mixture((Part(3, 1.0),), (ENDLESS,), make_schedule(0.5)), ConfigError, r"weights of real sources"),
-        (lambda: Mixture((Part(3),), (Part(3, 0.0),), make_schedule(0.5)), ConfigError, r"weight 0.0"),
+        (lambda: Mixture((THREE,), (), make_schedule(0.5)), ConfigError, r"ratio 0.5 .* without a synthetic source"),
+        (lambda: Mixture((WEIGHED,), (ENDLESS,), make_schedule(0.5)), ConfigError, r"weights of real sources"),
+        (lambda: Mixture((THREE,), (PlannedSource(3, 0.0),), make_schedule(0.5)), ConfigError, r"weight 0.0"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_planned(make: object, error: type[Exception], message: str) -> None:
@@ -326,7 +339,7 @@ def test_what_cannot_be_planned(make: object, error: type[Exception], message: s
 def test_synthetic_only_and_real_only() -> None:
     only = Mixture((), (ENDLESS,), make_schedule(1), epoch_size=5)
     assert sorted(plan(only, 1).index.tolist()) == [5, 6, 7, 8, 9]
-    assert plan(Mixture((Part(4),), (), make_schedule(0)), 0).domain.tolist() == [False] * 4
+    assert plan(Mixture((PlannedSource(4),), (), make_schedule(0)), 0).domain.tolist() == [False] * 4
 
 
 def test_a_plan_of_any_length_takes_the_same_memory() -> None:
@@ -334,7 +347,12 @@ def test_a_plan_of_any_length_takes_the_same_memory() -> None:
     try:
         for balanced in (False, True):
             mixed = Mixture(
-                (Part(10**8),), (ENDLESS, ENDLESS), make_schedule(0.25), reuse=2, epoch_size=10**8, balanced=balanced
+                (PlannedSource(10**8),),
+                (ENDLESS, ENDLESS),
+                make_schedule(0.25),
+                reuse=2,
+                epoch_size=10**8,
+                balanced=balanced,
             )
             made = plan(mixed, 3)
             asked = np.random.default_rng(0).integers(0, len(made), 200)

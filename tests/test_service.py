@@ -23,7 +23,7 @@ from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.mixing import MixedScans, Sources
 from lidar_synth.mixing.service import BatchMixer, RollingBank
 from lidar_synth.mixing.service.ledger import COUNTERS, Ledger
-from lidar_synth.mixing.service.outlook import NEVER, Counting, Pool, Told
+from lidar_synth.mixing.service.outlook import NEVER, KnownOrder, RotatingPool, SequentialPrefetch
 from lidar_synth.mixing.service.slots import Slots
 
 SEED = 3
@@ -66,7 +66,7 @@ def agree(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
 
 
 def test_an_outlook_that_counts_follows_the_requests() -> None:
-    outlook = Counting(window=4)
+    outlook = SequentialPrefetch(window=4)
     assert outlook.upcoming({0, 1, 3}) == (2, 2)
     outlook.answer(5)
     assert outlook.upcoming({2}) == (3, 3)
@@ -80,14 +80,14 @@ def test_an_outlook_that_counts_follows_the_requests() -> None:
 
 
 def test_an_outlook_that_was_told_knows_every_use() -> None:
-    outlook = Told([7, 9, 7, 8], window=4)
+    outlook = KnownOrder([7, 9, 7, 8], window=4)
     assert outlook.upcoming(()) == (0, 7)
     assert outlook.upcoming({7}) == (1, 9)
     outlook.answer(7)
     assert [outlook.next_use(n, 0) for n in (7, 8, 9, 6)] == [2, 3, 1, NEVER]
     assert outlook.upcoming({7, 9}) == (3, 8)
     assert outlook.upcoming({7, 8, 9}) is None
-    outlook = Told([7, 9, 7, 8], window=4)
+    outlook = KnownOrder([7, 9, 7, 8], window=4)
     assert [outlook.answer(n) for n in (7, 9)] == [7, 9]
     assert outlook.upcoming(()) == (2, 7)  # what was asked for already is not made for that
     for number in (7, 8, 5):
@@ -96,7 +96,7 @@ def test_an_outlook_that_was_told_knows_every_use() -> None:
 
 
 def test_a_pool_replaces_its_oldest_scans() -> None:
-    outlook = Pool(size=4, replaced=1)
+    outlook = RotatingPool(size=4, replaced=1)
     assert [outlook.answer(n) for n in range(6)] == [0, 1, 2, 3, 0, 1]
     outlook.set_epoch(2)
     assert [outlook.answer(n) for n in range(6)] == [4, 5, 2, 3, 4, 5]

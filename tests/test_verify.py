@@ -17,7 +17,7 @@ from test_generator import write
 from typer.testing import CliRunner
 
 import lidar_synth.bake.repair as repair_module
-from lidar_synth.bake import Job, bake, make_plan
+from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.bake.edit import head, merge, split
 from lidar_synth.bake.folder import SETTINGS, write_bank_files
 from lidar_synth.bake.repair import repair
@@ -35,7 +35,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def baked(out: Path, model: Path, **settings: Any) -> Path:
-    bake(make_plan(out, Job(**{"model": str(model), "count": 8, "shard_size": 3} | settings)), progress=False)
+    bake(make_plan(out, BakeJob(**{"model": str(model), "count": 8, "shard_size": 3} | settings)), progress=False)
     return out
 
 
@@ -160,7 +160,7 @@ def test_damage_beside_the_shards_by_command(root: Path, model: Path) -> None:
     assert status == 1 and f"{SETTINGS}: has sha256" in output and "damaged, or was edited" in output
     status, output = call("repair", root)
     assert status == 0 and f"{SETTINGS}: written again from the index" in output
-    assert bake(make_plan(root, Job(model=str(model), count=8, shard_size=3)), progress=False) is not None
+    assert bake(make_plan(root, BakeJob(model=str(model), count=8, shard_size=3)), progress=False) is not None
 
 
 def test_a_bank_under_another_name_is_whole(root: Path, tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_an_index_of_an_older_version_names_no_other_files(root: Path, original:
     assert Bank(root).identity == Bank(original).identity
     (root / "README.md").unlink()
     assert verify(root, progress=False) == [] and repair(root, progress=False) == {}
-    bake(make_plan(root, Job(model=str(model), count=8, shard_size=3)), progress=False)
+    bake(make_plan(root, BakeJob(model=str(model), count=8, shard_size=3)), progress=False)
     assert list(json.loads((root / SETTINGS).read_bytes())) == list(reversed(settings))
     assert verify(root, progress=False) == [] and (root / "README.md").is_file()
     flip(root / SETTINGS, 80)
@@ -290,7 +290,7 @@ def test_other_bytes_are_written_down(root: Path, model: Path, monkeypatch: pyte
     assert "with other bytes" in (root / "README.md").read_text()
     for old, new in zip(before, (scan.points for scan in Bank(root)), strict=True):
         assert np.allclose(old, new, rtol=1e-3)
-    bake_again = make_plan(root, Job(model=str(model), count=8, shard_size=3))
+    bake_again = make_plan(root, BakeJob(model=str(model), count=8, shard_size=3))
     index = bake(bake_again, progress=False)
     assert index is not None and index.repairs  # going on does not forget
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lidar_synth.bake import Job, bake, make_plan
+from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import check_shard
 from lidar_synth.bank import Bank, ShardReader
@@ -58,7 +58,7 @@ def main() -> None:
     rng = np.random.default_rng(given.seed)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "bank"
-        index = bake(make_plan(root, Job(model=given.model, count=4, shard_size=2)), progress=False)
+        index = bake(make_plan(root, BakeJob(model=given.model, count=4, shard_size=2)), progress=False)
         assert index is not None
         path, facts, entry = root / index.shards[1].file, index.sources[0], index.shards[1]
         content, whole, arrays = path.read_bytes(), by_index(root, 1), alone(path)

@@ -21,12 +21,12 @@ from pathlib import Path
 from bench.untrained import write_untrained
 from tqdm import tqdm
 
-from lidar_synth.bake import Job, Plan, Resources, bake, make_plan
+from lidar_synth.bake import BakeJob, BakePlan, Resources, bake, make_plan
 from lidar_synth.bake.verify import verify
 from lidar_synth.bank import INDEX
 
 
-def start(plan: Plan, engine: str, workers: int) -> int:
+def start(plan: BakePlan, engine: str, workers: int) -> int:
     """Bake in a child process with a group of its own; its id."""
     child = os.fork()
     if child:
@@ -74,7 +74,7 @@ def main() -> None:
     chance = random.Random(given.seed)
     with tempfile.TemporaryDirectory() as folder:
         model = given.model or str(write_untrained(Path(folder) / "untrained.safetensors"))
-        job = Job(model=model, count=given.count, shard_size=given.shard_size)
+        job = BakeJob(model=model, count=given.count, shard_size=given.shard_size)
         whole, plan = (make_plan(Path(folder) / name / "bank", job) for name in ("whole", "killed"))
         assert not killed(start(whole, "local", 1), 1e6)
         begin = time.monotonic()

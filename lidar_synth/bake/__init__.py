@@ -5,9 +5,9 @@ the engines (``local``, ``processes``, ``ray_actors``, ``slurm``, ``torchrun``);
 look after banks that are there.
 """
 
-from lidar_synth.bake.job import Job, Plan, make_plan
+from lidar_synth.bake.job import BakeJob, BakePlan, make_plan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.run import ENGINES, Share, bake
 from lidar_synth.bake.shard import bake_shard
 
-__all__ = ["ENGINES", "Job", "Plan", "Resources", "Share", "bake", "bake_shard", "make_plan"]
+__all__ = ["ENGINES", "BakeJob", "BakePlan", "Resources", "Share", "bake", "bake_shard", "make_plan"]

@@ -3,7 +3,7 @@
 import time
 from typing import NamedTuple
 
-from lidar_synth.bake.job import Plan
+from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.shard import generate, load_checked, one_computer
 from lidar_synth.bank.chunks import deflate
 
@@ -20,7 +20,7 @@ class Estimate(NamedTuple):
     seconds: float
 
 
-def estimate(plan: Plan) -> Estimate:
+def estimate(plan: BakePlan) -> Estimate:
     """Make two micro-batches, the first to warm up, and count on.
 
     Raises:

@@ -19,7 +19,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from lidar_synth.bake.job import Plan, settings_of
+from lidar_synth.bake.job import BakePlan, settings_of
 from lidar_synth.bake.lock import alone, shared
 from lidar_synth.bank import INDEX, Entry, Index
 from lidar_synth.bank.card import card_files
@@ -34,7 +34,7 @@ LOGS = ".slurm"
 """Folder of the logs of Slurm's jobs, in the bank's folder until that is finished."""
 
 
-def prepare(plan: Plan) -> None:
+def prepare(plan: BakePlan) -> None:
     """Claim the folder for the plan's settings, and clear away what killed runs left half-made.
 
     Raises:
@@ -48,7 +48,7 @@ def prepare(plan: Plan) -> None:
 
 
 @contextmanager
-def at_work(plan: Plan) -> Iterator[None]:
+def at_work(plan: BakePlan) -> Iterator[None]:
     """While it lasts, no process clears anything away in the plan's folder.
 
     Raises:
@@ -59,7 +59,7 @@ def at_work(plan: Plan) -> Iterator[None]:
         yield
 
 
-def recorded(plan: Plan, number: int) -> Entry | None:
+def recorded(plan: BakePlan, number: int) -> Entry | None:
     """What was noted of a shard when it was made, in its own note or in the index."""
     wanted = plan.shards[number]
     with suppress(FileError, ValueError, TypeError):
@@ -71,7 +71,7 @@ def recorded(plan: Plan, number: int) -> Entry | None:
     return there if there is not None and replace(there, bytes=0, sha256="") == wanted else None
 
 
-def finished(plan: Plan, number: int) -> Entry | None:
+def finished(plan: BakePlan, number: int) -> Entry | None:
     """The shard, if its file is there and has the hash that was noted."""
     entry = recorded(plan, number)
     if entry is None:
@@ -83,7 +83,7 @@ def finished(plan: Plan, number: int) -> Entry | None:
     return None
 
 
-def publish(plan: Plan, number: int, part: Path) -> Entry:
+def publish(plan: BakePlan, number: int, part: Path) -> Entry:
     """Note a shard that was written beside its place, and put it there.
 
     Raises:
@@ -103,7 +103,7 @@ def publish(plan: Plan, number: int, part: Path) -> Entry:
     return entry
 
 
-def finish(plan: Plan) -> Index | None:
+def finish(plan: BakePlan) -> Index | None:
     """Write index and card, if every shard is noted and there; None where some are still missing.
 
     Raises:
@@ -176,7 +176,7 @@ def sync_folder(path: Path) -> None:
             os.close(handle)
 
 
-def check_folder(plan: Plan) -> None:
+def check_folder(plan: BakePlan) -> None:
     """Refuse a folder that is not, or no more, the one that ``prepare`` claimed.
 
     Raises:
@@ -224,5 +224,5 @@ def _parsed(path: Path, *version: int) -> Index | None:
         return None
 
 
-def _note(plan: Plan, number: int) -> Path:
+def _note(plan: BakePlan, number: int) -> Path:
     return plan.out / NOTES / f"{plan.shards[number].file}.json"

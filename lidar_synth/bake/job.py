@@ -32,7 +32,7 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 """What a network may compute in, by name."""
 
 
-class Job(BaseModel):
+class BakeJob(BaseModel):
     """Settings of a bake; unknown keys are refused.
 
     Args:
@@ -79,7 +79,7 @@ class Job(BaseModel):
 
 
 @dataclass(frozen=True)
-class Plan:
+class BakePlan:
     """A job on a checkpoint that was looked at, and where its bank goes. Small, and can be sent to any process.
 
     Args:
@@ -89,7 +89,7 @@ class Plan:
     """
 
     out: Path
-    job: Job
+    job: BakeJob
     facts: Facts
 
     @cached_property
@@ -121,7 +121,7 @@ def settings_of(facts: Facts) -> dict[str, Any]:
     return dict(sorted((facts.settings | others | facts.software).items()))
 
 
-def make_plan(out: str | Path, job: Job) -> Plan:
+def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     """Look at the checkpoint and settle what the job leaves open, before any work starts.
 
     Raises:
@@ -158,10 +158,10 @@ def make_plan(out: str | Path, job: Job) -> Plan:
         licence=str(header.provenance["licence"]), data_licence=str(header.provenance["data_licence"]),
         provenance=header.provenance, software=software, compression=job.compression, layout=job.layout,
     )  # fmt: skip
-    return Plan(Path(out), settled, facts)
+    return BakePlan(Path(out), settled, facts)
 
 
-def _fields(job: Job, given: frozenset[str]) -> tuple[str, ...]:
+def _fields(job: BakeJob, given: frozenset[str]) -> tuple[str, ...]:
     """What the scans will carry, in the order in which it is stored."""
     wanted = given if job.fields is None else set(job.fields)
     if lacking := sorted(wanted - given):

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 
-from lidar_synth.bake.job import Plan
+from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 
 
-def bake_local(plan: Plan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+def bake_local(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
     """Make the shards here."""
     for number in numbers:
         bake_shard(plan, number, progress)

@@ -12,7 +12,7 @@ from multiprocessing import get_context, parent_process
 from operator import attrgetter
 from typing import Any
 
-from lidar_synth.bake.job import Plan
+from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import FileError
@@ -21,7 +21,7 @@ _LOOK = 0.2  # seconds between two looks at the workers
 _PATIENCE = 60  # seconds for a worker to give up its shard
 
 
-def bake_in_processes(plan: Plan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+def bake_in_processes(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
     """Make the shards in ``resources.workers`` processes.
 
     Raises:
@@ -91,7 +91,7 @@ def _tell(progress: Progress, scans: int) -> int:
     return scans
 
 
-def _work(plan: Plan, numbers: Sequence[int], taken: Any, scans: Any, stop: Any, errors: Any, rank: int) -> None:
+def _work(plan: BakePlan, numbers: Sequence[int], taken: Any, scans: Any, stop: Any, errors: Any, rank: int) -> None:
     """One worker: until there is no shard left, or the run is stopped."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows, where none can be deaf from the start
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from lidar_synth.bake.job import Plan
+from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError, FileError, LibraryError
@@ -20,7 +20,7 @@ _LOSSES = 5  # actors that may be lost, for each worker, while no shard is made
 class Baker:
     """What an actor holds: the plan; the model stays loaded between shards."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: BakePlan) -> None:
         self._plan = plan
 
     def ready(self) -> None:
@@ -31,7 +31,7 @@ class Baker:
         return bake_shard(self._plan, number).scans
 
 
-def bake_on_ray(plan: Plan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+def bake_on_ray(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
     """Make the shards by ``resources.workers`` actors.
 
     Raises:

@@ -9,7 +9,7 @@ import torch
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import SETTINGS, sync_folder, write_bank_files
-from lidar_synth.bake.job import Plan
+from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.shard import load_checked, write_shard
 from lidar_synth.bake.verify import check_scans, check_shard, check_side_files, job_of, read_index
 from lidar_synth.bank import INDEX, Entry, Facts, Index, ShardReader
@@ -95,7 +95,7 @@ def _index_from_shards(root: Path, damage: Exception) -> Index:
     if not found:
         raise DataError(f"{damage}, and no shard of {root} can be read", "at least one") from damage
     facts = next(iter(found.values()))[0]
-    shards = Plan(root, job_of(facts), facts).shards
+    shards = BakePlan(root, job_of(facts), facts).shards
     if any(other != facts for other, _ in found.values()) or not {e for _, e in found.values()} <= set(shards):
         raise DataError(f"{damage}, and the shards of {root} are not one bake's", "a copy of the index") from damage
     entries = []

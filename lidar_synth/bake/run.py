@@ -13,7 +13,7 @@ from types import FrameType
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import at_work, finish, finished, prepare
-from lidar_synth.bake.job import Plan
+from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.local import bake_local
 from lidar_synth.bake.processes import bake_in_processes
 from lidar_synth.bake.ray_actors import bake_on_ray
@@ -25,7 +25,7 @@ from lidar_synth.bank import Index
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.source import choose
 
-Engine = Callable[[Plan, Sequence[int], Resources, Progress], None]
+Engine = Callable[[BakePlan, Sequence[int], Resources, Progress], None]
 
 ENGINES: dict[str, Engine] = {
     "local": bake_local,
@@ -54,7 +54,7 @@ class Share:
 
 
 def bake(
-    plan: Plan,
+    plan: BakePlan,
     engine: str = "local",
     resources: Resources | None = None,
     share: Share | None = None,

@@ -11,7 +11,7 @@ import torch
 
 from lidar_synth.bake.conditions import condition_names, conditions, open_conditions
 from lidar_synth.bake.folder import at_work, finished, publish
-from lidar_synth.bake.job import DTYPES, Job, Plan
+from lidar_synth.bake.job import DTYPES, BakeJob, BakePlan
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import part_of
@@ -25,7 +25,7 @@ Progress = Callable[[int], object]
 """Called with the number of scans that were just made; what it raises stops the shard."""
 
 
-def bake_shard(plan: Plan, number: int, progress: Progress = lambda scans: None) -> Entry:
+def bake_shard(plan: BakePlan, number: int, progress: Progress = lambda scans: None) -> Entry:
     """Make one shard, unless it is there.
 
     Args:
@@ -57,7 +57,7 @@ def bake_shard(plan: Plan, number: int, progress: Progress = lambda scans: None)
                 part.unlink(missing_ok=True)
 
 
-def write_shard(generator: Generator, path: Path, job: Job, facts: Facts, entry: Entry, progress: Progress) -> None:
+def write_shard(generator: Generator, path: Path, job: BakeJob, facts: Facts, entry: Entry, progress: Progress) -> None:
     """Generate the scans of a shard and write them; the same settings give the same bytes.
 
     Raises:
@@ -73,7 +73,7 @@ def write_shard(generator: Generator, path: Path, job: Job, facts: Facts, entry:
             progress(1)
 
 
-def images(generator: Generator, job: Job, entry: Entry) -> Iterator[RangeImage]:
+def images(generator: Generator, job: BakeJob, entry: Entry) -> Iterator[RangeImage]:
     """The range images of a shard, in micro-batches that start with it."""
     size = job.batch or generator.batch
     stop = entry.first + entry.scans
@@ -82,7 +82,7 @@ def images(generator: Generator, job: Job, entry: Entry) -> Iterator[RangeImage]
         yield from generate(generator, job, indices)
 
 
-def generate(generator: Generator, job: Job, indices: Sequence[int]) -> list[RangeImage]:
+def generate(generator: Generator, job: BakeJob, indices: Sequence[int]) -> list[RangeImage]:
     """The range images of some indices, as the job has them made.
 
     Raises:
@@ -92,7 +92,7 @@ def generate(generator: Generator, job: Job, indices: Sequence[int]) -> list[Ran
     return generator.range_images(job.seed, indices, given, steps=job.steps, solver=job.solver, guidance=job.guidance)
 
 
-def _source(job: Job) -> ScanFiles | None:
+def _source(job: BakeJob) -> ScanFiles | None:
     return open_conditions(job.condition, job.condition_layout, job.condition_split)
 
 
@@ -112,7 +112,7 @@ def _load(model: str, device: str, dtype: str, batch: int) -> Generator:
     return load_generator(model, device=device, dtype=DTYPES[dtype], batch=batch)
 
 
-def load_checked(job: Job, facts: Facts) -> Generator:
+def load_checked(job: BakeJob, facts: Facts) -> Generator:
     """The model behind a bank, once per process.
 
     Raises:
@@ -129,7 +129,7 @@ def load_checked(job: Job, facts: Facts) -> Generator:
     return generator
 
 
-def _check_space(plan: Plan, entry: Entry) -> None:
+def _check_space(plan: BakePlan, entry: Entry) -> None:
     need = int(entry.scans * plan.scan_bytes * _PACKED)
     free = shutil.disk_usage(plan.out).free
     if free < need:

@@ -1,6 +1,6 @@
 """Engine ``slurm``: an array of Slurm jobs by submitit, all writing to a folder that every node sees.
 
-Job k of n takes every n-th shard. submitit puts a job that was preempted or ran out of time back into the queue; it
+BakeJob k of n takes every n-th shard. submitit puts a job that was preempted or ran out of time back into the queue; it
 goes on where whole shards end. Options are submitit's (``slurm_partition``, ``timeout_min``), and ``cluster``: "local"
 runs the jobs as processes of this machine, to try things without Slurm.
 """
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from lidar_synth.bake.folder import LOGS
-from lidar_synth.bake.job import Plan
+from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError, FileError, LibraryError
@@ -19,21 +19,21 @@ _TIMEOUTS = 1000  # how often a job may run out of time and go on
 _LOOK = 1  # seconds between two looks at the jobs
 
 
-class Part:
+class SlurmTask:
     """What one job makes. submitit calls it, and asks it what to run again after a preemption."""
 
-    def __call__(self, plan: Plan, numbers: Sequence[int]) -> int:
+    def __call__(self, plan: BakePlan, numbers: Sequence[int]) -> int:
         """The number of scans of the shards."""
         return sum(bake_shard(plan, number).scans for number in numbers)
 
-    def checkpoint(self, plan: Plan, numbers: Sequence[int]) -> Any:
+    def checkpoint(self, plan: BakePlan, numbers: Sequence[int]) -> Any:
         """The same: shards that are finished are passed over."""
         import submitit
 
         return submitit.helpers.DelayedSubmission(self, plan, numbers)
 
 
-def bake_on_slurm(plan: Plan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+def bake_on_slurm(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
     """Make the shards by an array of ``resources.workers`` jobs and wait for them.
 
     Raises:
@@ -44,7 +44,7 @@ def bake_on_slurm(plan: Plan, numbers: Sequence[int], resources: Resources, prog
     submitit = _import_submitit()
     workers = min(resources.workers, len(numbers))
     executor = _executor(submitit, plan, resources.slurm)
-    jobs = executor.map_array(Part(), [plan] * workers, [numbers[k::workers] for k in range(workers)])
+    jobs = executor.map_array(SlurmTask(), [plan] * workers, [numbers[k::workers] for k in range(workers)])
     try:
         for job in submitit.helpers.as_completed(jobs, poll_frequency=_LOOK):
             progress(job.result())
@@ -60,7 +60,7 @@ def bake_on_slurm(plan: Plan, numbers: Sequence[int], resources: Resources, prog
                 job.cancel()
 
 
-def _executor(submitit: Any, plan: Plan, options: dict[str, str | int]) -> Any:
+def _executor(submitit: Any, plan: BakePlan, options: dict[str, str | int]) -> Any:
     """What takes the jobs, with the options of a job set."""
     share = {"gpus_per_node": 1} if plan.job.device == "cuda" else {"cpus_per_task": plan.job.threads}
     values = _OPTIONS | share | options

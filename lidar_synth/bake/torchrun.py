@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import torch
 
-from lidar_synth.bake.job import Plan
+from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError
 
 
-def bake_under_torchrun(plan: Plan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+def bake_under_torchrun(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
     """Make this process's shards.
 
     Raises:

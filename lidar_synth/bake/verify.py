@@ -8,7 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import SETTINGS
-from lidar_synth.bake.job import Job
+from lidar_synth.bake.job import BakeJob
 from lidar_synth.bake.shard import generate, load_checked, one_computer
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.card import CARD, CROISSANT
@@ -151,7 +151,7 @@ def agreement(one: RangeImage, other: RangeImage) -> float:
     return float(same.mean())
 
 
-def job_of(facts: Facts, model: str | None = None) -> Job:
+def job_of(facts: Facts, model: str | None = None) -> BakeJob:
     """The settings with which a bank's scans can be made again.
 
     Args:
@@ -163,7 +163,7 @@ def job_of(facts: Facts, model: str | None = None) -> Job:
     """
     told = {"compression": facts.compression, "layout": facts.layout, "fields": facts.fields}
     try:
-        return Job(**facts.settings | told, model=model or facts.model)
+        return BakeJob(**facts.settings | told, model=model or facts.model)
     except (ValueError, TypeError) as error:
         raise DataError(f"settings {facts.settings} of a bank", "those of a bake") from error
 

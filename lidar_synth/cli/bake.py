@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from lidar_synth.bake import Plan, Resources
+    from lidar_synth.bake import BakePlan, Resources
 
 
 def bake(
@@ -54,7 +54,7 @@ def bake(
       lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4
       torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 --device cuda --engine torchrun
     """
-    from lidar_synth.bake import Job, Share, make_plan
+    from lidar_synth.bake import BakeJob, Share, make_plan
     from lidar_synth.bake import bake as run
     from lidar_synth.train.config import read_values, validated
 
@@ -65,10 +65,10 @@ def bake(
         "guidance": guidance, "dtype": dtype, "device": device, "threads": threads,
         "compression": compression, "layout": layout,
     }  # fmt: skip
-    values = {} if config is None else read_values(config, Job)
+    values = {} if config is None else read_values(config, BakeJob)
     values |= {name: value for name, value in chosen.items() if value is not None}
     share = Share(shard_index, num_shards)
-    plan = make_plan(out, validated(Job, values, "bake" if config is None else str(config)))
+    plan = make_plan(out, validated(BakeJob, values, "bake" if config is None else str(config)))
     if dry_run:
         _describe(plan)
         return
@@ -84,7 +84,7 @@ def bake(
         typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards, {index.size / 1e6:.3g} MB")
 
 
-def _resources(plan: "Plan", workers: int | None, address: str | None, slurm: list[str] | None) -> "Resources":
+def _resources(plan: "BakePlan", workers: int | None, address: str | None, slurm: list[str] | None) -> "Resources":
     import torch
 
     from lidar_synth.bake import Resources
@@ -100,7 +100,7 @@ def _resources(plan: "Plan", workers: int | None, address: str | None, slurm: li
     return Resources(workers if workers is not None else here or 1, address, options)
 
 
-def _describe(plan: "Plan") -> None:
+def _describe(plan: "BakePlan") -> None:
     """What a bake would make; the time by trying."""
     from lidar_synth.bake.estimate import estimate
 

@@ -52,7 +52,7 @@ VELOCITY, CODEC, ENCODER = "velocity", "codec", "condition"
 """Parts: the flow's velocity network, the autoencoder, the encoder of the condition."""
 
 
-class Part(NamedTuple):
+class NetworkSpec(NamedTuple):
     """A network as ``nets.build_network`` takes it."""
 
     architecture: str
@@ -67,7 +67,7 @@ class Header:
         ConfigError: on channels, a time grid or a provenance that no checkpoint may have.
     """
 
-    networks: dict[str, Part]
+    networks: dict[str, NetworkSpec]
     sensor: Sensor
     normalisation: Normalisation
     channels: tuple[str, ...]
@@ -127,7 +127,7 @@ class Header:
             raise ConfigError(f"format {given!r}", repr(FORMAT), "Use the version of lidar_synth that wrote it.")
         try:
             header = cls(
-                networks={name: Part(**part) for name, part in values["networks"].items()},
+                networks={name: NetworkSpec(**part) for name, part in values["networks"].items()},
                 sensor=Sensor.from_dict(values["sensor"]),
                 normalisation=Normalisation(**values["normalisation"]),
                 channels=tuple(values["channels"]),

@@ -28,7 +28,7 @@ class Codec(Protocol):
         """Tensors (B, C, H, W) to states (B, *shape)."""
         ...
 
-    def decode(self, y: Tensor, chance: Tensor | None = None) -> Tensor:
+    def decode(self, y: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         """States (B, *shape) to tensors (B, C, H, W), drawn by (B, draws, H, W) numbers in (0, 1), or the likeliest."""
         ...
 
@@ -52,7 +52,7 @@ class Autoencoder(Protocol):
         """Images (B, C, H, W) to latents of about mean 0 and variance 1."""
         ...
 
-    def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
+    def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         """Latents to images; label bits as logits."""
         ...
 
@@ -72,7 +72,7 @@ class Identity:
         """(B, C, H, W), as it is."""
         return x
 
-    def decode(self, y: Tensor, chance: Tensor | None = None) -> Tensor:
+    def decode(self, y: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         """(B, C, H, W), as it is."""
         return y
 
@@ -105,16 +105,16 @@ class Latent:
         return self.network.encode(x).float()
 
     @torch.no_grad()
-    def decode(self, y: Tensor, chance: Tensor | None = None) -> Tensor:
-        """Latents (B, *shape), through the codebook, to tensors (B, C, H, W), drawn by ``chance`` (B, draws, H, W) or
-        the likeliest.
+    def decode(self, y: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
+        """Latents (B, *shape), through the codebook, to tensors (B, C, H, W), drawn by ``uniform_noise`` (B, draws, H,
+        W) or the likeliest.
 
         Raises:
             DataError: on latents of another shape.
         """
         if y.shape[1:] != self.shape:
             raise DataError(f"a latent of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, self.shape))})")
-        return expected(self.network.decode(y, chance).float(), self.tensors)
+        return expected(self.network.decode(y, uniform_noise).float(), self.tensors)
 
 
 def expected(output: Tensor, tensors: TensorFormat) -> Tensor:

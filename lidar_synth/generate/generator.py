@@ -194,10 +194,10 @@ class Generator:
         for first in range(0, len(indices), self.batch):
             part = slice(first, first + self.batch)
             noise = gaussian(seed, indices[part], codec.shape, self.device)
-            chance = uniform(seed, indices[part], drawn, self.device) if codec.draws else None
+            uniform_noise = uniform(seed, indices[part], drawn, self.device) if codec.draws else None
             with torch.inference_mode():
                 velocity, cond = self._flow(None if condition is None else condition[part], guidance)
-                yield codec.decode(solve(velocity, noise, grid, solver, cond), chance)
+                yield codec.decode(solve(velocity, noise, grid, solver, cond), uniform_noise)
 
     def _flow(self, condition: Tensor | None, guidance: float) -> tuple[Velocity, Tensor | None]:
         """The flow to solve and what to give it: a condition is encoded once, not at every step."""

@@ -17,7 +17,7 @@ from lidar_synth.labels.boxes import overlapping, unseen, widened
 from lidar_synth.labels.ground import CLEARANCE, ground_under, standing
 from lidar_synth.labels.merge import merged
 from lidar_synth.labels.objects import Object
-from lidar_synth.labels.view import Part, View, refuse_coarser
+from lidar_synth.labels.view import View, VisibleReturns, refuse_coarser
 
 LIFT = 1.0
 """Metres by which an object is raised or lowered at most: farther, the sensor would see another side of it."""
@@ -82,7 +82,7 @@ def _raised(candidate: Object, height: float) -> Object:
     return Object(replace(candidate.scan, points=candidate.scan.points + lift, boxes=boxes), height)
 
 
-def _as_seen(scan: Scan, part: Part) -> Scan:
+def _as_seen(scan: Scan, part: VisibleReturns) -> Scan:
     """An object's returns that are seen, as an instance, with its occlusion."""
     assert scan.boxes is not None
     seen = scan[part.seen]

@@ -15,7 +15,7 @@ from lidar_synth.labels.objects import Object
 
 
 @dataclass
-class Part:
+class VisibleReturns:
     """The returns of the scan or of one object.
 
     Args:
@@ -49,7 +49,7 @@ class View:
     def __init__(self, scan: Scan) -> None:
         self.sensor = scan.sensor
         cell, distance, point = locate(scan.points, scan.sensor)
-        self.parts = [Part(cell, distance, np.ones(len(scan), bool), len(scan))]
+        self.parts = [VisibleReturns(cell, distance, np.ones(len(scan), bool), len(scan))]
         empty = point < 0
         self._front = np.full(point.shape, np.inf, np.float32)
         self._height = np.zeros(point.shape, np.float32)
@@ -78,7 +78,7 @@ class View:
         self._stand(*outline, top=placed.box[2] + placed.box[5] / 2)
         visible = np.zeros(len(cell), bool)
         visible[nearest[seen]] = True
-        self.parts.append(Part(cell, distance, visible, len(nearest)))
+        self.parts.append(VisibleReturns(cell, distance, visible, len(nearest)))
         return True
 
     def _stand(

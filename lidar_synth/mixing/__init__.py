@@ -6,8 +6,8 @@ The plan of an epoch (plan.py) is a pure function of seed and epoch; datasets, b
 from lidar_synth.mixing.batches import MixedBatches
 from lidar_synth.mixing.collate import Collate
 from lidar_synth.mixing.items import Item, to_item
-from lidar_synth.mixing.plan import Plan, plan
-from lidar_synth.mixing.quotas import Mixture, Part
+from lidar_synth.mixing.plan import MixingPlan, plan
+from lidar_synth.mixing.quotas import Mixture, PlannedSource
 from lidar_synth.mixing.scans import MixedScans
 from lidar_synth.mixing.schedules import Linear, make_schedule
 from lidar_synth.mixing.sources import Sources
@@ -23,9 +23,9 @@ __all__ = [
     "MixedBatches",
     "MixedScans",
     "MixedStream",
+    "MixingPlan",
     "Mixture",
-    "Part",
-    "Plan",
+    "PlannedSource",
     "Sources",
     "Synthetic",
     "make_schedule",

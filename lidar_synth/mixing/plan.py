@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.mixing.permutation import permute
-from lidar_synth.mixing.quotas import Mixture, Part, deal, quotas, running_counts, synthetic_before
+from lidar_synth.mixing.quotas import Mixture, PlannedSource, deal, quotas, running_counts, synthetic_before
 from lidar_synth.mixing.schedules import share_of
 
 VERSION = "lidar-synth-plan/2"
-"""Part of every plan's hash; changes when the same mixture gives another order."""
+"""PlannedSource of every plan's hash; changes when the same mixture gives another order."""
 
 _ORDER, _REALS, _SOURCES = range(3)  # streams of the permutations; each source has one of its own
 _BLOCK = 256  # positions that are computed together: most are asked for one after another
@@ -33,7 +33,7 @@ _BLOCKS = 8  # blocks that are kept
 
 
 @dataclass(frozen=True)
-class Plan:
+class MixingPlan:
     """An epoch: what stands at each of its N positions.
 
     ``plan[position]`` is the number of the source (the real ones in order, then the synthetic ones) and the local index
@@ -203,10 +203,10 @@ class Plan:
         return number if part.length is None else number % part.length
 
 
-def plan(mixture: Mixture, epoch: int) -> Plan:
-    """The plan of an epoch; see ``Plan``."""
-    return Plan(mixture, epoch)
+def plan(mixture: Mixture, epoch: int) -> MixingPlan:
+    """The plan of an epoch; see ``MixingPlan``."""
+    return MixingPlan(mixture, epoch)
 
 
-def _facts_of(part: Part) -> dict[str, Any]:
+def _facts_of(part: PlannedSource) -> dict[str, Any]:
     return {"length": part.length, "weight": part.weight, "identity": part.identity}

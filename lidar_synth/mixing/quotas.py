@@ -32,7 +32,7 @@ _LOOKED_AT = 100  # epochs of a changing schedule that tell how long a lap is
 
 
 @dataclass(frozen=True)
-class Part:
+class PlannedSource:
     """A source of scans as the plan sees it.
 
     Args:
@@ -67,8 +67,8 @@ class Mixture:
         DataError: on a real source without scans.
     """
 
-    real: tuple[Part, ...]
-    synthetic: tuple[Part, ...]
+    real: tuple[PlannedSource, ...]
+    synthetic: tuple[PlannedSource, ...]
     ratio: Schedule
     seed: int = 0
     epoch_size: EpochSize = "add"

@@ -16,8 +16,8 @@ from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
 from lidar_synth.mixing.epochs import CurrentEpoch, Position
 from lidar_synth.mixing.items import to_item
-from lidar_synth.mixing.plan import Plan
-from lidar_synth.mixing.quotas import EpochSize, Mixture, Part
+from lidar_synth.mixing.plan import MixingPlan
+from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
 from lidar_synth.mixing.schedules import Schedule, make_schedule
 from lidar_synth.mixing.sources import check_together, each, identity_of
 from lidar_synth.mixing.synthetic import make_synthetic
@@ -108,8 +108,8 @@ class MixedScans(Dataset[Any]):
         self.real = tuple(source for source, _ in reals)
         self.synthetic = tuple(source for source, _ in synthetics)
         self.mixture = Mixture(
-            tuple(Part(len(source), weight, identity_of(source)) for source, weight in reals),
-            tuple(Part(source.length, weight, source.identity) for source, weight in synthetics),
+            tuple(PlannedSource(len(source), weight, identity_of(source)) for source, weight in reals),
+            tuple(PlannedSource(source.length, weight, source.identity) for source, weight in synthetics),
             make_schedule(ratio), seed, epoch_size, reuse, balanced,
         )  # fmt: skip
         sources = self.synthetic if real_as_is else self.real + self.synthetic
@@ -123,7 +123,7 @@ class MixedScans(Dataset[Any]):
             collate = Collate(collate, sensors[0] if sensors else None, "allow" if labels == "none" else unlabelled)
         self.collate: Callable[[Any], Any] = collate
         self.current = CurrentEpoch()
-        self._planned: tuple[int, Plan] | None = None
+        self._planned: tuple[int, MixingPlan] | None = None
         self.set_epoch(0)
         if real_as_is and compare:
             check_alike(self.real, self.synthetic, self._finish)
@@ -199,7 +199,7 @@ class MixedScans(Dataset[Any]):
         Raises:
             ConfigError: on an epoch for which there is no ratio.
         """
-        Plan(self.mixture, epoch)
+        MixingPlan(self.mixture, epoch)
         self.current.set(epoch)
         if get_worker_info() is None:
             for source in self.synthetic:
@@ -207,11 +207,11 @@ class MixedScans(Dataset[Any]):
                     source.set_epoch(epoch)
             self.expect(epoch)
 
-    def plan(self, epoch: int | None = None) -> Plan:
+    def plan(self, epoch: int | None = None) -> MixingPlan:
         """The plan of an epoch, by default of the current one; its hash is logged once in the main process."""
         epoch = self.epoch if epoch is None else epoch
         if self._planned is None or self._planned[0] != epoch:
-            self._planned = (epoch, Plan(self.mixture, epoch))
+            self._planned = (epoch, MixingPlan(self.mixture, epoch))
             if get_worker_info() is None:
                 made = self._planned[1]
                 log.info(
@@ -238,7 +238,7 @@ class MixedScans(Dataset[Any]):
     def length(self, epoch: int) -> int:
         """Samples of an epoch."""
         made = self._planned
-        return len(made[1] if made is not None and made[0] == epoch else Plan(self.mixture, epoch))
+        return len(made[1] if made is not None and made[0] == epoch else MixingPlan(self.mixture, epoch))
 
     def __len__(self) -> int:
         return self.length(self.epoch)

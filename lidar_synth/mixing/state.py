@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.mixing.plan import Plan
+from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import Mixture
 
 VERSION = 2
@@ -59,7 +59,7 @@ def check_unshared(what: str, rank: int, world_size: int) -> None:
 
 def make_state(mixture: Mixture, epoch: int, position: int) -> dict[str, Any]:
     """The state of a run that goes on at a position of an epoch."""
-    made = Plan(mixture, epoch)
+    made = MixingPlan(mixture, epoch)
     return {
         "version": VERSION,
         "seed": mixture.seed,
@@ -73,9 +73,9 @@ def make_state(mixture: Mixture, epoch: int, position: int) -> dict[str, Any]:
 def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
     """Epoch and position where an epoch is over: the next one's beginning, or its own end where the schedule ends."""
     try:
-        Plan(mixture, epoch + 1)
+        MixingPlan(mixture, epoch + 1)
     except ConfigError:
-        return epoch, len(Plan(mixture, epoch))
+        return epoch, len(MixingPlan(mixture, epoch))
     return epoch + 1, 0
 
 
@@ -91,7 +91,7 @@ def checked_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]
     seed, epoch, position = (int(value or 0) for value in values)
     if seed != mixture.seed:
         raise ConfigError(f"the state of seed {seed} for a mixture of seed {mixture.seed}", "the seed of the state")
-    here = Plan(mixture, epoch)
+    here = MixingPlan(mixture, epoch)
     if "plan" not in state:
         _check_old(state, position)
     elif state["plan"] != here.hash:

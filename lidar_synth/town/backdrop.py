@@ -9,7 +9,7 @@ from lidar_synth.town import furniture as fit
 from lidar_synth.town.boundaries import KINDS as BOUNDARIES
 from lidar_synth.town.boundaries import bound
 from lidar_synth.town.buildings import building
-from lidar_synth.town.facades import Plan, finishes
+from lidar_synth.town.facades import BuildingPlan, finishes
 from lidar_synth.town.furniture import Thing
 from lidar_synth.town.lots import draw_house
 from lidar_synth.town.meshes import Mesh
@@ -78,7 +78,7 @@ def _plain_house(variant: int) -> Mesh:
     """A house that is only seen from afar."""
     rng = np.random.Generator(np.random.Philox(key=variant))
     roof = ("gable", "cross", "hip")[variant % 3]
-    return building(Plan(rng.uniform(9, 16), rng.uniform(8, 11), 1 + variant % 4, roof=roof, detail=False), rng)
+    return building(BuildingPlan(rng.uniform(9, 16), rng.uniform(8, 11), 1 + variant % 4, roof=roof, detail=False), rng)
 
 
 def second_row(street: Street, scene: Scene, rng: Rng) -> None:

@@ -11,8 +11,8 @@ from lidar_synth.town.facades import (
     ROOM,
     SLAB,
     WALL,
+    BuildingPlan,
     Frame,
-    Plan,
     facade,
     panels,
     reveals,
@@ -21,7 +21,7 @@ from lidar_synth.town.facades import (
 from lidar_synth.town.meshes import Mesh, boxes, merge, quads, tube
 
 
-def _balconies(plan: Plan, rng: np.random.Generator) -> Mesh:
+def _balconies(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
     """Slabs along parts of the front with railings of bars or panels."""
     parts = []
     x = rng.uniform(0.5, 1.5)
@@ -42,7 +42,7 @@ def _balconies(plan: Plan, rng: np.random.Generator) -> Mesh:
     return merge(parts)
 
 
-def _roof(plan: Plan, rng: np.random.Generator) -> Mesh:
+def _roof(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
     w, d, z, over = plan.width, plan.depth, plan.eaves, 0.45
     if plan.roof == "flat":
         edge = boxes([(-0.1, -0.1, z - 0.2)], [(w + 0.1, d + 0.1, z + 0.25)], SLAB)
@@ -81,7 +81,7 @@ def _skylights(slope: list[tuple[float, float, float]], count: int, rng: np.rand
     return quads(np.array(corners).reshape(-1, 4, 3), GLASS)
 
 
-def building(plan: Plan, rng: np.random.Generator) -> Mesh:
+def building(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
     """A building of the given measures; see ``finishes`` for its slots."""
     w, d = plan.width, plan.depth
     axes = np.eye(3)

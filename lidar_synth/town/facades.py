@@ -30,7 +30,7 @@ Frame = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
-class Plan:
+class BuildingPlan:
     """A building's measures.
 
     Args:
@@ -127,7 +127,7 @@ def _window(rect: Array, frame: Frame, rng: np.random.Generator) -> Mesh:
     ])  # fmt: skip
 
 
-def _openings(plan: Plan, width: float, front: bool, rng: np.random.Generator) -> tuple[Array, Array]:
+def _openings(plan: BuildingPlan, width: float, front: bool, rng: np.random.Generator) -> tuple[Array, Array]:
     """Rectangles (n, 4: u0, u1, z0, z1) of a facade's windows and doors."""
     count = max(1, int(width / rng.uniform(2.3, 3.3)))
     pitch = width / count
@@ -151,7 +151,7 @@ def _openings(plan: Plan, width: float, front: bool, rng: np.random.Generator) -
     return rect[keep], doors
 
 
-def facade(plan: Plan, width: float, frame: Frame, side: int, rng: np.random.Generator) -> Mesh:
+def facade(plan: BuildingPlan, width: float, frame: Frame, side: int, rng: np.random.Generator) -> Mesh:
     """One wall; side 0 is the front, 3 the back."""
     windows, doors = _openings(plan, width, side == 0, rng)
     if not plan.detail or side == 3:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidar_synth.town.boundaries import KINDS
-from lidar_synth.town.facades import Plan
+from lidar_synth.town.facades import BuildingPlan
 from lidar_synth.town.paving import PLAZA_DEPTH, Paint
 from lidar_synth.town.street import LEFT, RIGHT, Street
 
@@ -36,7 +36,7 @@ class Lot:
     side: int
     front: float
     setback: float
-    plan: Plan | None
+    plan: BuildingPlan | None
     at: float
     driveway: tuple[float, float] | None
     boundary: str
@@ -48,22 +48,26 @@ class Lot:
         return 2 * self.side - 1
 
 
-def draw_house(style: str, width: float, depth: float, rng: Rng) -> Plan:
+def draw_house(style: str, width: float, depth: float, rng: Rng) -> BuildingPlan:
     """A house, row, block, shop or hall of the given width and depth in metres."""
     match style:
         case "house":
             roof = str(rng.choice(["gable", "cross", "hip"], p=[0.6, 0.25, 0.15]))
             floors = int(rng.choice([1, 2, 3], p=[0.3, 0.55, 0.15]))
-            return Plan(width, depth, floors, rng.uniform(2.6, 2.9), rng.uniform(0.2, 1.1), roof, rng.random() < 0.15)
+            return BuildingPlan(
+                width, depth, floors, rng.uniform(2.6, 2.9), rng.uniform(0.2, 1.1), roof, rng.random() < 0.15
+            )
         case "row":
-            return Plan(width, depth, int(rng.integers(2, 4)), rng.uniform(2.7, 3.0), rng.uniform(0.2, 0.8))
+            return BuildingPlan(width, depth, int(rng.integers(2, 4)), rng.uniform(2.7, 3.0), rng.uniform(0.2, 0.8))
         case "block":
             roof = str(rng.choice(["gable", "hip", "flat"]))
-            return Plan(width, depth, int(rng.integers(3, 6)), 2.8, rng.uniform(0.5, 1.2), roof, rng.random() < 0.6)
+            return BuildingPlan(
+                width, depth, int(rng.integers(3, 6)), 2.8, rng.uniform(0.5, 1.2), roof, rng.random() < 0.6
+            )
         case "shop":
             roof = str(rng.choice(["gable", "hip", "flat"]))
-            return Plan(width, depth, int(rng.integers(2, 5)), 3.1, 0.15, roof, rng.random() < 0.2, shop=True)
-    return Plan(width, depth, 1, rng.uniform(4, 7), 0.2, "flat")
+            return BuildingPlan(width, depth, int(rng.integers(2, 5)), 3.1, 0.15, roof, rng.random() < 0.2, shop=True)
+    return BuildingPlan(width, depth, 1, rng.uniform(4, 7), 0.2, "flat")
 
 
 _SIZES = {"house": (8.5, 13.5), "row": (6.0, 8.5), "block": (15.0, 26.0), "shop": (10.0, 18.0), "hall": (18.0, 34.0)}

@@ -102,10 +102,10 @@ class Batches:
     def __call__(self, positions: Sequence[int]) -> Batch:
         """The samples at these positions of the sequence."""
         seed = self.seed + _TRAINING
-        chance = uniform(seed, positions, (5,))
+        draws = uniform(seed, positions, (5,))
         scans = self.scans_at(positions)
-        mirrored = (chance[:, 1] < 0.5) & self.flip
-        columns = (chance[:, 2] * self.cache.sensor.columns).long().tolist()
+        mirrored = (draws[:, 1] < 0.5) & self.flip
+        columns = (draws[:, 2] * self.cache.sensor.columns).long().tolist()
 
         def moved(x: Tensor) -> Tensor:
             x = _where(mirrored, x.flip(-1), x)
@@ -118,8 +118,8 @@ class Batches:
             y0 = y0 if self.codec is None else self.codec.encode(y0)
         cond = None if self.conditioning is None else moved(self._stored(scans))
         if cond is not None:
-            cond = self._dropped(cond, chance)
-        return Batch(y0, gaussian(seed, positions, y0.shape[1:], self.device), chance[:, 0].to(self.device), cond)
+            cond = self._dropped(cond, draws)
+        return Batch(y0, gaussian(seed, positions, y0.shape[1:], self.device), draws[:, 0].to(self.device), cond)
 
     def conditions(self, positions: Sequence[int]) -> Tensor | None:
         """The whole conditions (B, ...) of the scans at these positions, neither blank nor turned; None without."""
@@ -131,13 +131,13 @@ class Batches:
         values = self.cache.fields[CONDITIONS[self.conditioning.name].field][np.asarray(scans, np.int64)]
         return torch.from_numpy(values).to(self.device)
 
-    def _dropped(self, cond: Tensor, chance: Tensor) -> Tensor:
+    def _dropped(self, cond: Tensor, draws: Tensor) -> Tensor:
         """Some conditions (B, ...) blank, some with one view."""
         assert self.conditioning is not None
         about = self.conditioning
         if about.view_dropout:
-            cond = _where(chance[:, 4] < about.view_dropout, one_view(cond, about.views), cond)
-        return _where(chance[:, 3] < about.dropout, blank(about.name, cond), cond) if about.dropout else cond
+            cond = _where(draws[:, 4] < about.view_dropout, one_view(cond, about.views), cond)
+        return _where(draws[:, 3] < about.dropout, blank(about.name, cond), cond) if about.dropout else cond
 
 
 def _where(chosen: Tensor, a: Tensor, b: Tensor) -> Tensor:

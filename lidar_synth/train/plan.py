@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """A run before its first step.
 
     Args:
@@ -84,7 +84,7 @@ class Plan:
         return {**trained, **self.held}
 
 
-def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -> Plan:
+def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -> TrainingPlan:
     """A teacher, a student or an autoencoder.
 
     Raises:
@@ -99,7 +99,7 @@ def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -
     return replace(plan, header=with_recordings(config, plan.header))
 
 
-def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> Plan:
+def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> TrainingPlan:
     """Flow matching, from fresh weights or from those of ``config.init``."""
     task = teacher_task(config.timesteps)
     networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
@@ -108,10 +108,10 @@ def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> Plan:
     autoencoder = networks.get(CODEC)
     if autoencoder is not None:
         autoencoder.requires_grad_(False).to(accelerator.device)
-    return Plan(join(networks), task, header, held=_codec_of(networks))
+    return TrainingPlan(join(networks), task, header, held=_codec_of(networks))
 
 
-def plan_autoencoder(config: TrainConfig) -> Plan:
+def plan_autoencoder(config: TrainConfig) -> TrainingPlan:
     """An autoencoder, from fresh weights or from those of ``config.init``."""
     networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
     recipe = config.recipe
@@ -119,10 +119,10 @@ def plan_autoencoder(config: TrainConfig) -> Plan:
     trained = Autoencoding(
         network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights
     )
-    return Plan(trained, reconstruction_task, header, autoencoder_loss)
+    return TrainingPlan(trained, reconstruction_task, header, autoencoder_loss)
 
 
-def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> Plan:
+def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> TrainingPlan:
     """The decoder of a latent model, on what its flow leaves."""
     networks, header = start_networks(config)
     network = networks[CODEC]
@@ -134,10 +134,10 @@ def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> Plan:
     recipe = config.recipe
     trained = Decoding(network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights)
     task = decoding_task(network, join(held), header.time_grid[-2], config.losses.noise)
-    return Plan(trained, task, header, decoding_loss, held)
+    return TrainingPlan(trained, task, header, decoding_loss, held)
 
 
-def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
+def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingPlan:
     """Distillation on the given, the selected or a uniform grid, from the teacher's weights."""
     teacher = load_checkpoint(config.teacher, accelerator.device)
     if VELOCITY not in teacher.networks:
@@ -148,7 +148,7 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> Plan:
     provenance = provenance_of(config) | made
     header = replace(teacher.header, time_grid=config.grid or uniform_grid(config.intervals), provenance=provenance)
     student = join(load_checkpoint(config.teacher).networks)
-    plan = Plan(student, teacher_task(), header, held=_codec_of(teacher.networks))
+    plan = TrainingPlan(student, teacher_task(), header, held=_codec_of(teacher.networks))
     if config.grid is None and config.strategy == "adaptive_piecewise":
         with accelerator.main_process_first():
             found = _selection(config, flow, plan, accelerator)
@@ -161,7 +161,7 @@ def _codec_of(networks: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
     return {CODEC: networks[CODEC]} if CODEC in networks else {}
 
 
-def open_data(config: Run, plan: Plan, device: torch.device) -> Batches:
+def open_data(config: Run, plan: TrainingPlan, device: torch.device) -> Batches:
     """The run's batches; the scans are projected once, into the run's cache."""
     sensor, tensors = plan.header.sensor, plan.header.tensors
     conditioning, channels, others = None, set(tensors.channels), {}
@@ -189,7 +189,7 @@ def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, A
     return lambda scan: CONDITIONS[name].read(scan, sensor, shape, options)
 
 
-def _selection(config: DistillConfig, velocity: Any, plan: Plan, accelerator: "Accelerator") -> Selection:
+def _selection(config: DistillConfig, velocity: Any, plan: TrainingPlan, accelerator: "Accelerator") -> Selection:
     """The timesteps of the student, from the folder where an earlier call with the same settings left them."""
     path, settings = config.output / "selection.npz", selection_settings(config, plan.header)
     if path.exists():

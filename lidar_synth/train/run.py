@@ -29,7 +29,7 @@ from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.train import Autoencoding, Batches, Record, Training, reconstruct, reconstruction_figures, steps
 from lidar_synth.train.config import DistillConfig, Run, TrainConfig
-from lidar_synth.train.plan import Plan, make_plan, open_data
+from lidar_synth.train.plan import TrainingPlan, make_plan, open_data
 from lidar_synth.train.resume import check_parents, check_resumed
 from lidar_synth.viz import write_view
 
@@ -89,7 +89,9 @@ def checkpoint_path(config: Run) -> Path:
     return config.output / f"{config.output.name}.safetensors"
 
 
-def _train(config: Run, plan: Plan, training: Training, accelerator: "Accelerator", minutes: float | None) -> Path:
+def _train(
+    config: Run, plan: TrainingPlan, training: Training, accelerator: "Accelerator", minutes: float | None
+) -> Path:
     """The loop, its logs and its saves."""
     with accelerator.main_process_first():
         data = open_data(config, plan, accelerator.device)
@@ -114,7 +116,7 @@ def _train(config: Run, plan: Plan, training: Training, accelerator: "Accelerato
     return checkpoint_path(config)
 
 
-def _save(config: Run, plan: Plan, training: Training) -> None:
+def _save(config: Run, plan: TrainingPlan, training: Training) -> None:
     training.save(config.output / "state.safetensors")
     header = replace(plan.header, provenance=plan.header.provenance | {"iterations": training.step})
     save_checkpoint(checkpoint_path(config), header, plan.parts(training.average))
@@ -149,7 +151,7 @@ class _Log:
         self.bar.close()
         self.board.close()
 
-    def picture(self, plan: Plan, training: Training, data: Batches) -> None:
+    def picture(self, plan: TrainingPlan, training: Training, data: Batches) -> None:
         """Samples of a flow, from the first scans' conditions; of an autoencoder what went in and what came out."""
         name, some = self.config.output.name, range(self.config.samples.count)
         given: list[Scan] | list[RangeImage]
@@ -164,7 +166,7 @@ class _Log:
             title=f"{name}, {training.step} iterations",
         )
 
-    def _reconstructions(self, plan: Plan, trained: Autoencoding, data: Batches) -> list[RangeImage]:
+    def _reconstructions(self, plan: TrainingPlan, trained: Autoencoding, data: Batches) -> list[RangeImage]:
         """Real range images, each followed by its reconstruction; figures go to the logs."""
         codec = Latent(trained.network, plan.header.tensors)
         images = data(range(self.config.samples.count)).y0

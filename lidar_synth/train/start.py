@@ -16,7 +16,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.evaluate.leakage import inherited, recordings_of, town
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.formats import BankScans, ScanFiles, layout_of
-from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, Part, load_checkpoint
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, NetworkSpec, load_checkpoint
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.models import build_network
@@ -96,7 +96,7 @@ def _add_condition(
 
 
 def _build(
-    config: TrainConfig, parts: dict[str, Part], sensor: Sensor, state: tuple[int, int, int]
+    config: TrainConfig, parts: dict[str, NetworkSpec], sensor: Sensor, state: tuple[int, int, int]
 ) -> dict[str, nn.Module]:
     """Networks with fresh weights, some of which look where the cells of the state look."""
     torch.manual_seed(config.seed)

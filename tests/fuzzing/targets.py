@@ -21,7 +21,7 @@ from lidar_synth.formats import READERS, WRITERS, layout_of
 from lidar_synth.generate.checkpoint import (
     VELOCITY,
     Header,
-    Part,
+    NetworkSpec,
     load_checkpoint,
     read_header,
     save_checkpoint,
@@ -166,7 +166,7 @@ def make_checkpoint(root: Path) -> None:
     """A small velocity network with every key that a header has."""
     arguments = {"resolution": [8, 32], "channels": 7, "width": 16, "time_width": 8, "depths": [1, 1], "heads": [2, 2]}
     header = Header(
-        networks={VELOCITY: Part("hdit", arguments)},
+        networks={VELOCITY: NetworkSpec("hdit", arguments)},
         sensor=SENSOR,
         normalisation=NORMALISATIONS["r2flow"],
         channels=("range", "reflectance", "label"),

@@ -21,7 +21,7 @@ from typing import Any
 from timing import machine
 from untrained import write_untrained
 
-from lidar_synth.bake import Job, Plan, Resources, bake, make_plan
+from lidar_synth.bake import BakeJob, BakePlan, Resources, bake, make_plan
 from lidar_synth.bake.shard import images, load_checked, one_computer
 
 ROUNDS = 3
@@ -33,9 +33,9 @@ def alone(call: Callable[..., Any], *arguments: Any) -> Any:
         return pool.submit(call, *arguments).result()
 
 
-def plan_of(out: Path, model: str, count: int, shard_size: int) -> Plan:
+def plan_of(out: Path, model: str, count: int, shard_size: int) -> BakePlan:
     """A plan with the default settings otherwise."""
-    return make_plan(out, Job(model=model, count=count, shard_size=shard_size))
+    return make_plan(out, BakeJob(model=model, count=count, shard_size=shard_size))
 
 
 def by_processes(out: Path, model: str, count: int, workers: int) -> float:

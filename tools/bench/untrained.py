@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from lidar_synth.generate.checkpoint import VELOCITY, Header, Part, save_checkpoint
+from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec, save_checkpoint
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.models import build_network
@@ -22,7 +22,7 @@ def write_untrained(path: Path) -> Path:
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)  # a fresh network answers zero
     header = Header(
-        networks={VELOCITY: Part("hdit", arguments)}, sensor=sensor, normalisation=NORMALISATIONS["r2flow"],
+        networks={VELOCITY: NetworkSpec("hdit", arguments)}, sensor=sensor, normalisation=NORMALISATIONS["r2flow"],
         channels=tuple(CHANNELS), time_grid=(1.0, 0.0),
         provenance={"data": "none", "data_licence": "none", "licence": "MIT"},
     )  # fmt: skip

@@ -27,7 +27,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.flow.solvers import uniform_grid
-from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, Part
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
 from lidar_synth.generate.importers.pickled import load_pickle, state_of
 from lidar_synth.geometry.normalize import Normalisation
@@ -98,7 +98,7 @@ def _config(path: Path) -> dict[str, Any]:
 
 def _parts(
     model: Mapping[str, Any], dataset: Mapping[str, Any], augment: Mapping[str, Any], path: Path
-) -> tuple[dict[str, Part], dict[str, Any]]:
+) -> tuple[dict[str, NetworkSpec], dict[str, Any]]:
     """The networks of a configuration, and the options of its condition."""
     if "ddconfig" in model:
         return {CODEC: codec_part(model, dataset["size"], path)}, {}
@@ -115,18 +115,20 @@ def _parts(
         channels = condition["params"]["out_channels"]
         unet.arguments.update(channels=unet.arguments["channels"] - channels, condition_channels=channels)
         sizes = {"resolution": list(dataset["size"]), "target": unet.arguments["resolution"]}
-        return parts | {ENCODER: Part("semantic_map", sizes | {"channels": channels})}, {"semantic": {"dropout": 0.0}}
+        return parts | {ENCODER: NetworkSpec("semantic_map", sizes | {"channels": channels})}, {
+            "semantic": {"dropout": 0.0}
+        }
     if kind == "FrozenClipMultiImageEmbedder":
         given = condition["params"]
         arguments = {"views": given["split_per_view"], "channels": given.get("out_dim", 512)}
         options = {"dropout": 0.0, "view_dropout": augment.get("camera_drop", 0.0), "image": list(CAMERA_SIZE)}
-        return parts | {ENCODER: Part("clip_views", arguments)}, {"camera": options}
+        return parts | {ENCODER: NetworkSpec("clip_views", arguments)}, {"camera": options}
     if kind:
         raise DataError(f"{path}: a condition by {kind}", "label maps (SpatialRescaler) or camera images, or none")
     return parts, {}
 
 
-def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> Part:
+def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> NetworkSpec:
     """The autoencoder of the peer's configuration, for images of ``size`` rows and columns."""
     inner, mask = params["ddconfig"], bool(params.get("use_mask"))
     wanted = {"double_z": False, "z_channels": params["embed_dim"], "out_ch": inner["in_channels"] + mask}
@@ -136,19 +138,19 @@ def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> 
     # A level that there is not is no mistake to the peer.
     attends = sorted(set(inner["attn_levels"]) & set(range(len(inner["ch_mult"]))))
     extra: dict[str, Any] = ({"attention_levels": attends} if attends else {}) | ({"mask": True} if mask else {})
-    return Part("vqvae", {
+    return NetworkSpec("vqvae", {
         "resolution": list(size), "channels": inner["in_channels"], "latent_channels": params["embed_dim"],
         "codes": params["n_embed"], "width": inner["ch"], "multipliers": list(inner["ch_mult"]),
         "strides": [list(s) for s in inner["strides"]], "blocks": inner["num_res_blocks"],
     } | extra)  # fmt: skip
 
 
-def unet_part(params: Mapping[str, Any], path: Path | str) -> Part:
+def unet_part(params: Mapping[str, Any], path: Path | str) -> NetworkSpec:
     """The U-Net of the peer's configuration; ``channels`` counts those of a condition beside the state."""
     levels = [1 << i for i in range(len(params["channel_mult"]))]
     if params.get("lib_name") != "lidm" or not set(params["attention_resolutions"]) <= set(levels):
         raise DataError(f"{path}: a U-Net with {dict(params)}", "one of LiDM's published configurations")
-    return Part("diffusion_unet", {
+    return NetworkSpec("diffusion_unet", {
         "resolution": list(params["image_size"]), "channels": params["in_channels"],
         "context_channels": params.get("context_dim") or 0, "width": params["model_channels"],
         "multipliers": list(params["channel_mult"]), "blocks": params["num_res_blocks"],
@@ -215,7 +217,7 @@ def _provenance(config: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def convert(
-    weights: Mapping[str, Tensor], parts: Mapping[str, Part], what: str = "LiDM's weights"
+    weights: Mapping[str, Tensor], parts: Mapping[str, NetworkSpec], what: str = "LiDM's weights"
 ) -> dict[str, nn.Module]:
     """LiDM's state dict as networks of ours.
 
@@ -246,7 +248,7 @@ def convert(
     return networks
 
 
-def _statistics(part: Part) -> dict[str, Tensor]:
+def _statistics(part: NetworkSpec) -> dict[str, Tensor]:
     """Of latents that are taken as they are."""
     size = part.arguments["latent_channels"]
     return {
@@ -294,7 +296,7 @@ def _check_schedule(weights: Mapping[str, Tensor], arguments: Mapping[str, Any],
         )
 
 
-def _arranged(ours: str, tensor: Tensor, part: Part) -> Tensor:
+def _arranged(ours: str, tensor: Tensor, part: NetworkSpec) -> Tensor:
     """A peer's tensor in our order of dimensions."""
     if part.architecture == "semantic_map":  # their unlabelled 0, 1..19 are our 0..18 and then unlabelled
         return tensor[:, [*range(1, len(NAMES) + 1), 0]]

@@ -4,7 +4,7 @@ from collections.abc import Collection
 
 import torch
 
-from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Part
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
 from lidar_synth.models import build_network
 
 UNET, UNET_EMA = "model.diffusion_model.", "model_ema."
@@ -35,7 +35,7 @@ STATISTICS = ("shift", "scale", "codebook.counts", "codebook.sums")
 """What only our autoencoder holds."""
 
 
-def peer_names(name: str, part: Part, nested: bool) -> Sources:
+def peer_names(name: str, part: NetworkSpec, nested: bool) -> Sources:
     """Where every weight of a part comes from.
 
     Args:

@@ -23,7 +23,7 @@ from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, whole
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.flow.solvers import uniform_grid
-from lidar_synth.generate.checkpoint import VELOCITY, Header, Part
+from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.importers.pickled import load_pickle, state_of
 from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
@@ -95,7 +95,7 @@ def _load(path: Path) -> dict[str, Any]:
     return content
 
 
-def _network(data: Mapping[str, Any], model: Mapping[str, Any], path: Path) -> Part:
+def _network(data: Mapping[str, Any], model: Mapping[str, Any], path: Path) -> NetworkSpec:
     if model["architecture"] != "nat_hdit":
         raise DataError(f"{path}: architecture {model['architecture']!r}", "nat_hdit, R2Flow's own")
     if model["coords_encoding"] not in POSITIONS:
@@ -110,7 +110,7 @@ def _network(data: Mapping[str, Any], model: Mapping[str, Any], path: Path) -> P
         "mapping_depth": MAPPING_DEPTH,
         "position": POSITIONS[model["coords_encoding"]],
     }
-    return Part("hdit", arguments)
+    return NetworkSpec("hdit", arguments)
 
 
 def _normalisation(data: Mapping[str, Any], path: Path) -> Normalisation:
@@ -155,7 +155,7 @@ def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
     }
 
 
-def convert(weights: Mapping[str, Tensor], part: Part, what: str = "R2Flow's weights") -> nn.Module:
+def convert(weights: Mapping[str, Tensor], part: NetworkSpec, what: str = "R2Flow's weights") -> nn.Module:
     """R2Flow's state dict as an ``HDiT`` in our convention.
 
     Args:

@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from lidar_synth.errors import ConfigError, ProcessError
-from lidar_synth.mixing.service.process import GET, Plan, receive, run, send
+from lidar_synth.mixing.service.process import GET, GeneratorJob, receive, run, send
 from lidar_synth.mixing.service.slots import Slots
 
 
@@ -33,7 +33,7 @@ class Client:
         ProcessError: where it does not start, with its reason.
     """
 
-    def __init__(self, plan: Plan, slots: Slots, timeout: float) -> None:
+    def __init__(self, plan: GeneratorJob, slots: Slots, timeout: float) -> None:
         if current_process().daemon:
             raise ConfigError("a rolling bank made inside a worker process", "one that is made before the workers are")
         self.timeout = timeout

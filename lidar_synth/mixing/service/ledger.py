@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.mixing.service.outlook import NEVER, Counting, Outlook, Pool, Told
+from lidar_synth.mixing.service.outlook import NEVER, KnownOrder, Outlook, RotatingPool, SequentialPrefetch
 
 Starved = Literal["wait", "reuse"]
 """What a request does whose scan is not there: wait for it, or take the held one that was served least."""
@@ -59,7 +59,7 @@ class Ledger:
         self._counters = counters
         self._starved = starved
         self._asked: list[int] = []  # numbers that readers wait for
-        self._outlook: Outlook = Pool(slots - replaced, replaced) if replaced else Counting(slots)
+        self._outlook: Outlook = RotatingPool(slots - replaced, replaced) if replaced else SequentialPrefetch(slots)
         lock = Lock()
         self._work = Condition(lock)  # something may have to be made
         self._made = Condition(lock)  # something can be read
@@ -67,14 +67,14 @@ class Ledger:
     def expect(self, numbers: Sequence[int]) -> None:
         """Make these ahead, in this order, and no others; a pool knows better."""
         with self._work:
-            if not isinstance(self._outlook, Pool):
-                self._outlook = Told(numbers, len(self._held))
+            if not isinstance(self._outlook, RotatingPool):
+                self._outlook = KnownOrder(numbers, len(self._held))
             self._work.notify_all()
 
     def set_epoch(self, epoch: int) -> None:
         """Let a pool replace its scans."""
         with self._work:
-            if isinstance(self._outlook, Pool):
+            if isinstance(self._outlook, RotatingPool):
                 self._outlook.set_epoch(epoch)
             self._work.notify_all()
 

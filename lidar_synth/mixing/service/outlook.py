@@ -28,7 +28,7 @@ class Outlook(Protocol):
         ...
 
 
-class Counting:
+class SequentialPrefetch:
     """Nobody said anything: 0, 1, 2, ... or on from wherever requests are.
 
     Args:
@@ -54,12 +54,12 @@ class Counting:
         return NEVER if served or number < self._past else number
 
 
-class Told:
+class KnownOrder:
     """The numbers are known, in order; a number may stand there more than once.
 
     Args:
         numbers: of the scans.
-        window: as for ``Counting``.
+        window: as for ``SequentialPrefetch``.
     """
 
     def __init__(self, numbers: Sequence[int], window: int) -> None:
@@ -92,7 +92,7 @@ class Told:
         return uses[0] if uses else NEVER
 
 
-class Pool:
+class RotatingPool:
     """Some scans that serve for an epoch; with the next one, the oldest of them are replaced.
 
     Args:

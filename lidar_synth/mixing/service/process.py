@@ -39,7 +39,7 @@ WATCH = 0.5
 
 
 @dataclass(frozen=True)
-class Plan:
+class GeneratorJob:
     """What the process does.
 
     Args:
@@ -73,7 +73,7 @@ def receive(connection: Connection) -> list[int]:
     return values
 
 
-def run(plan: Plan, slots: Slots, started: Connection) -> None:
+def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
     """The process; returns never.
 
     Args:
@@ -102,7 +102,7 @@ def run(plan: Plan, slots: Slots, started: Connection) -> None:
         os._exit(1)  # at once, so that no reader waits for an answer
 
 
-def _make(generator: Generator, plan: Plan, claimed: Sequence[Slot], slots: Slots, ledger: Ledger) -> None:
+def _make(generator: Generator, plan: GeneratorJob, claimed: Sequence[Slot], slots: Slots, ledger: Ledger) -> None:
     images = generator.range_images(plan.seed, [slot.number for slot in claimed], **plan.sampling)
     for slot, image in zip(claimed, images, strict=True):
         ledger.publish(slot, slots.write(slot.place, slot.number, image))

@@ -25,7 +25,7 @@ from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.mixing.service.client import Client
 from lidar_synth.mixing.service.ledger import COUNTERS, Starved
-from lidar_synth.mixing.service.process import EXPECT, GET, GIVE_BACK, SET_EPOCH, Plan
+from lidar_synth.mixing.service.process import EXPECT, GET, GIVE_BACK, SET_EPOCH, GeneratorJob
 from lidar_synth.mixing.service.slots import Slots
 
 _PART = 8192  # numbers in one message: less than a socket holds, so that sending never waits
@@ -104,7 +104,7 @@ class RollingBank:
         self.identity = f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:{starved}:{replaced}"
         self._name = f"{path.stem}/{seed}"
         self._slots = Slots(Encoding(header.sensor, made), slots + replaced)
-        plan = Plan(path, seed, starved, replaced, threads, options, {"steps": steps, "solver": solver})
+        plan = GeneratorJob(path, seed, starved, replaced, threads, options, {"steps": steps, "solver": solver})
         self._client = Client(plan, self._slots, timeout)
 
     @property

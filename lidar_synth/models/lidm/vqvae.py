@@ -144,9 +144,9 @@ class VQVAE(nn.Module):
         """Images (B, C, H, W) to latents before the codebook, (B, *latent_shape), mean 0 and variance 1 per channel."""
         return (self._encode(x) - _channel(self.shift)) / _channel(self.scale)
 
-    def decode(self, z: Tensor, chance: Tensor | None = None) -> Tensor:
+    def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         """Latents (B, *latent_shape), moved to their codes, to images (B, C, H, W), -1 where the mask says that there
-        is no return; nothing is left to ``chance``."""
+        is no return; nothing is left to ``uniform_noise``."""
         check_shape(z, self.latent_shape, "a latent")
         z = z.to(self.to_latent.weight.dtype) * _channel(self.scale) + _channel(self.shift)
         output = self._decode(self.codebook(z)[0])

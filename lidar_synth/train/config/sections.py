@@ -8,7 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import open_scans
-from lidar_synth.generate.checkpoint import Part
+from lidar_synth.generate.checkpoint import NetworkSpec
 from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.geometry.scan import Source
 from lidar_synth.geometry.sensor import Sensor
@@ -142,7 +142,7 @@ class Condition(Section):
     image: tuple[Count, Count] | None = None
     focal: Annotated[float, Field(gt=0)] | None = None
 
-    def part(self, resolution: tuple[int, int], target: tuple[int, int]) -> Part:
+    def part(self, resolution: tuple[int, int], target: tuple[int, int]) -> NetworkSpec:
         """The encoder, for a sensor's ``resolution`` and a state of ``target`` rows and columns.
 
         Raises:
@@ -153,7 +153,7 @@ class Condition(Section):
             raise ConfigError(f"condition.encoder {encoder!r}", f"one of {', '.join(encoders)}")
         sizes = {"resolution": list(resolution), "target": list(target), "image": list(self.image or ())}
         wanted = {"semantic_map": ("resolution", "target"), "sight": ("target", "image")}.get(encoder, ())
-        return Part(encoder, {name: sizes[name] for name in wanted} | self.arguments)
+        return NetworkSpec(encoder, {name: sizes[name] for name in wanted} | self.arguments)
 
     def options(self) -> dict[str, Any]:
         """What the checkpoint's header says about it."""

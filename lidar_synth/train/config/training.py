@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Part
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.models import AUTOENCODERS, build_network
 from lidar_synth.train import Losses
@@ -60,7 +60,7 @@ class TrainConfig(Run):
             raise ConfigError(f"normalisation {self.normalisation!r}", f"one of {', '.join(NORMALISATIONS)}")
         return TensorFormat(self.channels, NORMALISATIONS[self.normalisation])
 
-    def parts(self, state: tuple[int, int, int], resolution: tuple[int, int]) -> dict[str, Part]:
+    def parts(self, state: tuple[int, int, int], resolution: tuple[int, int]) -> dict[str, NetworkSpec]:
         """The networks to train: the velocity (or the autoencoder) and the condition's encoder.
 
         Args:
@@ -80,18 +80,18 @@ class TrainConfig(Run):
             given["normalisation"] = self.normalisation
         if twice := sorted(set(given) & set(self.network.arguments)):
             raise ConfigError(f"network.arguments with {twice}", "no such keys: they follow from what the states are")
-        part = Part(self.network.architecture, given | self.network.arguments)
+        part = NetworkSpec(self.network.architecture, given | self.network.arguments)
         _checked(part)
         return parts | {CODEC if self.autoencodes else VELOCITY: part}
 
 
-def _checked(part: Part) -> nn.Module:
+def _checked(part: NetworkSpec) -> nn.Module:
     """The network without weights: no memory and no time, only whether the values fit together."""
     with torch.device("meta"):
         return build_network(*part)
 
 
-class Selection(Section):
+class SelectionSettings(Section):
     """How timesteps are selected: see ``timesteps.select_timesteps``."""
 
     candidates: Count = 100
@@ -127,4 +127,4 @@ class DistillConfig(Run):
     within: tuple[float, float] = (0.0, 1.0)
     intervals: Count = 4
     grid: tuple[float, ...] | None = None
-    selection: Selection = Selection()
+    selection: SelectionSettings = SelectionSettings()
