@@ -22,6 +22,7 @@ FURTHER = {
     "lidar_synth.labels.augment": ("compose",),
     "lidar_synth.mixing": ("Generated", "MixedScans.batches", "MixedScans.domain", "MixedScans.wrap"),
     "lidar_synth.noise": ("gaussian",),
+    "lidar_synth.train": ("run",),
 }
 """What the README names besides ``lidar_synth.__all__``. A dictionary such as ``NORMALISATIONS`` has no docstring that
 Python keeps: the example of its values' class shows it."""

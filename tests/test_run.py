@@ -23,7 +23,7 @@ from safetensors.torch import load_file
 from typer.testing import CliRunner
 
 import lidar_synth.train.plan as plan_module
-import lidar_synth.train.run as module
+import lidar_synth.train.runs as module
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.flow.path import Example

@@ -17,7 +17,7 @@ from lidar_synth.evaluate.segmentation import load_judge
 from lidar_synth.flow.distill import STRATEGIES
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.train.config import DistillConfig, load_config
-from lidar_synth.train.run import checkpoint_path, run
+from lidar_synth.train.runs import checkpoint_path, run
 
 ROOT = Path(__file__).parents[1]
 WHOLE = ("reflow", "timestep_distillation")

@@ -28,7 +28,7 @@ from lidar_synth.files.disk import write_file
 from lidar_synth.generate.checkpoint import load_checkpoint, read_header, save_checkpoint
 from lidar_synth.town import Town, export_town
 from lidar_synth.train.config import DistillConfig, TrainConfig, load_config
-from lidar_synth.train.run import run
+from lidar_synth.train.runs import run
 
 ROOT = Path(__file__).parents[1]
 PLATEAU = 0.75

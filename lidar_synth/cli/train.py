@@ -17,7 +17,7 @@ Minutes = Annotated[float | None, typer.Option(help="save and stop after so many
 def train(recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
     """Trains a teacher: a rectified flow from noise to scans.
 
-    The output folder gets the checkpoint, named as the folder; state.safetensors, to go on after a stop or a kill
+    The output folder gets the checkpoint, which has the folder's name; state.safetensors, from which --resume continues
     with the same losses; logs for TensorBoard; and pictures of samples. torchrun runs it on several GPUs.
 
     \b
@@ -28,8 +28,7 @@ def train(recipe: RecipeName, overrides: Overrides = None, resume: Resume = Fals
       lidar-synth train mine.yaml init=runs/town_teacher/town_teacher.safetensors data.path=scans
       torchrun --nproc-per-node 8 -m lidar_synth train kitti360_teacher precision=bf16
     """
-    from lidar_synth.train.config import TrainConfig, load_config
-    from lidar_synth.train.run import run
+    from lidar_synth.train import TrainConfig, load_config, run
 
     _say(run(load_config(TrainConfig, recipe, overrides or ()), resume, minutes))
 
@@ -37,8 +36,8 @@ def train(recipe: RecipeName, overrides: Overrides = None, resume: Resume = Fals
 def distill(recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
     """Distils a student that needs few steps from a teacher.
 
-    Where the configuration gives no time grid, the timesteps are selected first. With a weaker teacher the student
-    learns what leads away from it (autoguidance).
+    Without a time grid in the configuration, the timesteps are selected first. With `weaker=` the student learns the
+    autoguided teacher (Karras et al. 2024).
 
     \b
     Examples:
@@ -47,13 +46,12 @@ def distill(recipe: RecipeName, overrides: Overrides = None, resume: Resume = Fa
       lidar-synth distill town_student weaker=null guidance=1 output=runs/plain
       lidar-synth distill kitti360_student teacher=mine.safetensors grid=[1,0.86,0.58,0.22,0]
     """
-    from lidar_synth.train.config import DistillConfig, load_config
-    from lidar_synth.train.run import run
+    from lidar_synth.train import DistillConfig, load_config, run
 
     _say(run(load_config(DistillConfig, recipe, overrides or ()), resume, minutes))
 
 
 def _say(path: Path) -> None:
-    """Where the checkpoint is, once for all processes of torchrun."""
+    """Prints the path of the checkpoint, once for all processes of torchrun."""
     if os.environ.get("RANK", "0") == "0":
         typer.echo(path)

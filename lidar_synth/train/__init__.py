@@ -1,4 +1,8 @@
-"""Training of teachers and students: data, state, loop. Accelerate (extra ``train``) is needed only to run it."""
+"""Training of teachers, autoencoders and students.
+
+``run(config)`` trains as ``lidar-synth train`` and ``lidar-synth distill`` do; the parts below it (data, tasks, state,
+the loop as a generator) serve trainings of your own. Running needs Accelerate (extra ``train``).
+"""
 
 from lidar_synth.train.autoencoder import (
     Autoencoding,
@@ -9,10 +13,12 @@ from lidar_synth.train.autoencoder import (
     reconstruction_task,
 )
 from lidar_synth.train.cache import ImageCache, Other, cache_latents, cache_scans
+from lidar_synth.train.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.train.data import Batch, Batches, Conditioning, micro_batches
 from lidar_synth.train.decoding import Decoding, decoding_loss, decoding_task
 from lidar_synth.train.loop import Loss, Record, Task, steps, student_task, teacher_task
 from lidar_synth.train.optimizers import OPTIMIZERS
+from lidar_synth.train.runs import run
 from lidar_synth.train.schedules import SCHEDULES
 from lidar_synth.train.state import Recipe, Training
 
@@ -24,6 +30,7 @@ __all__ = [
     "Batches",
     "Conditioning",
     "Decoding",
+    "DistillConfig",
     "ImageCache",
     "Loss",
     "Losses",
@@ -31,16 +38,19 @@ __all__ = [
     "Recipe",
     "Record",
     "Task",
+    "TrainConfig",
     "Training",
     "autoencoder_loss",
     "cache_latents",
     "cache_scans",
     "decoding_loss",
     "decoding_task",
+    "load_config",
     "micro_batches",
     "reconstruct",
     "reconstruction_figures",
     "reconstruction_task",
+    "run",
     "steps",
     "student_task",
     "teacher_task",

@@ -25,24 +25,12 @@ from lidar_synth.generate.checkpoint import (
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
-from lidar_synth.train import (
-    Autoencoding,
-    Batches,
-    Conditioning,
-    Decoding,
-    Loss,
-    Other,
-    Task,
-    autoencoder_loss,
-    cache_latents,
-    cache_scans,
-    decoding_loss,
-    decoding_task,
-    reconstruction_task,
-    student_task,
-    teacher_task,
-)
+from lidar_synth.train.autoencoder import Autoencoding, autoencoder_loss, reconstruction_task
+from lidar_synth.train.cache import Other, cache_latents, cache_scans
 from lidar_synth.train.config import DistillConfig, Run, TrainConfig
+from lidar_synth.train.data import Batches, Conditioning
+from lidar_synth.train.decoding import Decoding, decoding_loss, decoding_task
+from lidar_synth.train.loop import Loss, Task, student_task, teacher_task
 from lidar_synth.train.selection import load_selection, save_selection, selection_settings
 from lidar_synth.train.start import fresh_networks, provenance_of, start_networks, with_recordings
 from lidar_synth.train.teaching import taught_flow

@@ -13,7 +13,7 @@ from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.geometry.scan import Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.town.town import Town
-from lidar_synth.train import Recipe
+from lidar_synth.train.state import Recipe
 
 Count = Annotated[int, Field(ge=1)]
 

@@ -10,7 +10,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.models import AUTOENCODERS, build_network
-from lidar_synth.train import Losses
+from lidar_synth.train.autoencoder import Losses
 from lidar_synth.train.config.sections import Condition, Count, Network, Run, Section
 
 

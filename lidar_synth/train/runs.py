@@ -1,13 +1,13 @@
-"""A training configuration becomes a run in its output folder.
+"""Training runs: from a configuration to a checkpoint in the output folder.
 
 The folder holds::
 
-    config.yaml              what was asked for, overrides included
+    config.yaml              the configuration, overrides included
     cache/                   the projected scans
-    selection.npz            a student's timesteps and how they were found
-    state.safetensors        to go on after a stop or a kill
-    <folder>.safetensors     the checkpoint: the averaged weights, to use
-    samples/, logs/          pictures; numbers for TensorBoard
+    selection.npz            a student's timesteps and how they were selected
+    state.safetensors        the state from which an interrupted run resumes
+    <folder>.safetensors     the checkpoint: the averaged weights
+    samples/, logs/          pictures; scalars for TensorBoard
 """
 
 import math
@@ -27,10 +27,13 @@ from lidar_synth.generate.checkpoint import save_checkpoint
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.train import Autoencoding, Batches, Record, Training, reconstruct, reconstruction_figures, steps
+from lidar_synth.train.autoencoder import Autoencoding, reconstruct, reconstruction_figures
 from lidar_synth.train.config import DistillConfig, Run, TrainConfig
+from lidar_synth.train.data import Batches
+from lidar_synth.train.loop import Record, steps
 from lidar_synth.train.plan import TrainingPlan, make_plan, open_data
 from lidar_synth.train.resume import check_parents, check_resumed
+from lidar_synth.train.state import Training
 from lidar_synth.viz import write_view
 
 if TYPE_CHECKING:
@@ -40,20 +43,26 @@ _LOG_EVERY = 10  # steps between two numbers in the logs
 
 
 def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: float | None = None) -> Path:
-    """Train as configured, with a bar, logs, pictures and saves.
+    """Train a teacher, an autoencoder or a student, with a progress bar, logs, pictures and saved states.
 
     Args:
-        config: of a teacher or of a student.
-        resume: continue from the saved state in the output folder, where there is one, with the same settings.
-        minutes: stop, saved, after so long.
+        config: ``TrainConfig`` for a teacher or an autoencoder, ``DistillConfig`` for a student (``load_config``).
+        resume: continue from the state in the output folder, if there is one; the settings must be the same.
+        minutes: save and stop after this time.
 
     Returns:
-        The checkpoint.
+        Path of the checkpoint, which ``load_generator`` reads.
 
     Raises:
-        ConfigError: where the folder holds a run and ``resume`` is not set, or a run with other settings.
-        LibraryError: without Accelerate.
-        DataError: where the training does not stay finite; what was saved last is kept.
+        ConfigError: if the folder holds a run and ``resume`` is not set, or holds a run with other settings.
+        LibraryError: if Accelerate (extra ``train``) is not installed.
+        DataError: if the loss becomes NaN or infinite; the last saved state is kept.
+
+    Example:
+        >>> from lidar_synth.train import TrainConfig, load_config, run
+        >>> changes = ["recipe.iterations=1", "recipe.batch=1", "data.town=2", "samples.every=0", "output=runs/mine"]
+        >>> run(load_config(TrainConfig, "town_tiny", changes)).as_posix()
+        'runs/mine/mine.safetensors'
     """
     try:
         from accelerate import Accelerator
@@ -64,9 +73,9 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
     state = config.output / "state.safetensors"
     if state.exists():
         if not resume:
-            raise ConfigError(f"{config.output} holds a run", "--resume to go on, or another output=FOLDER")
+            raise ConfigError(f"{config.output} holds a run", "--resume to continue it, or another output=FOLDER")
         check_resumed(config)
-    # Without being told so, Accelerate takes the processes of torchrun on CPUs for runs of their own.
+    # Without cpu=True, Accelerate treats the processes of torchrun on a machine without GPU as separate runs.
     gpu = torch.cuda.is_available() or torch.xpu.is_available() or torch.backends.mps.is_available()
     accelerator = Accelerator(mixed_precision=config.precision, cpu="LOCAL_RANK" in os.environ and not gpu)
     plan = make_plan(config, accelerator)
@@ -74,7 +83,7 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
     if state.exists():
         check_parents(config, plan.header)
         training.load(state)
-    if accelerator.is_main_process:  # after all that may refuse
+    if accelerator.is_main_process:  # after all checks
         write_file(config.output / "config.yaml", yaml.safe_dump(config.model_dump(mode="json")).encode())
     if config.compile:
         plan.network.compile()
@@ -85,14 +94,14 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
 
 
 def checkpoint_path(config: Run) -> Path:
-    """Where a run leaves its checkpoint; the name goes into the ids of its scans."""
+    """Path of a run's checkpoint; its name becomes a part of the ids of generated scans."""
     return config.output / f"{config.output.name}.safetensors"
 
 
 def _train(
     config: Run, plan: TrainingPlan, training: Training, accelerator: "Accelerator", minutes: float | None
 ) -> Path:
-    """The loop, its logs and its saves."""
+    """The loop with logs and saved states."""
     with accelerator.main_process_first():
         data = open_data(config, plan, accelerator.device)
     log = _Log(config, training.step) if accelerator.is_main_process else None
