@@ -156,7 +156,7 @@ def test_runs_go_on_as_if_nothing_had_happened(scans: Path, codec: Path, tmp_pat
 
 
 class Fixed(nn.Module):
-    """An autoencoder that takes every latent for zero: what differs in its images was left to uniform_noise."""
+    """An autoencoder that takes every latent for zero: its images differ by the noise of sampling only."""
 
     def __init__(self, network: Any) -> None:
         super().__init__()
@@ -179,7 +179,7 @@ def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(scans: Pat
     generator = load_generator(tmp_path / "teacher" / "teacher.safetensors")
     [scan] = generator.scans(0, [3])
     assert len(scan) and scan.label is not None and scan.confidence is not None
-    # What the autoencoder leaves to uniform_noise is a function of seed and index too.
+    # The noise with which the autoencoder samples is a function of seed and index too.
     among = generator.range_images(0, [2, 3])[1]
     assert np.array_equal(generator.range_images(0, [3])[0].mask, among.mask)
     middle = replace(generator, autoencoder=Fixed(generator.autoencoder))

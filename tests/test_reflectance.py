@@ -1,4 +1,4 @@
-"""What a sensor reads beside the range: 0 with a uniform_noise of its own, or a number around a median."""
+"""What a sensor reads beside the range: zero-inflated reflectance."""
 
 import pytest
 import torch

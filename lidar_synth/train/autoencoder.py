@@ -1,20 +1,20 @@
-"""Training of the autoencoder of latent models: its losses, and how well it gives scans back, in metres.
+"""Training of autoencoders: the losses, and the reconstruction errors in metres.
 
-It runs in the same loop as everything else: one network, one optimiser, one loss::
+An autoencoder trains in the same loop as a flow: one network, one optimiser, one loss::
 
     reconstruction   the recipe's metric per channel, with the recipe's weights; label bits by cross-entropy
     codebook         squared distance of latents to their codes: ``commitment`` moves the encoder, ``codebook`` a
-                     "gradient" codebook; an "ema" codebook moves by itself
+                     "gradient" codebook; an "ema" codebook follows by moving averages
     mask             distance of the decoder's mask, where it has one, to 1 = return and -1 = none
-    geometric        squared distance of points, each the mean of four neighbours in a row, in units of the farthest
-                     range: the beams' curves shall be straight where they were
+    geometric        squared distance of points, each the mean of four neighbours in a row, in units of the
+                     maximum range: preserves the curves that the beams trace
     adversarial      a discriminator of patches, with the hinge loss (Esser et al., "Taming Transformers for
-                     High-Resolution Image Synthesis", CVPR 2021). Both sides are trained in every step: the
-                     autoencoder's term goes through the discriminator as it stands, the discriminator's own looks at
-                     detached reconstructions
+                     High-Resolution Image Synthesis", CVPR 2021). Both networks are trained in every step:
+                     the autoencoder's term uses the discriminator with frozen weights, the discriminator's term
+                     uses detached reconstructions
 
-The architecture "autoencoder" says distributions. Its loss is how unlikely the scan is under them: the range and other
-values where there is a return, the return itself, the class.
+The architecture "autoencoder" predicts distributions. Its loss is the negative log-likelihood of the scan: of the
+return, of the class, and, given a return, of the range and the other values.
 """
 
 import math
@@ -38,9 +38,9 @@ from lidar_synth.models.town_codec.distributions import CellDistributions
 from lidar_synth.train.data import Batch
 
 CURVE_LENGTH = 4
-"""LatticeRefinement in a row whose points are averaged, as LiDM has it."""
+"""Number of neighbouring cells in a row whose points are averaged, as in LiDM."""
 
-_QUERIES = 2048  # points whose nearest neighbours are looked for
+_QUERIES = 2048  # points whose nearest neighbours are searched
 
 
 @dataclass(frozen=True)
@@ -48,23 +48,23 @@ class Losses:
     """Weights of the terms; 0 = left out.
 
     Args:
-        commitment: of the encoder's distance to its codes.
-        codebook: of the codes' distance to what they stand for, where they move by gradients.
-        geometric: of the points.
+        commitment: of the distance between latents and their codes, as a loss of the encoder.
+        codebook: of the same distance, as a loss of a "gradient" codebook.
+        geometric: of the distance between points.
         mask: of the decoder's mask.
-        adversarial: of the discriminator's verdict.
-        adaptive: multiply ``adversarial`` by the ratio of two norms at the decoder's last layer: of the gradient of all
-            reconstruction terms, and of the verdict's gradient (Esser et al., Eq. 7).
+        adversarial: of the discriminator's output.
+        adaptive: multiply ``adversarial`` by the ratio of two gradient norms at the decoder's last layer: of all
+            reconstruction terms, and of the adversarial term (Esser et al., Eq. 7).
         discriminator_width: channels of the discriminator.
-        noise: standard deviation of what is added to the latents of an "autoencoder", which lie in (-1, 1).
-        rare: how much more the cells of rare classes count for an "autoencoder": each by the share of its class in the
-            batch to the power of -rare. A pole is a hundredth of a scan, but not of its use.
+        noise: standard deviation of the noise added to the latents of an "autoencoder", which lie in (-1, 1).
+        rare: exponent of the class weights of an "autoencoder": the weight of a cell is the share of its class in the
+            batch to the power of -rare. Poles cover one per cent of a scan, but matter more than that.
 
     Raises:
         ConfigError: on a negative weight.
     """
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # read where a configuration is checked
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # used when a configuration is validated
 
     commitment: float = 0.25
     codebook: float = 1.0
@@ -82,15 +82,15 @@ class Losses:
 
 
 class Autoencoding(nn.Module):
-    """What is trained: the autoencoder and, for an adversarial term, its discriminator.
+    """The trained module: the autoencoder and, with an adversarial term, its discriminator.
 
     Args:
         network: the autoencoder.
         tensors: layout of its images.
-        sensor: whose rays.
+        sensor: its rays turn ranges into points.
         losses: weights of the terms.
         metric: of the reconstruction.
-        weights: {channel: weight}, 1 where none is given.
+        weights: {channel: weight}, 1 by default.
     """
 
     rays: Tensor
@@ -160,12 +160,12 @@ class Autoencoding(nn.Module):
         return loss
 
     def _rarity(self, code: Tensor, codes: int) -> Tensor:
-        """How much each cell of codes (B, H, W) counts, (B, H, W); see ``Losses.rare``."""
+        """(B, H, W) weights of cells by their codes (B, H, W); see ``Losses.rare``."""
         share = torch.bincount(code.flatten(), minlength=codes).float() / code.numel()
         return share.pow(-self.losses.rare)[code]
 
     def _points(self, x: Tensor) -> Tensor:
-        """(B, 3, H, W / 4) mean points of neighbours, in units of the farthest range."""
+        """(B, 3, H, W / 4) mean points of neighbouring cells, in units of the maximum range."""
         return F.avg_pool2d(self._metres(x) * self.rays, (1, CURVE_LENGTH))
 
     def _returned(self, x: Tensor) -> Tensor:
@@ -178,7 +178,7 @@ class Autoencoding(nn.Module):
         return self.tensors.normalisation.decode(x[:, first : first + 1])
 
     def _adversarial(self, judge: nn.Module, output: Tensor, x: Tensor, reconstruction: Tensor | None = None) -> Tensor:
-        """Both sides' terms; an adaptive weight looks at the loss of the ``reconstruction``."""
+        """The terms of autoencoder and discriminator; an adaptive weight needs the loss of the ``reconstruction``."""
         frozen = {name: p.detach() for name, p in judge.named_parameters()}
         fooled: Tensor = -torch.func.functional_call(judge, frozen, (output,)).mean()
         verdict = F.relu(1 - judge(x)).mean() + F.relu(1 + judge(output.detach())).mean()
@@ -186,7 +186,7 @@ class Autoencoding(nn.Module):
         return self.losses.adversarial * balance * fooled + verdict / 2
 
     def _balance(self, reconstruction: Tensor, fooled: Tensor) -> Tensor:
-        """How much larger the gradient of the reconstruction is at the decoder's last layer, at most 10^4."""
+        """Ratio of the gradient norms of both terms at the decoder's last layer, at most 10^4."""
         assert isinstance(self.network, VQVAE)
         last = self.network.decoder.head.weight
         if not (torch.is_grad_enabled() and last.requires_grad):
@@ -205,7 +205,7 @@ def _code(bits: Tensor) -> Tensor:
 
 
 class Discriminator(nn.Module):
-    """Real or not, patch by patch: positive for real.
+    """A patch discriminator: positive outputs mean real.
 
     Args:
         channels: of the images.
@@ -229,23 +229,23 @@ class Discriminator(nn.Module):
 
 
 def reconstruction_task(batch: Batch) -> Example:
-    """The answer to an image is the image; noise goes with it."""
+    """The target of an image is the image itself; the noise is passed as the condition."""
     return Example(batch.y0, batch.u, batch.y0, cond=batch.y1)
 
 
 def autoencoder_loss(network: nn.Module, example: Example, metric: Metric) -> Tensor:
-    """The loss of ``Autoencoding``, which knows its metric itself."""
+    """The loss that ``Autoencoding`` computes itself; ``metric`` is not used."""
     loss: Tensor = network(example.y, example.cond)
     return loss
 
 
 def reconstruct(codec: Latent, x: Tensor, sensor: Sensor) -> list[RangeImage]:
-    """Tensors (B, C, H, W) through the codec and its codebook, as range images."""
+    """Reconstructions of tensors (B, C, H, W) as range images."""
     return codec.tensors.to_images(codec.decode(codec.encode(x)), sensor)
 
 
 def reconstruction_figures(codec: Latent, x: Tensor, sensor: Sensor) -> dict[str, float]:
-    """How well tensors (B, C, H, W) come back.
+    """Reconstruction errors of tensors (B, C, H, W).
 
     Returns:
         ``mae``, metres, over cells with a return in both; ``within_5cm``, share of all real returns; ``drop_accuracy``,
@@ -273,7 +273,7 @@ def reconstruction_figures(codec: Latent, x: Tensor, sensor: Sensor) -> dict[str
 
 
 def _chamfer(a: Tensor, b: Tensor) -> float:
-    """Mean of both directions, metres, of clouds (N, 3) and (M, 3)."""
+    """Chamfer distance of clouds (N, 3) and (M, 3): the mean of both directions, metres."""
     if not len(a) or not len(b):
         return float("nan")
     means = []

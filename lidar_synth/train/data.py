@@ -1,8 +1,7 @@
-"""Training batches that are a function of their position alone.
+"""Training batches as a function of their position alone.
 
-A run asks for samples by their position in one endless sequence. What stands there (which scan, turned and mirrored
-how, with which noise, at which time) follows from (seed, position) and nothing else, so that a run that was killed,
-or that runs on another number of processes, sees the same data.
+A run requests samples by their position in one endless sequence. A sample (scan, rotation, mirroring, noise, time) is a
+function of (seed, position) only, so that a resumed run, or one with another number of processes, sees the same data.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,11 +22,11 @@ from lidar_synth.noise import gaussian, uniform
 from lidar_synth.train.cache import ImageCache
 
 _TRAINING = 1 << 62
-"""Added to a run's seed, so that its noise is not that of the scans that are made with the same seed."""
+"""Offset of a run's seed: training noise differs from the noise of scans that are sampled with the same seed."""
 
 
 class Batch(NamedTuple):
-    """What a task makes an example of.
+    """One batch of training data, from which a task makes its example.
 
     Args:
         y0: (B, C, H, W) data: tensors in [-1, 1], or latents.
@@ -49,8 +48,8 @@ class Conditioning:
     Args:
         name: of ``CONDITIONS``.
         dropout: share of samples with a blank condition, so that the model can be guided.
-        view_dropout: share of camera images of which one view is left.
-        views: of a camera image.
+        view_dropout: share of camera images that keep only one view.
+        views: number of views of a camera image.
     """
 
     name: str
@@ -64,18 +63,18 @@ class Batches:
     """The endless sequence of training samples.
 
     Args:
-        cache: of the scans.
-        tensors: their layout for the network.
+        cache: the scans.
+        tensors: layout of the network's tensors.
         seed: 0 <= seed < 2^62.
         flip: mirror every other sample, left to right.
         roll: turn every sample about the vertical by a random whole number of columns.
-        device: where the noise is made and the tensors are put together.
-        codec: makes states of tensors; None = they are the states.
-        latents: (2, N, *codec.shape) what it makes of the scans (``cache_latents``), in place of ``codec``.
-        conditioning: which field of the cache is the condition; None = there is none.
+        device: on which noise is generated and batches are assembled.
+        codec: encodes tensors to states; None = the tensors are the states.
+        latents: (2, N, *codec.shape) encoded scans and mirrored scans (``cache_latents``), in place of ``codec``.
+        conditioning: the field of the cache that is the condition; None = unconditional.
 
     Raises:
-        ConfigError: where scans shall be turned, and the condition or the latents cannot.
+        ConfigError: on ``roll`` with cached latents or with a condition that cannot be turned.
     """
 
     cache: ImageCache
@@ -90,12 +89,12 @@ class Batches:
 
     def __post_init__(self) -> None:
         if self.roll and self.latents is not None:
-            raise ConfigError("roll with latents that were made before", "data.latents=false, or roll=false")
+            raise ConfigError("roll with cached latents", "data.latents=false, or roll=false")
         if self.roll and self.conditioning and not CONDITIONS[self.conditioning.name].turns:
             raise ConfigError(f"roll with the condition {self.conditioning.name!r}", "roll=false: it does not turn")
 
     def scans_at(self, positions: Sequence[int]) -> list[int]:
-        """Which scan stands at each position: every epoch is a permutation of all."""
+        """Index of the scan at each position; every epoch is a permutation of all scans."""
         count = len(self.cache)
         return [int(_permutation(self.seed, p // count, count)[p % count]) for p in positions]
 
@@ -107,32 +106,33 @@ class Batches:
         mirrored = (draws[:, 1] < 0.5) & self.flip
         columns = (draws[:, 2] * self.cache.sensor.columns).long().tolist()
 
-        def moved(x: Tensor) -> Tensor:
+        def augmented(x: Tensor) -> Tensor:
             x = _where(mirrored, x.flip(-1), x)
             return _rolled(x, columns) if self.roll else x
 
         if self.latents is not None:
             y0 = torch.from_numpy(self.latents[mirrored.long().numpy(), scans]).to(self.device, torch.float32)
         else:
-            y0 = moved(self.tensors.encode(self.cache.read(scans)).to(self.device))
+            y0 = augmented(self.tensors.encode(self.cache.read(scans)).to(self.device))
             y0 = y0 if self.codec is None else self.codec.encode(y0)
-        cond = None if self.conditioning is None else moved(self._stored(scans))
+        cond = None if self.conditioning is None else augmented(self._stored(scans))
         if cond is not None:
             cond = self._dropped(cond, draws)
         return Batch(y0, gaussian(seed, positions, y0.shape[1:], self.device), draws[:, 0].to(self.device), cond)
 
     def conditions(self, positions: Sequence[int]) -> Tensor | None:
-        """The whole conditions (B, ...) of the scans at these positions, neither blank nor turned; None without."""
+        """The conditions (B, ...) of the scans at these positions, without dropout and augmentation; None if
+        unconditional."""
         return None if self.conditioning is None else self._stored(self.scans_at(positions))
 
     def _stored(self, scans: Sequence[int]) -> Tensor:
-        """Conditions (B, ...) of these scans."""
+        """The cached conditions (B, ...) of these scans."""
         assert self.conditioning is not None
         values = self.cache.fields[CONDITIONS[self.conditioning.name].field][np.asarray(scans, np.int64)]
         return torch.from_numpy(values).to(self.device)
 
     def _dropped(self, cond: Tensor, draws: Tensor) -> Tensor:
-        """Some conditions (B, ...) blank, some with one view."""
+        """Conditions (B, ...) with dropout: some blank, some reduced to one view."""
         assert self.conditioning is not None
         about = self.conditioning
         if about.view_dropout:
@@ -141,34 +141,34 @@ class Batches:
 
 
 def _where(chosen: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Sample by sample a or b (B, ...), by ``chosen`` (B,)."""
+    """Per sample, a where ``chosen`` (B,) is true, else b; both (B, ...)."""
     return torch.where(chosen.to(b.device).view(-1, *[1] * (b.ndim - 1)), a, b)
 
 
 def _rolled(x: Tensor, columns: Sequence[int]) -> Tensor:
-    """Every sample of (B, ..., W) turned by its own number of columns."""
+    """Each sample of (B, ..., W) rolled by its own number of columns."""
     return torch.stack([one.roll(c, -1) for one, c in zip(x, columns, strict=True)])
 
 
 @lru_cache(maxsize=2)
 def _permutation(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
-    """(count,) an order that follows from the seed and the epoch."""
-    # One number per scan and epoch, well away from the positions' own (index < 2^62).
+    """(count,) a permutation, a function of the seed and the epoch."""
+    # One number per scan and epoch, at indices that positions (< 2^62) do not use.
     keys = uniform(seed + _TRAINING, range((1 << 62) + epoch * count, (1 << 62) + (epoch + 1) * count))
     return np.argsort(keys.numpy(), kind="stable")
 
 
 def micro_batches(step: int, batch: int, accumulate: int, process: int = 0, processes: int = 1) -> Iterator[range]:
-    """The positions that one process takes in one optimiser step, micro-batch by micro-batch.
+    """The positions that one process trains on in one optimiser step, one range per micro-batch.
 
     Args:
         step: number of the step, from 0.
         batch: samples of a step, over all micro-batches and processes.
         accumulate: micro-batches of a step.
-        process, processes: which of how many.
+        process, processes: index of this process, number of processes.
 
     Raises:
-        ConfigError: where the batch cannot be divided.
+        ConfigError: if the batch cannot be divided.
     """
     if batch % (accumulate * processes):
         raise ConfigError(f"batch {batch} over {accumulate} micro-batches and {processes} processes", "a multiple")

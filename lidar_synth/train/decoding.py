@@ -1,10 +1,10 @@
-"""Training of a decoder alone, on latents as a flow leaves them.
+"""Fine-tuning of a decoder on the latents that a flow generates.
 
-An autoencoder learns with its own latents and a little noise. A student of few steps leaves more, and of another kind:
-walls whose pieces do not meet. So at the end the decoder goes on alone, while encoder and flow stand still. Every other
-latent is noised to the student's last timestep and goes through its last step, and the decoder shall find the scan
-again that it is of: what streets are like, it then knows better than the flow. The others have noise of any strength up
-to that of ``Losses``, so that latents which are exact are still trusted.
+An autoencoder is trained on its own latents with a little noise. A student of few steps makes larger errors of another
+kind, such as walls whose pieces do not meet. Therefore the decoder alone is trained further, with encoder and flow
+frozen. Every other latent is noised to the student's last timestep and denoised by the student's last step; the decoder
+learns to reconstruct the original scan from it. The other latents get noise of random strength up to that of
+``Losses``, so that the decoder still trusts exact latents.
 """
 
 import math
@@ -20,7 +20,7 @@ from lidar_synth.train.loop import Task
 
 
 class Decoding(Autoencoding):
-    """What is trained: a decoder; the encoder's weights need no gradient. Arguments as ``Autoencoding`` has them."""
+    """The trained module: a decoder; the encoder is frozen. Takes the arguments of ``Autoencoding``."""
 
     network: Autoencoder
 

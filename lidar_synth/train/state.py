@@ -1,7 +1,7 @@
-"""What a training run consists of, and how it is kept through a kill.
+"""The state of a training run, and how it is saved for resumption.
 
-The file is safetensors like a checkpoint, but it is for going on, not for sampling: it holds the network, the
-averaged weights, the optimiser's moments and the step. All else follows from the configuration and the step.
+The file is safetensors like a checkpoint, but serves to resume, not to sample: it holds the network, the averaged
+weights, the optimiser's moments and the step. Everything else is a function of the configuration and the step.
 """
 
 import copy
@@ -25,29 +25,29 @@ from lidar_synth.train.schedules import SCHEDULES
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the weights are moved; the defaults are those of R2Flow's 1-RF.
+    """The optimisation settings; the defaults are those of R2Flow's 1-RF.
 
     Args:
         iterations: optimiser steps in all.
         batch: samples of a step, over all processes and micro-batches.
         accumulate: micro-batches of a step.
         metric: a name of ``METRICS``.
-        weights: {channel: weight} of squared errors, 1 where none is given: labels are five channels of seven, but
-            no more than a seventh of what matters.
+        weights: {channel: weight} of squared errors, 1 by default. Labels are five channels of seven, but should not
+            dominate the loss.
         optimizer: a name of ``OPTIMIZERS``.
         rate: the learning rate at the top of the schedule.
-        betas, weight_decay: AdamW's; the decay is Muon's too.
+        betas, weight_decay: of AdamW; the weight decay also applies to Muon.
         schedule: a name of ``SCHEDULES``.
-        warmup: steps until the rate is reached.
-        clip: largest norm of the gradient.
-        ema_decay: of the averaged weights, at each of their updates; less at the beginning.
-        ema_every: steps between these.
+        warmup: steps until the full rate is reached.
+        clip: maximum norm of the gradient.
+        ema_decay: decay of the averaged weights at each update; smaller in the first updates.
+        ema_every: steps between these updates.
 
     Raises:
         ConfigError: on an unknown name or a number below 1.
     """
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # read where a configuration is checked
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # used when a configuration is validated
 
     iterations: int
     batch: int = 8
@@ -75,11 +75,11 @@ class Recipe:
 
 
 class Training:
-    """What a run consists of between two steps: the network, its averaged twin, the optimisers, the step.
+    """The state of a run between two steps: the network, its averaged copy, the optimisers, the step.
 
     Args:
         network: the velocity network, on its device.
-        recipe: how it is trained.
+        recipe: the optimisation settings.
     """
 
     def __init__(self, network: nn.Module, recipe: Recipe) -> None:
@@ -91,9 +91,9 @@ class Training:
         self.step = 0
 
     def update_average(self) -> None:
-        """Move the averaged weights towards the network's, and take over what it counts (norms, codebooks)."""
+        """Move the averaged weights towards the network's, and copy its buffers (statistics of norms, codebooks)."""
         updates = self.step // self.recipe.ema_every
-        # The start is forgotten soon: an average over few steps follows at once.
+        # Early averages have a short memory, so that they forget the initial weights.
         keep = min(self.recipe.ema_decay, (1 + updates) / (10 + updates))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - keep)
@@ -101,7 +101,7 @@ class Training:
                 mine.copy_(new)
 
     def save(self, path: Path) -> None:
-        """Write all of it beside ``path``, then rename.
+        """Write the state beside ``path``, then rename.
 
         Raises:
             FileError: where it cannot be written.
@@ -115,11 +115,11 @@ class Training:
         write_file(path, save(tensors, {"step": str(self.step)}))
 
     def load(self, path: Path) -> None:
-        """Go on where ``save`` was called.
+        """Restore the state that ``save`` wrote.
 
         Raises:
             FileError: where the file cannot be read.
-            DataError: where it is no state of such a run.
+            DataError: if it is not the state of such a run.
         """
         try:
             with safe_open(path, "pt") as file:
@@ -128,7 +128,7 @@ class Training:
         except OSError as error:
             raise FileError(f"{path} cannot be read ({error})", "a saved state", "Start without --resume.") from error
         except (SafetensorError, KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path} is no saved state ({error})", "state.safetensors of a run") from error
+            raise DataError(f"{path} is not a saved state ({error})", "state.safetensors of a run") from error
         parts: dict[str, dict[str, Any]] = {"network": {}, "average": {}, "optimizer": {}}
         for name, tensor in tensors.items():
             part, key = name.split(".", 1)
