@@ -351,7 +351,7 @@ def test_a_state_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         training.load(path)
     training.save(path)
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(DataError, match="is no saved state"):
+    with pytest.raises(DataError, match="is not a saved state"):
         training.load(path)
     training.save(path)
     other = Training(nn.Linear(2, 2), training.recipe)
