@@ -25,7 +25,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.generator import load_generator
 from lidar_synth.train.config import DistillConfig, load_config
-from lidar_synth.train.teaching import taught_flow
+from lidar_synth.train.teaching import target_flow
 
 STILL = ("stem", "encode", "merge", "to_latent", "shift", "scale")
 """Parts of names in an autoencoder that belong to its encoder, or to both sides."""
@@ -94,7 +94,7 @@ def test_a_student_learns_what_leads_away_from_a_weaker_teacher(
     assert str(tmp_path) not in json.dumps(header.provenance)
 
     strong, weak = load_checkpoint(teacher), load_checkpoint(weaker)
-    flow, _ = taught_flow(load_config(DistillConfig, config), strong, torch.device("cpu"))
+    flow, _ = target_flow(load_config(DistillConfig, config), strong, torch.device("cpu"))
     y, t = torch.randn(2, 4, 4, 8), torch.tensor([0.3, 0.8])
     maps = torch.randint(0, 19, (2, *SENSOR.shape), dtype=torch.uint8)
     a, b = (join(checkpoint.networks)(y, t, maps) for checkpoint in (strong, weak))
@@ -104,7 +104,7 @@ def test_a_student_learns_what_leads_away_from_a_weaker_teacher(
 
     for changes, message in (
         (["guidance=1"], "weak.safetensors with guidance 1; expected a scale"),
-        (["within=[0.9,0.1]"], r"within \(0.9, 0.1\); expected a lesser and a greater time"),
+        (["within=[0.9,0.1]"], r"within \(0.9, 0.1\); expected two increasing times"),
         ([f"weaker={codec}"], "codec.safetensors, an autoencoder; expected a model that generates"),
         ([f"teacher={without_condition(teacher, tmp_path)}"], "of another conditioning; expected those of"),
         ([f"weaker={with_other_codec(weaker, tmp_path)}"], "of another autoencoder; expected those of"),

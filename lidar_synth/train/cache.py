@@ -23,12 +23,12 @@ from lidar_synth.geometry.scan import RangeImage, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 
 DTYPES: dict[str, type[np.generic]] = {name: TYPES[name] for name in ("range", "reflectance", "label")}
-"""How a cache holds each channel: as a bank does."""
+"""Data type of each channel in a cache, the same as in a bank."""
 
 Layout = dict[str, tuple[tuple[int, ...], type[np.generic]]]
 """{field of a cache: its shape and type}."""
 
-_SAVE_EVERY = 64  # scans between two notes of how far a cache has come
+_SAVE_EVERY = 64  # scans between two records of the progress
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ImageCache:
     Args:
         fields: {channel: (N, H, W)} of the types in ``DTYPES``, in memory or memory-mapped; others, such as camera
             images (N, 3, h, w), are uint8 and stay as they are.
-        sensor: whose grid.
+        sensor: defines the grid.
     """
 
     fields: Mapping[str, NDArray[Any]]
@@ -46,7 +46,7 @@ class ImageCache:
 
     @cached_property
     def encoding(self) -> Encoding:
-        """Of the channels."""
+        """The encoding of the channels."""
         return Encoding(self.sensor, DTYPES.keys() & self.fields.keys())
 
     def __len__(self) -> int:
@@ -97,7 +97,7 @@ def cache_scans(
 
     Args:
         source: of scans.
-        sensor: whose grid.
+        sensor: defines the grid.
         channels: names of ``DTYPES``.
         folder: keep the cache there, memory-mapped: a second call finds it, an interrupted one goes on; by
             default the cache is in memory.

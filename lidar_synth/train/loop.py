@@ -1,8 +1,7 @@
 """The training loop: a generator that yields one record per optimiser step, so that any engine can drive it.
 
-Teacher and student differ in the task only: what is asked of the network where (an ``Example`` for a ``Batch``). An
-autoencoder has a loss of its own.
-The caller logs, saves and stops as it likes; a ``Training`` that was saved goes on with the same losses.
+Teacher and student differ only in the task, which makes an ``Example`` (input and target) of a ``Batch``. An
+autoencoder has its own loss. The caller logs, saves and stops; a saved ``Training`` resumes with the same losses.
 """
 
 import math
@@ -25,10 +24,10 @@ if TYPE_CHECKING:
     from accelerate import Accelerator
 
 Task = Callable[[Batch], Example]
-"""What a batch is made into: at which state and time the network is trained, and on which velocity."""
+"""Makes the example of a batch: the state and time at which the network is trained, and the target velocity."""
 
 Loss = Callable[[nn.Module, Example, Metric], Tensor]
-"""The scalar that training lowers: of the network, what it is asked, and the recipe's metric."""
+"""The scalar loss of a network on an example, with the recipe's metric."""
 
 
 def teacher_task(timesteps: str = "uniform") -> Task:
@@ -48,14 +47,14 @@ def student_task(strategy: str, teacher: Velocity, grid: Sequence[float], steps:
 
 
 class Record(NamedTuple):
-    """What is known after a step.
+    """The figures of one optimiser step.
 
     Args:
-        step: steps done, from 1.
-        loss: mean over the step's samples of this process.
-        gradient: norm before clipping.
+        step: number of the step, from 1.
+        loss: mean over the samples of this process.
+        gradient: norm of the gradient before clipping.
         rate: learning rate of the step.
-        teacher_evaluations: of this process in this step, one per sample and evaluation.
+        teacher_evaluations: number in this process and step, one per sample and evaluation.
     """
 
     step: int

@@ -1,4 +1,4 @@
-"""What a training configuration asks for: the networks, what they are trained on, and what the checkpoint will say."""
+"""From a training configuration to what a run needs: networks, task, data and the header of the checkpoint."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -33,7 +33,7 @@ from lidar_synth.train.decoding import Decoding, decoding_loss, decoding_task
 from lidar_synth.train.loop import Loss, Task, student_task, teacher_task
 from lidar_synth.train.selection import load_selection, save_selection, selection_settings
 from lidar_synth.train.start import fresh_networks, provenance_of, start_networks, with_recordings
-from lidar_synth.train.teaching import taught_flow
+from lidar_synth.train.teaching import target_flow
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -44,36 +44,36 @@ class TrainingPlan:
     """A run before its first step.
 
     Args:
-        network: what is trained.
-        task: on what.
-        header: what the checkpoint will say.
-        loss: what is lowered.
-        held: parts of the checkpoint that stand still, such as the autoencoder of a latent model.
+        network: the trained module.
+        task: makes training examples of batches.
+        header: of the checkpoint.
+        loss: the minimised loss.
+        frozen: parts of the checkpoint that are not trained, such as the autoencoder of a latent model.
     """
 
     network: nn.Module
     task: Task
     header: Header
     loss: Loss = velocity_loss
-    held: Mapping[str, nn.Module] = field(default_factory=dict)
+    frozen: Mapping[str, nn.Module] = field(default_factory=dict)
 
     @property
     def autoencoder(self) -> nn.Module | None:
-        """That makes the latents which are trained on."""
-        return self.held.get(CODEC)
+        """The frozen autoencoder of a latent model, or None."""
+        return self.frozen.get(CODEC)
 
     def codec(self) -> Codec:
-        """Between tensors and states."""
+        """The codec between tensors and states."""
         return make_codec(self.autoencoder, self.header.tensors, self.header.sensor.shape)
 
     def parts(self, network: nn.Module) -> dict[str, nn.Module]:
-        """The parts of the checkpoint, of the network or its averaged twin."""
+        """The parts of the checkpoint, from the network or its averaged copy."""
         trained = {CODEC: network.network} if isinstance(network, Autoencoding) else split(network)
-        return {**trained, **self.held}
+        return {**trained, **self.frozen}
 
 
 def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -> TrainingPlan:
-    """A teacher, a student or an autoencoder.
+    """The plan of a teacher, an autoencoder, a decoder or a student.
 
     Raises:
         ConfigError: where the configuration does not fit the checkpoints that it names.
@@ -88,7 +88,7 @@ def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -
 
 
 def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> TrainingPlan:
-    """Flow matching, from fresh weights or from those of ``config.init``."""
+    """Flow matching, from random weights or from those of ``config.init``."""
     task = teacher_task(config.timesteps)
     networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
     if config.codec is not None and CODEC not in networks:
@@ -96,11 +96,11 @@ def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> TrainingPla
     autoencoder = networks.get(CODEC)
     if autoencoder is not None:
         autoencoder.requires_grad_(False).to(accelerator.device)
-    return TrainingPlan(join(networks), task, header, held=_codec_of(networks))
+    return TrainingPlan(join(networks), task, header, frozen=_codec_of(networks))
 
 
 def plan_autoencoder(config: TrainConfig) -> TrainingPlan:
-    """An autoencoder, from fresh weights or from those of ``config.init``."""
+    """An autoencoder, from random weights or from those of ``config.init``."""
     networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
     recipe = config.recipe
     network: Any = networks[CODEC]
@@ -111,18 +111,20 @@ def plan_autoencoder(config: TrainConfig) -> TrainingPlan:
 
 
 def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> TrainingPlan:
-    """The decoder of a latent model, on what its flow leaves."""
+    """The decoder of a latent model, on latents that its flow generates."""
     networks, header = start_networks(config)
     network = networks[CODEC]
     if not isinstance(network, Autoencoder):
-        raise ConfigError(f"decoder with init {config.init}", "a model whose autoencoder says distributions")
-    held = {name: part.requires_grad_(False).to(accelerator.device) for name, part in networks.items() if name != CODEC}
+        raise ConfigError(f"decoder with init {config.init}", "a model whose autoencoder predicts distributions")
+    frozen = {
+        name: part.requires_grad_(False).to(accelerator.device) for name, part in networks.items() if name != CODEC
+    }
     for weight in network.encoder():
         weight.requires_grad_(False)
     recipe = config.recipe
     trained = Decoding(network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights)
-    task = decoding_task(network, join(held), header.time_grid[-2], config.losses.noise)
-    return TrainingPlan(trained, task, header, decoding_loss, held)
+    task = decoding_task(network, join(frozen), header.time_grid[-2], config.losses.noise)
+    return TrainingPlan(trained, task, header, decoding_loss, frozen)
 
 
 def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingPlan:
@@ -132,11 +134,11 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
         raise ConfigError(f"teacher {config.teacher}, an autoencoder", "a model that generates")
     if CODEC in teacher.networks and config.recipe.weights:
         raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
-    flow, made = taught_flow(config, teacher, accelerator.device)
+    flow, made = target_flow(config, teacher, accelerator.device)
     provenance = provenance_of(config) | made
     header = replace(teacher.header, time_grid=config.grid or uniform_grid(config.intervals), provenance=provenance)
     student = join(load_checkpoint(config.teacher).networks)
-    plan = TrainingPlan(student, teacher_task(), header, held=_codec_of(teacher.networks))
+    plan = TrainingPlan(student, teacher_task(), header, frozen=_codec_of(teacher.networks))
     if config.grid is None and config.strategy == "adaptive_piecewise":
         with accelerator.main_process_first():
             found = _selection(config, flow, plan, accelerator)
@@ -150,7 +152,7 @@ def _codec_of(networks: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
 
 
 def open_data(config: Run, plan: TrainingPlan, device: torch.device) -> Batches:
-    """The run's batches; the scans are projected once, into the run's cache."""
+    """The batches of the run; its scans are projected once and cached."""
     sensor, tensors = plan.header.sensor, plan.header.tensors
     conditioning, channels, others = None, set(tensors.channels), {}
     for name, options in plan.header.conditioning.items():
@@ -178,7 +180,7 @@ def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, A
 
 
 def _selection(config: DistillConfig, velocity: Any, plan: TrainingPlan, accelerator: "Accelerator") -> Selection:
-    """The timesteps of the student, from the folder where an earlier call with the same settings left them."""
+    """The timesteps of the student; those of an earlier call with the same settings are reused."""
     path, settings = config.output / "selection.npz", selection_settings(config, plan.header)
     if path.exists():
         return load_selection(path, settings)

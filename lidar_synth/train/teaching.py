@@ -1,4 +1,4 @@
-"""The flow that a student learns from: its teacher's, with guidance or without."""
+"""The flow that a student is distilled from: its teacher's, with or without guidance."""
 
 from typing import Any
 
@@ -12,8 +12,8 @@ from lidar_synth.generate.conditions import CONDITIONS, Conditioned, blank
 from lidar_synth.train.config import DistillConfig
 
 
-def taught_flow(config: DistillConfig, teacher: Checkpoint, device: torch.device) -> tuple[Velocity, dict[str, Any]]:
-    """What a student learns, of conditions as they are stored, and what its provenance says of the making.
+def target_flow(config: DistillConfig, teacher: Checkpoint, device: torch.device) -> tuple[Velocity, dict[str, Any]]:
+    """The velocity that a student is distilled from, and its part of the student's provenance.
 
     Args:
         config: of the student.
@@ -21,20 +21,21 @@ def taught_flow(config: DistillConfig, teacher: Checkpoint, device: torch.device
         device: of the training.
 
     Raises:
-        ConfigError: on guidance from a blank condition that the teacher never met, or from a model of other data.
+        ConfigError: on classifier-free guidance of a teacher without dropout of its condition, or a weaker model of
+            other data.
     """
     made = {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
-    velocity = _standing(teacher, config.compile)
+    velocity = _frozen_flow(teacher, config.compile)
     if config.weaker is not None:
         weaker = load_checkpoint(config.weaker, device)
         _check_weaker(config, teacher, weaker)
         made |= {"weaker": weaker.hash, "weaker_provenance": weaker.header.provenance}
-        return autoguided(velocity, _standing(weaker, config.compile), config.guidance, config.within), made
+        return autoguided(velocity, _frozen_flow(weaker, config.compile), config.guidance, config.within), made
     return velocity if config.guidance == 1 else _from_blank(config, teacher, velocity), made
 
 
-def _standing(checkpoint: Checkpoint, compiled: bool) -> nn.Module:
-    """The flow of a checkpoint, which no training changes."""
+def _frozen_flow(checkpoint: Checkpoint, compiled: bool) -> nn.Module:
+    """The flow of a checkpoint, with frozen weights."""
     velocity = join(checkpoint.networks).requires_grad_(False)
     if compiled:
         velocity.compile()
@@ -47,17 +48,19 @@ def _from_blank(config: DistillConfig, teacher: Checkpoint, velocity: nn.Module)
         raise ConfigError(f"guidance {config.guidance} of an unconditional teacher", "1, or weaker=CHECKPOINT")
     [(name, options)] = teacher.header.conditioning.items()
     if not options.get("dropout"):
-        raise ConfigError(f"guidance {config.guidance} of a teacher that never met a blank condition", "1")
+        raise ConfigError(
+            f"guidance {config.guidance} of a teacher that was trained without dropout of its condition", "1"
+        )
     empty = torch.zeros(CONDITIONS[name].shape(velocity.encoder), dtype=torch.uint8)
     return guided(velocity, config.guidance, blank(name, empty))
 
 
 def _check_weaker(config: DistillConfig, teacher: Checkpoint, weaker: Checkpoint) -> None:
-    """Both have to speak of the same states and conditions."""
+    """Both models need the same states and conditions."""
     if config.guidance == 1:
-        raise ConfigError(f"weaker {config.weaker} with guidance 1", "a scale that leads away from it, such as 2")
+        raise ConfigError(f"weaker {config.weaker} with guidance 1", "a guidance scale other than 1, such as 2")
     if not 0 <= config.within[0] < config.within[1] <= 1:
-        raise ConfigError(f"within {config.within}", "a lesser and a greater time, both within [0, 1]")
+        raise ConfigError(f"within {config.within}", "two increasing times within [0, 1]")
     if VELOCITY not in weaker.networks:
         raise ConfigError(f"weaker {config.weaker}, an autoencoder", "a model that generates")
     differs = [k for k in ("sensor", "channels", "normalisation", "conditioning")
@@ -69,5 +72,5 @@ def _check_weaker(config: DistillConfig, teacher: Checkpoint, weaker: Checkpoint
 
 
 def _hash_of_latents(checkpoint: Checkpoint) -> str:
-    """Of the autoencoder that makes them; empty for a model of range images."""
+    """Hash of the autoencoder of a latent model; "" for a pixel model."""
     return network_hash(checkpoint.networks[CODEC]) if CODEC in checkpoint.networks else ""
