@@ -74,7 +74,7 @@ def score(
     progress: bool = True,
     folder: Path | None = None,
 ) -> Scores:
-    """Score every scan of a bank. It takes 2.4 kB a scan on disk, and some 300 bytes a scan in memory.
+    """Score every scan of a bank. It takes 2.4 kB a scan on disk, and at most 400 bytes a scan in memory.
 
     Args:
         bank: whose scans.
