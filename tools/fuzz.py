@@ -53,26 +53,33 @@ def main() -> None:
         print(look(names[0], given.seed, given.case, given.keep))
         return
     limits = Limits(int(given.memory * 1e6), given.seconds)
-    reports = run(names, given.cases, given.seed, given.jobs, limits)
+    reports, failures = run(names, given.cases, given.seed, given.jobs, limits)
     print(table(reports))
+    for failure in failures:
+        print(f"the harness failed, and some cases of a reader are missing: {failure}")
     for name, report in reports.items():
         print_flaws(name, given.seed, report, given.keep)
-    if any(report.flaws for report in reports.values()):
+    if failures or any(report.flaws for report in reports.values()):
         sys.exit(1)
 
 
-def run(names: list[str], cases: int, seed: int, jobs: int, limits: Limits) -> dict[str, Report]:
-    """A report for each reader."""
+def run(names: list[str], cases: int, seed: int, jobs: int, limits: Limits) -> tuple[dict[str, Report], list[str]]:
+    """A report for each reader, and what went wrong with the harness itself."""
+    failures: list[str] = []
     reports = {name: Report() for name in names}
     parts = [(name, range(cases)[i : i + PART]) for i in range(0, cases, PART) for name in names]
     with tqdm(total=cases * len(names), unit="case") as bar, ThreadPoolExecutor(jobs) as pool:
 
         def one(name: str, numbers: range) -> tuple[str, Report]:
-            return name, fuzz(name, TARGETS[name], numbers, seed, limits, lambda _: bar.update())
+            try:
+                return name, fuzz(name, TARGETS[name], numbers, seed, limits, lambda _: bar.update())
+            except RuntimeError as error:
+                failures.append(f"cases {numbers.start} to {numbers.stop - 1}: {error}")
+                return name, Report()
 
         for name, report in pool.map(lambda part: one(*part), parts):
             reports[name].merge(report)
-    return reports
+    return reports, failures
 
 
 def table(reports: dict[str, Report]) -> str:

@@ -31,6 +31,10 @@ VALUES: tuple[Any, ...] = (
 """What takes the place of a value of JSON or YAML."""
 
 
+MOST_PLACES = 100_000
+"""Values that are looked at for an edit."""
+
+
 def encoded(text: str) -> bytes:
     return text.encode("utf-8", "surrogatepass")
 
@@ -113,6 +117,8 @@ def places(root: Any) -> list[tuple[Any, Any]]:
         node = waiting.pop()
         keys = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else []
         found += [(node, key) for key in keys]
+        if len(found) > MOST_PLACES:
+            raise ValueError("aliases of aliases, which are not followed here")
         waiting += [node[key] for key in keys]
     return found
 
