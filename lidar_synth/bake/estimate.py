@@ -6,6 +6,7 @@ from typing import NamedTuple
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.shard import generate, load_checked, one_computer
 from lidar_synth.bank.chunks import deflate
+from lidar_synth.bank.layout import head_size
 
 
 class Estimate(NamedTuple):
@@ -34,4 +35,5 @@ def estimate(plan: BakePlan) -> Estimate:
             images = generate(generator, job, range(job.first, job.first + batch))
             seconds = time.perf_counter() - start
     size = sum(len(deflate(a)) for image in images for a in plan.facts.encoding.encode(image).values())
-    return Estimate(size / batch * job.count, seconds / batch * job.count)
+    heads = sum(head_size(plan.facts, entry.scans) for entry in plan.shards)
+    return Estimate(heads + size / batch * job.count, seconds / batch * job.count)

@@ -71,6 +71,11 @@ def metadata_size(facts: Facts, scans: int) -> int:
     return _BASE + scans * _PLACE * len(facts.encoding.names)
 
 
+def head_size(facts: Facts, scans: int) -> int:
+    """Bytes of all that a shard holds beside its chunks, rounded up."""
+    return metadata_size(facts, scans) + facts.text_size + scans * SCAN_NUMBERS
+
+
 def with_hdf5(storage: Storage, facts: Facts | None, scans: int, work: Callable[[h5py.File], T]) -> T:
     """What ``work`` makes of the metadata and the numbers of a stored file, in one read where they stand together.
 
@@ -83,8 +88,7 @@ def with_hdf5(storage: Storage, facts: Facts | None, scans: int, work: Callable[
         OSError, RuntimeError: from HDF5, where it is no such file.
         FileError, DataError: as ``Storage.read``.
     """
-    head = _BASE if facts is None else metadata_size(facts, scans) + facts.text_size + scans * SCAN_NUMBERS
-    view = View(storage, max(head, storage.window))
+    view = View(storage, max(storage.window, 0 if facts is None else head_size(facts, scans)))
     for _ in range(_PASSES):
         view.fetch_missing()
         try:
