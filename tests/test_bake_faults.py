@@ -282,12 +282,13 @@ def test_a_rerun_over_many_shards_parses_the_index_once(
 # The disk
 
 
-def test_a_full_disk_by_limit(plan: BakePlan, expected: dict[str, bytes]) -> None:
-    """A file may grow beyond what HDF5 needs for its metadata, but not to the end of a shard."""
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.98])
+def test_a_full_disk_by_limit(plan: BakePlan, expected: dict[str, bytes], share: float) -> None:
+    """A file cannot grow to the end of a shard; at a low limit HDF5 cannot even write its metadata."""
     bake(plan, share=Share(0, 4), progress=False)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     shortest = min(len(content) for name, content in expected.items() if name.endswith(".h5"))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (shortest - 100, limits[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * shortest), limits[1]))
     try:
         with pytest.raises(FileError, match=r"cannot be written \(File too large\).*finished shards are kept"):
             bake(plan, progress=False)

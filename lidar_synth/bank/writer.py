@@ -15,6 +15,7 @@ import numpy as np
 from lidar_synth.bank.chunks import checksum, deflate, filters
 from lidar_synth.bank.index import Entry, Facts
 from lidar_synth.bank.layout import metadata_size
+from lidar_synth.bank.sink import Sink
 from lidar_synth.errors import DataError, FileError, LibraryError
 from lidar_synth.geometry.scan import RangeImage
 
@@ -58,9 +59,11 @@ class ShardWriter:
         self._pool = ThreadPoolExecutor(threads, "compress")
         self._limit = _PENDING * threads
         with _on_disk(path):
-            self._file = _create(path, facts, entry.scans)
+            self._sink = Sink(path)
+            self._file = _create(self._sink, facts, entry.scans)
             try:
                 self._declare(facts)
+                self._sink.check()
             except BaseException:
                 self.discard()
                 raise
@@ -96,17 +99,15 @@ class ShardWriter:
         with _on_disk(self.path):
             self._file["crc"][:] = self._crc
             self._file.close()
-            with self.path.open("rb") as file:
-                os.fsync(file.fileno())
+            self._sink.sync()
+            self._sink.close()
 
     def discard(self) -> None:
         """Give up and remove the file."""
         self._pool.shutdown(cancel_futures=True)
-        # A full disk may keep HDF5 from closing; room for its metadata is there once the file is empty.
-        with suppress(OSError):
-            os.truncate(self.path, 0)
         with suppress(OSError, RuntimeError):
             self._file.close()
+        self._sink.close()
         with suppress(OSError):
             self.path.unlink(missing_ok=True)
 
@@ -178,14 +179,15 @@ class ShardWriter:
                 else:
                     shape, dtype = self.encoding.sensor.shape, self._types()[name]
                     self._datasets[name][position] = np.frombuffer(chunk, dtype).reshape(shape)
+            self._sink.check()
 
 
-def _create(path: Path, facts: Facts, scans: int) -> h5py.File:
+def _create(sink: Sink, facts: Facts, scans: int) -> h5py.File:
     # In one block, so that a reader at a distance has all of the metadata with one request.
     options: dict[str, Any] = {"meta_block_size": metadata_size(facts, scans)}
     if facts.layout == "paged":
         options = {"fs_strategy": "page", "fs_page_size": _PAGE}
-    return h5py.File(path, "w", libver=(_VERSION, _VERSION), **options)
+    return h5py.File(sink, "w", libver=(_VERSION, _VERSION), **options)
 
 
 @contextmanager
