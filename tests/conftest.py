@@ -45,10 +45,18 @@ def real_scans() -> Path:
     return _folder("LIDAR_SYNTH_REAL_SCANS")
 
 
+class Golden:
+    """Numbers from running the peers' code: small files in tests/golden, larger ones where LIDAR_SYNTH_GOLDEN says."""
+
+    def __truediv__(self, name: str) -> Path:
+        here = Path(__file__).parent / "golden" / name
+        return here if here.is_file() else _folder("LIDAR_SYNTH_GOLDEN") / name
+
+
 @pytest.fixture(scope="session")
-def golden() -> Path:
-    """Folder with numbers from running the peers' code; skips where there is none."""
-    return _folder("LIDAR_SYNTH_GOLDEN")
+def golden() -> Golden:
+    """``golden / name`` is the path of a file; the test is skipped if it is not available."""
+    return Golden()
 
 
 @pytest.fixture(params=sorted(presets()))
