@@ -250,15 +250,18 @@ def test_two_that_end_at_the_same_time(
     assert files(plan.out) == expected
 
 
+SHARD = b"shard".ljust(64)
+
+
 def test_a_rerun_over_many_shards_parses_the_index_once(
     plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """10,000 shards, all but 20 of them there. What a shard holds is not read then; a few bytes do."""
+    """10,000 shards, all but 20 of them complete. What a shard holds is not read then; a few bytes do."""
     many = plan_in(plan.out, model, count=10_000, shard_size=1)
     prepare(many)
     for entry in many.shards:
-        (plan.out / entry.file).write_bytes(b"shard")
-    content = {"bytes": 5, "sha256": sha256(plan.out / many.shards[0].file)}
+        (plan.out / entry.file).write_bytes(SHARD)
+    content = {"bytes": len(SHARD), "sha256": sha256(plan.out / many.shards[0].file)}
     write_bank_files(plan.out, Index((many.facts,), tuple(replace(e, **content) for e in many.shards)), baked=True)
     for entry in many.shards[::500]:
         (plan.out / entry.file).unlink()
