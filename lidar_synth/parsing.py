@@ -96,7 +96,7 @@ def _yaml_fault(events: Iterable[Any]) -> str:
             if event.anchor not in sizes:
                 return f"the alias *{event.anchor} of nothing before it"
             count += sizes[event.anchor]
-        elif isinstance(event, yaml.NodeEvent):
+        elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
             if event.tag is not None:
                 return f"the tag {event.tag}"
             count += 1

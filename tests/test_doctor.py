@@ -92,7 +92,7 @@ def test_open3d_without_its_system_libraries(importing: Callable[..., None], mon
     assert found.fix.endswith("apt-get install -y --no-install-recommends libusb-1.0-0 libegl1")
     assert works(findings)
     assert found.fix in report(findings)
-    assert "PCD" in report(findings)
+    assert "3-D window" in report(findings)
 
 
 def test_open3d_that_fails_for_another_reason_shows_it(

@@ -8,7 +8,9 @@
 Files in subfolders belong to it; a scan's id is its path there without the suffix.
 """
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,14 +83,15 @@ class Folder(ScanFiles):
             check_scan(scan, str(path))
             return scan
         else:
-            scan = Scan(sensor=self.sensor, **ARRAYS[path.suffix](path))
+            arrays: dict[str, Any] = ARRAYS[path.suffix](path)
+            scan = Scan(sensor=self.sensor, **arrays)
             check_scan(scan, str(path), self._reflectance_max)
         if self._reflectance_max != 1:
             scan.reflectance = scan.reflectance / np.float32(self._reflectance_max)
         return scan
 
 
-def _columns(path: Path) -> dict[str, NDArray[np.float32]]:
+def _columns(path: Path) -> dict[str, NDArray[Any]]:
     array = read_arrays(path)["array"]
     if array.ndim != 2 or array.shape[1] < 4:
         raise DataError(f"{path} holds an array of shape {array.shape}", "(N, 4): x, y, z, reflectance")
@@ -98,7 +101,7 @@ def _columns(path: Path) -> dict[str, NDArray[np.float32]]:
     return {"points": array[:, :3], "reflectance": array[:, 3]}
 
 
-ARRAYS = {".npy": _columns, ".pcd": read_pcd, ".ply": read_ply}
+ARRAYS: dict[str, Callable[[Path], dict[str, NDArray[Any]]]] = {".npy": _columns, ".pcd": read_pcd, ".ply": read_ply}
 """Readers of a scan's arrays by suffix."""
 
 

@@ -141,7 +141,7 @@ def decode_stack(
     Raises:
         DataError: where x, y, z and range do not agree, or a value is none of the convention's.
     """
-    if stack.shape[:2] != sensor.shape:
+    if not stack.size:
         raise DataError(f"{where} holds an array of shape {stack.shape}", f"{(*sensor.shape, 6)} for {sensor.name!r}")
     distance = stack[..., 4]
     error = np.abs(np.linalg.norm(stack[..., :3], axis=-1) - distance).max()

@@ -165,10 +165,10 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
     return scan
 
 
-def _texts(names: Any) -> list[str]:
+def _texts(names: Any) -> tuple[str, ...]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise TypeError("names that are no texts")
-    return names
+    return tuple(names)
 
 
 def _content(file: BinaryIO, offset: int, size: int) -> bytes:

@@ -120,8 +120,8 @@ class ObjectBank:
             DataError: where it is no bank of objects, or damaged.
         """
         path = Path(path)
-        arrays: dict[str, Any] = read_arrays(path, most=MOST_BYTES)
         try:
+            arrays: dict[str, Any] = read_arrays(path, most=MOST_BYTES)
             if str(arrays.pop("format")) != FORMAT:
                 raise ValueError("another format")
             sensor = Sensor.from_dict(parse_json(str(arrays.pop("sensor")), "its sensor"))
