@@ -71,6 +71,7 @@ GOOD = {"name": "x", "columns": 8, "range_min": 1.0, "range_max": 9.0, "rows": 4
         ({"beams": [1.0, 2.0, 3.0, 4.0]}, "highest first"),
         ({"heights": [0.1]}, r"one per row \(4\)"),
         ({"heights": [0.1, 0.1, 0.1, 7.0]}, "within 1 m"),
+        ({"name": ""}, "an empty name; expected text"),
         ({"beans": 4}, r"sensor keys \['beans'\]"),
     ],
 )

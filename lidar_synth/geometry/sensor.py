@@ -103,6 +103,8 @@ class Sensor:
         for key in ("name", "description"):
             if not isinstance(getattr(self, key), str):
                 raise self._error(f"{key} = {getattr(self, key)!r}", "text")
+        if not self.name:
+            raise self._error("an empty name", "text, which files of its scans tell")
         for key in ("columns", "range_min", "range_max", "rows", "fov_up", "fov_down"):
             value, whole = getattr(self, key), key in ("columns", "rows")
             fits = _is_whole(value) if whole else _is_finite(value)
