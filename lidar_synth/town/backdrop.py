@@ -1,4 +1,4 @@
-"""What closes the view: houses where a street ends, rows of houses and trees behind the lots."""
+"""The background: houses where a street ends, along side streets, and in rows behind the lots."""
 
 from functools import cache
 
@@ -22,7 +22,7 @@ Rng = np.random.Generator
 
 
 def close_ends(street: Street, scene: Scene, rng: Rng) -> None:
-    """Houses, hedges and trees where the street ends at another one."""
+    """Put houses and hedges where the street ends at another one."""
     for end, way in zip(street.ends, (-1, 1), strict=True):
         if not np.isfinite(end):
             continue
@@ -31,7 +31,7 @@ def close_ends(street: Street, scene: Scene, rng: Rng) -> None:
             width = rng.uniform(9, 16)
             plan = draw_house(str(rng.choice(["house", "house", "block"])), width, 9.0, rng)
             house = Thing(building(plan, rng), finishes(rng), HOUSE)
-            # The front looks back along the street: a building's own front faces -y.
+            # The front faces back along the street; in a building's own frame it faces -y.
             at = t if way < 0 else t + width
             scene.put(house, end + way * rng.uniform(3, 6), at, -way * np.pi / 2)
             scene.put(fences.hedged(width, rng), end, t, np.pi / 2)
@@ -39,7 +39,7 @@ def close_ends(street: Street, scene: Scene, rng: Rng) -> None:
 
 
 def line_side_streets(street: Street, scene: Scene, rng: Rng) -> None:
-    """Boundaries, houses and trees along the streets that meet this one; in full where the ego vehicle turns off."""
+    """Put boundaries, houses and trees along the side streets, in full detail where the ego vehicle turns into one."""
     for c in street.crossings:
         for side in c.sides:
             if street.kind == "edge" or street.plaza == side:
@@ -69,20 +69,20 @@ def line_side_streets(street: Street, scene: Scene, rng: Rng) -> None:
 
 
 def _line(scene: Scene, ends: tuple[float, float], at: float, side: int, kind: str, rng: Rng) -> None:
-    """A boundary along t on a side; ``ends`` are |t|."""
+    """Put a boundary along t on one side of the street; ``ends`` are |t|, ``at`` is s, metres."""
     bound(scene, kind, ends if side == LEFT else (-ends[1], -ends[0]), at, False, rng)
 
 
 @cache
 def _plain_house(variant: int) -> Mesh:
-    """A house that is only seen from afar."""
+    """One of the house meshes without window recesses, for houses that are only seen from afar."""
     rng = np.random.Generator(np.random.Philox(key=variant))
     roof = ("gable", "cross", "hip")[variant % 3]
     return building(BuildingPlan(rng.uniform(9, 16), rng.uniform(8, 11), 1 + variant % 4, roof=roof, detail=False), rng)
 
 
 def second_row(street: Street, scene: Scene, rng: Rng) -> None:
-    """Houses and trees beyond the lots, and the far ends of the street, seen from afar only."""
+    """Put distant houses and trees behind the lots and around the far ends of the street."""
     low, high = -REACH - 70, street.length + REACH + 70
     for side in (RIGHT, LEFT):
         sign = 2 * side - 1

@@ -1,4 +1,4 @@
-"""What bounds a lot towards a street, in pieces that follow the street's bends."""
+"""Boundaries of lots (hedges, walls, fences), in pieces that follow the bends of the street."""
 
 from itertools import pairwise
 
@@ -10,19 +10,19 @@ from lidar_synth.town.materials import Finish
 from lidar_synth.town.scene import Scene
 
 KINDS = ("hedge", "hedge", "wall", "bars", "boards", "wire", "wallhedge", "wallhedge", "wallbars", "none")
-"""Boundaries, about as often as they are met."""
+"""Kinds of boundary; a kind that is listed twice is twice as frequent."""
 
 
 def bound(scene: Scene, kind: str, ends: tuple[float, float], at: float, along: bool, rng: np.random.Generator) -> None:
     """Put a boundary into the scene.
 
     Args:
-        scene: where.
+        scene: the scene to add it to.
         kind: one of ``KINDS``.
-        ends: metres, the coordinate along the boundary at which it starts and ends.
-        at: metres, the other coordinate.
-        along: True if it runs along s, False along t.
-        rng: draws its height, material and leaves.
+        ends: metres, start and end along its running coordinate.
+        at: metres, its position in the other coordinate.
+        along: True if it runs along s, False if it runs along t.
+        rng: samples its height, material and leaves.
     """
     if kind == "none" or ends[1] - ends[0] < 0.8:
         return
@@ -41,7 +41,7 @@ def bound(scene: Scene, kind: str, ends: tuple[float, float], at: float, along: 
 def _piece(
     kind: str, length: float, height: float, stone: Finish, shade: float, rng: np.random.Generator
 ) -> list[tuple[Thing, float, float]]:
-    """What one piece is made of: (thing, metres to its left, metres above the ground)."""
+    """The objects that make up one piece: (object, metres to its left, metres above the ground)."""
     iron = (shade, shade, 1.1 * shade)
     match kind:
         case "hedge":

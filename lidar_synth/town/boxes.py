@@ -1,7 +1,7 @@
-"""Boxes around the objects of a scan, and what the camera sees of each: image box, truncation, occlusion.
+"""3-D boxes of the objects of a scan, with their image box, truncation and occlusion in the camera image.
 
-A box is the object's own bounding box, so that it holds exactly the returns of its instance, to the noise and to
-the tilt between the ground under the object and under the sensor: a box has a yaw only.
+A box is the bounding box of the object's own mesh, so it contains the returns of its instance. Range noise and the
+tilt of the ground can move a few returns outside: a box has a yaw, but no pitch or roll.
 """
 
 import numpy as np
@@ -13,18 +13,18 @@ from lidar_synth.town.cast import Stage, trace
 from lidar_synth.town.scene import Placed, Pose
 
 _GRID = 12
-"""Camera rays along each side of an object's image box that probe how much of it is hidden."""
+"""Camera rays along each side of an object's image box, cast to estimate how much of the object is hidden."""
 _LEVELS = ((0.80, 0), (0.45, 1), (0.05, 2))
-"""KITTI's occlusion by the least visible share: 0 visible, 1 partly, 2 largely; below, 3."""
+"""(smallest visible share, KITTI's occlusion): 0 visible, 1 partly, 2 largely occluded; 3 below all of them."""
 
 
 def boxes_of(objects: list[Placed], pose: Pose, stage: Stage) -> Boxes:
-    """The boxes of objects, in the sensor frame, with what the camera sees of them.
+    """The boxes of objects in the sensor frame, with their image box, truncation and occlusion.
 
     Args:
-        objects: those that have a box and at least one return.
+        objects: the objects that have a box and at least one return.
         pose: (4, 4) sensor to world.
-        stage: the scene of the moment.
+        stage: the stretch at the time of the scan.
     """
     count = len(objects)
     seen = np.linalg.inv(pose) @ np.array([o.pose for o in objects]).reshape(-1, 4, 4)
@@ -32,7 +32,7 @@ def boxes_of(objects: list[Placed], pose: Pose, stage: Stage) -> Boxes:
     image_box, truncation = np.full((count, 4), -1, np.float32), np.full(count, -1, np.float32)
     occlusion = np.full(count, -1, np.int8)
     for i, placed in enumerate(objects):
-        # The camera sees 104 degrees; what is farther aside than its own size is not worth projecting.
+        # The camera's field of view is 104 degrees wide; objects well outside of it need no projection.
         if abs(values[i, 1]) < 1.35 * values[i, 0] + values[i, 3] + 1:
             image_box[i], truncation[i] = _in_image(placed, seen[i])
     visible = _visible_shares(
@@ -52,8 +52,8 @@ def _values(placed: Placed, seen: Pose) -> NDArray[np.float64]:
 
 
 def _in_image(placed: Placed, seen: Pose) -> tuple[NDArray[np.float64] | float, float]:
-    """The rectangle (left, top, right, bottom) in which an object's outline falls, and the share of the outline's
-    corners that fall outside the image; -1, -1 where all do."""
+    """The image box (left, top, right, bottom) of an object and its truncation, the share of its outline's corners
+    that lie outside the image; -1, -1 if the object is not in the image."""
     assert CAMERA.image_size is not None
     edge = np.array(CAMERA.image_size) - 1.0
     outline = placed.scale * placed.prototype.mesh.outline
@@ -69,7 +69,7 @@ def _in_image(placed: Placed, seen: Pose) -> tuple[NDArray[np.float64] | float, 
 
 
 def _visible_shares(objects: list[Placed], image_boxes: NDArray[np.float32], pose: Pose, stage: Stage) -> list[float]:
-    """Of the camera's rays onto each object, the share that nothing else stops."""
+    """For each object, the share of the camera rays towards it that nothing in front of it blocks."""
     step = (np.arange(_GRID) + 0.5) / _GRID
     rays, own = [], []
     eye = pixel_rays(pose, np.zeros((1, 2)))[0]

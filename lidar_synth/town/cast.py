@@ -1,7 +1,7 @@
-"""Rays into a scene: Embree finds the first triangle of the static world and of every mover.
+"""Ray casting with Embree against the static world and the movers.
 
-The static world is one Embree scene per stretch. Each mover's prototype is another, built once per process;
-per frame the few rays that can meet a mover are carried into its own frame, so that nothing is rebuilt.
+The static world is one Embree scene per stretch. Each prototype of a mover is another one, built once per process.
+For each frame, the few rays that can hit a mover are transformed into its own frame, so that nothing is rebuilt.
 """
 
 from collections.abc import Iterator
@@ -17,16 +17,16 @@ from lidar_synth.town.world import World
 
 Floats = NDArray[np.float32]
 MISS = -1
-"""Surface of a ray that hits nothing."""
+"""Surface number of a ray that hits nothing."""
 
 
 class Hits(NamedTuple):
-    """Where rays end.
+    """The first hits of N rays.
 
     Args:
-        distance: (N,) float32 metres from each ray's origin; inf where it ends nowhere.
+        distance: (N,) float32 metres from each ray's origin; inf where it hits nothing.
         surface: (N,) int32 surface number, or ``MISS``.
-        normal: (N, 3) float32 unit normal in the world, turned either way.
+        normal: (N, 3) float32 unit normal in the world frame, of arbitrary sign.
     """
 
     distance: Floats
@@ -35,7 +35,10 @@ class Hits(NamedTuple):
 
 
 class _Shape(NamedTuple):
-    """A prototype made ready for rays: kept with its mesh, so that the key by identity stays true."""
+    """A prototype as an Embree scene, with its bounding sphere.
+
+    It holds a reference to its mesh: ``_SHAPES`` is keyed by ``id(mesh)``, which must not be reused.
+    """
 
     mesh: Mesh
     solid: Solid
@@ -58,11 +61,11 @@ def _shape(mesh: Mesh) -> _Shape:
 
 
 class Stage:
-    """A stretch at one moment: its static world and its movers where they are.
+    """A stretch at one moment: its static world, and its movers at their current poses.
 
     Args:
         world: the stretch.
-        movers: those of the moment.
+        movers: the movers at this moment.
     """
 
     def __init__(self, world: World, movers: list[Placed]) -> None:
@@ -74,13 +77,13 @@ class Stage:
         self._radii = np.array([m.scale * s.radius for m, s in zip(movers, shapes, strict=True)], np.float32)
 
     def cast(self, origins: Floats, directions: Floats, eye: Floats | None = None) -> Hits:
-        """The first hits of rays.
+        """Find the first hit of each ray.
 
         Args:
-            origins: (N, 3) world, metres.
+            origins: (N, 3) metres, world frame.
             directions: (N, 3) unit vectors.
-            eye: (3,) a point that every ray's line passes within 0.3 m, e.g. the sensor: it tells cheaply which rays
-                can meet which mover.
+            eye: (3,) a point within 0.3 m of every ray, such as the sensor; with it, the rays that can hit a mover
+                are found faster.
         """
         distance, face, normal = self._solid.first(origins, directions)
         surface = np.where(face >= 0, self._faces[face], MISS)
@@ -97,7 +100,7 @@ class Stage:
         return Hits(distance, surface, normal)
 
     def _reach(self, directions: Floats, eye: Floats) -> NDArray[np.bool_]:
-        """(M, N) which rays from near an eye can meet each mover, and a few more."""
+        """(M, N) which rays that start near ``eye`` can hit each mover's bounding sphere; may include a few more."""
         way = self._middles - eye
         far = np.linalg.norm(way, axis=1, keepdims=True)
         sine = np.minimum((self._radii[:, None] + 0.3) / np.maximum(far, 1e-3), 1)
@@ -105,7 +108,7 @@ class Stage:
         return np.asarray((way / np.maximum(far, 1e-3)) @ directions.T > least)
 
     def _far_reach(self, origins: Floats, directions: Floats) -> Iterator[NDArray[np.bool_]]:
-        """The same for any rays, one mover after the other."""
+        """Which of any rays can hit each mover's bounding sphere: (N,) for one mover after another."""
         for middle, radius in zip(self._middles, self._radii, strict=True):
             way = middle - origins
             along = np.einsum("ij,ij->i", way, directions)
@@ -113,7 +116,7 @@ class Stage:
 
 
 def trace(placed: Placed, origins: Floats, directions: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
-    """Distance (inf = none), surface number and world normal (not unit) where rays meet one object alone."""
+    """Distance (inf = no hit), surface number and normal (world frame, not unit) of rays cast at one object alone."""
     shape = _shape(placed.prototype.mesh)
     turn = placed.pose[:3, :3].astype(np.float32)
     start = ((origins - placed.pose[:3, 3].astype(np.float32)) @ turn) / np.float32(placed.scale)

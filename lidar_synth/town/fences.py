@@ -1,4 +1,4 @@
-"""What bounds gardens and roads: hedges, fences that one sees through, walls, crash barriers; all along +x."""
+"""Hedges, fences, garden walls and crash barriers, all along +x."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from lidar_synth.town.plants import hedge
 
 
 def hedged(length: float, rng: np.random.Generator) -> Thing:
-    """A clipped hedge of a random height along +x."""
+    """A clipped hedge of random height and depth along +x."""
     mesh = hedge(length, rng.uniform(0.8, 1.9), rng.uniform(0.5, 0.9), rng)
     green = rng.uniform(0.8, 1.2)
     inside = Finish("foliage", (0.10 * green, 0.18 * green, 0.05))
@@ -17,7 +17,7 @@ def hedged(length: float, rng: np.random.Generator) -> Thing:
 
 
 def bar_fence(length: float, height: float, pitch: float, colour: RGB, wood: bool) -> Thing:
-    """Upright bars or boards between rails, along +x; rays pass between them."""
+    """A fence of upright bars or boards along +x; rays pass between them."""
     x = np.arange(0, length, pitch)
     thick = 0.075 if wood else 0.022
     bars = [[(a, 0, 0.06), (a + thick, 0, 0.06), (a + thick, 0, height), (a, 0, height)] for a in x]
@@ -32,7 +32,7 @@ def bar_fence(length: float, height: float, pitch: float, colour: RGB, wood: boo
 
 
 def wire_fence(length: float, height: float) -> Thing:
-    """Wire mesh between posts along +x: most rays pass."""
+    """A wire fence between posts along +x; most rays pass through the mesh."""
     posts = np.arange(0, length + 0.01, max(1.0, length / max(1, round(length / 2.5))))
     mesh = merge([
         quads([[(0, 0, 0.03), (length, 0, 0.03), (length, 0, height), (0, 0, height)]], 1),

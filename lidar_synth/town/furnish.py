@@ -1,4 +1,4 @@
-"""What stands on a street itself: parked vehicles, trees, lamps, signs, lights, the things of a square."""
+"""Objects on the street: parked vehicles, trees, lamps, signs, traffic lights and small street furniture."""
 
 import numpy as np
 
@@ -20,13 +20,13 @@ _PARKED = {
 
 
 def draw_vehicle(rng: Rng, shares: dict[str, float] = _PARKED) -> str:
-    """A kind of vehicle by how often it is met."""
+    """A kind of vehicle, sampled by the given shares (they need not sum to 1)."""
     weight = np.array(list(shares.values()))
     return str(rng.choice(list(shares), p=weight / weight.sum()))
 
 
 def furnish(street: Street, lots: list[Lot], scene: Scene, rng: Rng) -> None:
-    """Put everything that stands on the street into the scene."""
+    """Put all static objects of the street and its squares into the scene."""
     for side in (RIGHT, LEFT):
         _park_along(street, lots, side, scene, rng)
         _trees(street, side, scene, rng)
@@ -148,7 +148,7 @@ def _signs(street: Street, side: int, scene: Scene, rng: Rng) -> None:
 
 
 def _corner_posts(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> None:
-    """Traffic lights at big junctions, street names and right-of-way signs at others."""
+    """Put traffic lights at large junctions, and street-name and right-of-way signs at other ones."""
     for side in c.sides:
         sign = 2 * side - 1
         for way in (-1, 1):
@@ -169,7 +169,7 @@ def _corner_posts(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> None
 
 
 def _small_things(street: Street, side: int, scene: Scene, rng: Rng) -> None:
-    """Bins, cabinets, bollards, bicycles and motorcycles, bus stops, columns along the lots' front."""
+    """Put bins, cabinets, bicycles, motorcycles, bus stops and advertising columns along the front of the lots."""
     sign, front = 2 * side - 1, street.front(side)
     if street.kind == "edge":
         return

@@ -1,7 +1,6 @@
-"""What stands along a street: lamps, signs, traffic lights, fences, walls, benches, bins, shelters.
+"""Static objects along a street: plants, lamps, benches, bins, bus shelters, market stalls.
 
-Every function returns a ``Thing`` that stands on the ground at the origin, faces +x (its front, or the
-way it runs) and tells the class of each of its slots.
+Every function returns a ``Thing`` whose origin is on the ground and whose front (or long side) is along +x.
 """
 
 from dataclasses import dataclass
@@ -18,12 +17,12 @@ GALVANISED = Finish("metal", (0.55, 0.57, 0.58))
 
 @dataclass(frozen=True)
 class Thing:
-    """Something that stands still and is no instance.
+    """A static object without an instance number ("stuff" in panoptic segmentation).
 
     Args:
         mesh: its triangles.
-        finishes: what each slot wears.
-        raw: SemanticKITTI's class of each slot.
+        finishes: the finish of each slot.
+        raw: SemanticKITTI's class id of each slot.
     """
 
     mesh: Mesh
@@ -32,7 +31,7 @@ class Thing:
 
 
 def grown(species: str, rng: np.random.Generator, size: float = 1.0, near: bool = True) -> Thing:
-    """A tree or bush of a species, with its own tint; coarser where it is not ``near``."""
+    """A tree or bush of a species with a random shape, size and tint; with fewer leaves unless it is ``near``."""
     mesh = (plant if near else coarse_plant)(species, int(rng.integers(VARIANTS)))
     mesh = mesh.moved(yaw=rng.uniform(0, 2 * np.pi), scale=size * rng.uniform(0.85, 1.15, 3))
     leaf, *rest = SPECIES[species]
@@ -45,12 +44,12 @@ def grown(species: str, rng: np.random.Generator, size: float = 1.0, near: bool 
 
 
 def weeds(length: float, depth: float, height: float, rng: np.random.Generator) -> Thing:
-    """High grass along +x."""
+    """A strip of high grass along +x."""
     return Thing(tufts(length, depth, height, 26, rng), (Finish("leaf", (0.36, 0.45, 0.18)),), (TERRAIN,))
 
 
 def lamp_post(height: float, reach: float) -> Thing:
-    """A street lamp, its arm towards +x."""
+    """A street lamp with its arm towards +x."""
     pole = tube([(0, 0, -0.2), (0, 0, 0.9), (0, 0, 1.0), (0, 0, height)], (0.085, 0.085, 0.06, 0.045), 8)
     arm = tube([(0, 0, height), (0.4 * reach, 0, height + 0.25), (reach, 0, height + 0.3)], 0.035, 6)
     head = boxes([(reach - 0.1, -0.14, height + 0.22)], [(reach + 0.6, 0.14, height + 0.36)], 1)
@@ -58,7 +57,7 @@ def lamp_post(height: float, reach: float) -> Thing:
 
 
 def mast(height: float, radius: float, wood: bool) -> Thing:
-    """A plain pole: a telegraph mast or one that carries the tram's wires."""
+    """A plain pole: a telegraph mast, or a mast of a tram's overhead line."""
     return Thing(
         tube([(0, 0, -0.2), (0, 0, height)], (radius, 0.75 * radius), 8),
         (Finish("bark") if wood else GALVANISED,),
@@ -87,7 +86,7 @@ def bin_(rng: np.random.Generator) -> Thing:
 
 
 def cabinet() -> Thing:
-    """A telephone or power company's cabinet."""
+    """A roadside cabinet of a telephone or power company."""
     mesh = merge([boxes([(-0.2, -0.5, -0.1)], [(0.2, 0.5, 1.15)]), boxes([(-0.24, -0.54, 1.15)], [(0.24, 0.54, 1.22)])])
     return Thing(mesh, (Finish("plastic", (0.50, 0.53, 0.50)),), (OTHER,))
 
@@ -103,7 +102,7 @@ def bollard(height: float = 0.9) -> Thing:
 
 
 def shelter() -> Thing:
-    """A bus stop's shelter, open to +x: glass walls, a roof, a bench."""
+    """A bus shelter, open to +x: glass walls, a roof, a bench."""
     glass = [
         [(-0.7, -2, 0.15), (-0.7, 2, 0.15), (-0.7, 2, 2.2), (-0.7, -2, 2.2)],
         [(-0.7, -2, 0.15), (0.5, -2, 0.15), (0.5, -2, 2.2), (-0.7, -2, 2.2)],

@@ -1,6 +1,6 @@
-"""Lots along a street: which house stands where, its driveway, what bounds its front.
+"""The plan of the lots along a street: houses, driveways and front boundaries.
 
-Lots are drawn before the ground is laid, because driveways and yards are painted on it; ``yards`` builds them.
+Lots are sampled before the ground is built, because driveways and yards are painted on it; ``yards`` then builds them.
 """
 
 from dataclasses import dataclass, replace
@@ -17,18 +17,18 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Lot:
-    """A piece of ground beside the street.
+    """A lot beside the street.
 
     Args:
-        start, end: its s, start < end.
+        start, end: its interval of s, metres, start < end.
         side: RIGHT or LEFT.
-        front: |t| of its front boundary.
-        setback: metres from there to the house.
-        plan: its house, or None.
-        at: metres from ``start`` to the house's corner of lower s.
-        driveway: (start, end) in s of a paved strip, or None.
-        boundary: what bounds its front: hedge, wall, bars, boards, wire, wallhedge or nothing.
-        garden: how green it is, 0..1.
+        front: |t| of its front boundary, metres.
+        setback: metres from the front boundary to the house.
+        plan: the plan of its house, or None for an empty lot.
+        at: metres along s from ``start`` to the house.
+        driveway: (start, end) of a paved strip along s, metres, or None.
+        boundary: the kind of its front boundary, one of ``boundaries.KINDS``.
+        garden: density of its plants, 0..1.
     """
 
     start: float
@@ -44,12 +44,12 @@ class Lot:
 
     @property
     def sign(self) -> int:
-        """Of t on this side."""
+        """The sign of t on this side of the street."""
         return 2 * self.side - 1
 
 
 def draw_house(style: str, width: float, depth: float, rng: Rng) -> BuildingPlan:
-    """A house, row, block, shop or hall of the given width and depth in metres."""
+    """The sampled plan of a house, row, block, shop or hall of the given width and depth in metres."""
     match style:
         case "house":
             roof = str(rng.choice(["gable", "cross", "hip"], p=[0.6, 0.25, 0.15]))
@@ -84,7 +84,7 @@ def _style(street: Street, side: int, rng: Rng) -> str:
 
 
 def draw_lots(street: Street, rng: Rng) -> list[Lot]:
-    """The lots of both sides, from one end of the stretch to the other."""
+    """Sampled lots on both sides, from one end of the stretch to the other."""
     lots = []
     for side in (RIGHT, LEFT):
         front = street.front(side)
@@ -150,7 +150,7 @@ def _draw_lot(
 
 
 def paint_lots(lots: list[Lot], paint: Paint, rng: Rng) -> None:
-    """Driveways, yards and flower beds."""
+    """Paint driveways, yards and flower beds onto the ground."""
     for lot in lots:
         if lot.plan is not None and lot.garden < 0.25:
             paint((lot.start, lot.end), (lot.sign * lot.front, lot.sign * (lot.front + lot.setback)), "yard")

@@ -1,8 +1,7 @@
-"""What things are made of, as a 905 nm laser and as a camera see it, and the table of all surfaces of a scene.
+"""Materials, as a 905 nm laser and as a camera see them, and the table of all surfaces of a scene.
 
-The LiDAR's figures are in the sensor's own units of reflectance (0..1 as the KITTI datasets store it, which
-is neither albedo nor calibrated): set so that each class of the town lies where the same class lies in
-labelled street scans at 10 to 25 m.
+Reflectance is in the unit of the KITTI datasets (0..1, neither albedo nor calibrated). The values are fitted so that
+each class of the town has the reflectance that it has in labelled street scans at 10 to 25 m.
 """
 
 from dataclasses import dataclass, field
@@ -19,15 +18,15 @@ class Material(NamedTuple):
     """One material.
 
     Args:
-        reflectance: what a LiDAR reads at 10 to 25 m, face on.
-        speckle: standard deviation of that from one return to the next.
-        gloss: how mirror-like, 0..1: glossy faces send little back unless they face the sensor.
-        through: share of rays that pass on to what is behind.
-        lost: share of rays that never come back.
-        depth: metres, roughness along the ray (leaves, grass).
+        reflectance: mean reflectance that a LiDAR measures at 10 to 25 m and normal incidence.
+        speckle: standard deviation of the reflectance between returns.
+        gloss: how specular it is, 0..1; glossy faces return little unless they face the sensor.
+        through: share of rays that pass through it.
+        lost: share of rays that never return.
+        depth: metres, standard deviation of the range noise of rough materials (leaves, grass).
         colour: RGB in 0..1 for the camera.
-        grain: strength of the camera's texture.
-        tone: whether a darker finish also reflects less in the infrared.
+        grain: strength of its texture in the camera image.
+        tone: whether a darker finish also reflects less at 905 nm.
     """
 
     reflectance: float
@@ -74,19 +73,19 @@ MATERIALS: dict[str, Material] = {
     "cloth": Material(0.42, 0.11, lost=0.01, depth=0.005, colour=(0.3, 0.3, 0.4), grain=0.12, tone=True),
     "skin": Material(0.40, 0.08, colour=(0.78, 0.58, 0.47), grain=0.05),
 }
-"""Every material by name."""
+"""The materials by name."""
 
 INDEX = {name: i for i, name in enumerate(MATERIALS)}
-"""A material's number by its name."""
+"""The number of each material by name."""
 
 
 def column(name: str) -> NDArray[np.float32]:
-    """One property of all materials by number."""
+    """One property of all materials, indexed by material number."""
     return np.array([getattr(m, name) for m in MATERIALS.values()], np.float32)
 
 
 class Finish(NamedTuple):
-    """What a slot of an object wears: a material and, where it is not the material's own, a colour."""
+    """The finish of a slot: a material and, unless it is the material's own, a colour."""
 
     material: str
     colour: RGB | None = None
@@ -97,7 +96,7 @@ def _reflectance(finish: Finish) -> float:
     material = MATERIALS[finish.material]
     if finish.colour is None or not material.tone:
         return material.reflectance
-    # Paints and cloths that are dark to the eye are mostly, not always, dark at 905 nm; red ones are bright.
+    # Dark paints and cloths are mostly dark at 905 nm too; red ones are bright.
     bright = 0.55 * finish.colour[0] + 0.3 * finish.colour[1] + 0.15 * finish.colour[2]
     low = 0.03 if material.gloss > 0.5 else 0.45
     return material.reflectance * (low + (1.15 - low) * min(1.0, bright / 0.75))
@@ -105,20 +104,20 @@ def _reflectance(finish: Finish) -> float:
 
 @dataclass
 class Surfaces:
-    """All surfaces of a scene, each a finish on an object; a triangle names its surface by number.
+    """All surfaces of a scene, each a finish on one object; triangles refer to surfaces by number.
 
-    ``freeze`` gives them as columns, for lookups by the surfaces that rays hit.
+    ``freeze`` returns them as columns, for lookups by the surface numbers of ray hits.
     """
 
     rows: list[tuple[int, int, int, float, RGB]] = field(default_factory=list)
 
     def add(self, finish: Finish, raw: int, instance: int = 0) -> int:
-        """The number of a new surface.
+        """Add a surface and return its number.
 
         Args:
             finish: its material and colour.
             raw: SemanticKITTI's class id.
-            instance: of the object it belongs to, 0 = none.
+            instance: instance number of its object, 0 = none.
         """
         colour = finish.colour or MATERIALS[finish.material].colour
         self.rows.append((INDEX[finish.material], raw, instance, _reflectance(finish), colour))
@@ -137,10 +136,10 @@ class Surfaces:
 
 
 class SurfaceTable(NamedTuple):
-    """Columns by surface number.
+    """All surfaces as columns, indexed by surface number.
 
     Args:
-        material: (S,) uint8, a key's place in ``MATERIALS``.
+        material: (S,) uint8, index in ``MATERIALS``.
         raw: (S,) uint32 SemanticKITTI class id.
         instance: (S,) int32, 0 = none.
         reflectance: (S,) float32.

@@ -1,4 +1,4 @@
-"""How things move: the ego vehicle, and movers that walk steadily along a line of the street."""
+"""Motion: the path of the ego vehicle, and movers with constant speed along a line of the street."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,19 @@ from lidar_synth.town.street import Street
 
 @dataclass(frozen=True)
 class Mover:
-    """Something on its way.
+    """A moving object (or one that waits) on a line of constant s or t.
 
     Args:
-        shapes: its prototypes by phase of the stride; one for what does not change.
-        stride: metres of way per turn of the phases.
-        along: True if it runs along s, False along t.
-        at: the other coordinate, metres.
-        start: its coordinate at time 0, metres.
-        way: +1 or -1, where it faces along its line.
-        speed: m/s, 0 waits.
-        instance: its number.
-        surfaces: of its slots.
-        scale: of its prototype.
+        shapes: its prototypes by phase of the stride; a single one for a vehicle.
+        stride: metres travelled per cycle of the phases.
+        along: True if it moves along s, False if it moves along t.
+        at: the constant coordinate, metres.
+        start: the changing coordinate at time 0, metres.
+        way: +1 or -1, the direction in which it faces.
+        speed: m/s; 0 for one that waits.
+        instance: its instance number.
+        surfaces: the surface number of each slot.
+        scale: the scale of its prototype.
     """
 
     shapes: tuple[Prototype, ...]
@@ -39,7 +39,7 @@ class Mover:
     scale: float
 
     def place(self, time: float) -> tuple[float, float, float]:
-        """Its s, t (metres) and yaw from the street's heading (radians) at a time in seconds."""
+        """Its s and t (metres) and its yaw relative to the street (radians) at a time in seconds."""
         on = self.start + self.way * self.speed * time
         yaw = (0.0 if self.along else np.pi / 2) + (np.pi if self.way < 0 else 0.0)
         return (on, self.at, yaw) if self.along else (self.at, on, yaw)
@@ -52,7 +52,7 @@ class Mover:
 
 
 def stand(movers: list[Mover], scene: Scene, time: float, about: tuple[float, float], reach: float) -> list[Placed]:
-    """The movers as objects in the world at a time in seconds, those within ``reach`` metres of street coordinates."""
+    """The movers within ``reach`` metres of street coordinates ``about``, placed in the world at a time in seconds."""
     places = np.array([m.place(time) for m in movers]).reshape(-1, 3)
     near = np.flatnonzero(np.hypot(places[:, 0] - about[0], places[:, 1] - about[1]) < reach)
     lengths = [2.0 if len(movers[i].shapes) == 1 else 0.5 for i in near]
@@ -65,9 +65,9 @@ def stand(movers: list[Mover], scene: Scene, time: float, about: tuple[float, fl
 
 
 def ego_place(street: Street, time: float) -> tuple[float, float, float]:
-    """Street coordinates of the ego vehicle at a time in seconds, and its yaw (radians) from the street's heading.
+    """Street coordinates of the ego vehicle at a time in seconds, and its yaw (radians) relative to the street.
 
-    It keeps its lane, though only nearly, or turns off in an arc into the right lane of a side street.
+    The vehicle follows its lane with a small lateral drift, or turns in an arc into the right lane of a side street.
     """
     way, lane = street.speed * time, street.lanes[0].t
     if street.turn is None:
@@ -86,10 +86,10 @@ def ego_pose(street: Street, scene: Scene, time: float, height: float, sway: NDA
     """(4, 4) sensor to world at a time in seconds.
 
     Args:
-        street, scene: where it drives.
-        time: seconds from s = 0.
-        height: metres of the sensor above the ground.
-        sway: (roll, pitch) of the body on its springs, radians.
+        street, scene: the stretch on which it drives.
+        time: seconds since it passed s = 0.
+        height: height of the sensor above the ground, metres.
+        sway: (roll, pitch) of the body on its suspension, radians.
     """
     pose = scene.poses(*ego_place(street, time), 4.0)
     roll, pitch = sway

@@ -1,4 +1,4 @@
-"""What a street's ground is painted with: verges, pavements, bays, carriageways, markings, crossings."""
+"""The kinds of ground of a street: verges, pavements, parking bays, carriageways, markings, crossings."""
 
 from dataclasses import dataclass, field
 
@@ -8,17 +8,19 @@ from lidar_synth.town.ground import NAMES, Corner, Rect
 from lidar_synth.town.street import LEFT, REACH, RIGHT, SideStreet, Street
 
 PLAZA_DEPTH = 34.0
-"""Metres of open square behind the pavement."""
+"""Depth of an open square behind the pavement, metres."""
 BEYOND = 260.0
-"""Metres of ground around the driven part, for the camera's horizon."""
+"""Metres of ground around the driven part, so that the camera image has a horizon."""
 
 
 @dataclass
 class Paint:
-    """Rectangles of ground, later ones over earlier ones.
+    """Rectangles of ground; later ones cover earlier ones.
 
     Args:
-        reach: (lowest s, highest s, lowest t, highest t) of all ground.
+        reach: (lowest s, highest s, lowest t, highest t) of all ground, metres.
+        rects: the rectangles, see ``Ground``.
+        corners: rounded corners of kerbs.
     """
 
     reach: tuple[float, float, float, float]
@@ -26,12 +28,12 @@ class Paint:
     corners: list[Corner] = field(default_factory=list)
 
     def __call__(self, s: tuple[float, float], t: tuple[float, float], kind: str) -> None:
-        """Paint a rectangle; the ends of s and of t in either order."""
+        """Paint a rectangle with a kind of ground; ``s`` and ``t`` are its intervals in metres, in either order."""
         self.rects.append((min(s), max(s), min(t), max(t), NAMES.index(kind)))
 
 
 def pave(street: Street, rng: np.random.Generator) -> Paint:
-    """All ground of a street but its lots, from the pavements in to the markings."""
+    """Paint all ground of a street except its lots, from the pavements inwards to the markings."""
     paint = Paint((-BEYOND, street.length + BEYOND, -BEYOND, BEYOND))
     whole = paint.reach[:2]
     asphalt = "road" if rng.random() < 0.7 else "old_road"
@@ -77,14 +79,14 @@ def _pavements(street: Street, c: SideStreet, paint: Paint) -> None:
 
 
 def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> None:
-    """A side street's asphalt; lines, stop lines and zebras where the streets are big."""
+    """Paint the asphalt of a side street, and on larger streets its lines, stop lines and zebra crossings."""
     low = -BEYOND if RIGHT in c.sides else -street.edge[RIGHT]
     high = BEYOND if LEFT in c.sides else street.edge[LEFT]
     if len(c.sides) == 1 and street.median:
         low, high = (low, -street.median) if RIGHT in c.sides else (street.median, high)
     paint((c.s - c.half, c.s + c.half), (low, high), asphalt)
     if street.kind == "junction" and street.median:
-        # The strip between the ways ends before the zebra crossings.
+        # The median ends before the zebra crossings.
         paint((c.s - c.half - 6.5, c.s + c.half + 6.5), (-street.median, street.median), asphalt)
     if not street.marked or street.kind not in ("junction", "main", "square"):
         return

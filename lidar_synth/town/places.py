@@ -1,4 +1,4 @@
-"""What makes a place: the wild sides of a road at the edge of town, the things and people of a square."""
+"""Objects of special places: the verges of a road at the edge of town, and the furniture and people of a square."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ Rng = np.random.Generator
 
 
 def edge_of_town(street: Street, side: int, scene: Scene, rng: Rng) -> None:
-    """Edge of town: high grass, thickets, crash barriers, lone trees."""
+    """Put high grass, thickets, crash barriers and single trees beside a road at the edge of town."""
     sign, front = 2 * side - 1, street.front(side)
     rail, thicket = rng.random() < 0.3, rng.uniform(0, 0.8)
     for low, high in street.gaps(side, 2.0):
@@ -33,7 +33,7 @@ def edge_of_town(street: Street, side: int, scene: Scene, rng: Rng) -> None:
 
 
 def square(street: Street, side: int, scene: Scene, rng: Rng) -> None:
-    """Trees in rows, benches and their sitters, stalls, a fountain, bicycles, people standing about."""
+    """Put rows of trees, benches with sitting people, stalls, a fountain and standing people onto a square."""
     sign, front = 2 * side - 1, street.front(side)
     low, high = -8.0, street.length + 8
     middle = sign * (front + 0.5 * PLAZA_DEPTH)

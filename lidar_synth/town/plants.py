@@ -1,7 +1,7 @@
-"""Trees, bushes and hedges: trunks and boughs as tubes, foliage as many small triangles.
+"""Meshes of trees, bushes and hedges: trunks and branches as tubes, foliage as many small triangles.
 
-Rays slip between the leaves as they do in a real crown: some end on the outside, some on a bough, some
-behind the tree. Prototypes are drawn once per process from fixed keys; a scene turns, scales and tints them.
+Rays pass between the leaves as in a real crown: some hit outer leaves, some a branch, and some an object behind the
+tree. Each prototype is sampled once per process with a fixed key; a scene rotates, scales and tints it.
 """
 
 from functools import cache
@@ -14,9 +14,9 @@ from lidar_synth.town.meshes import Mesh, leaves, loft, merge, tube
 
 LEAF, BARK, TWIG = 0, 1, 2
 TREE_CLASSES = (70, 71, 70)
-"""SemanticKITTI's class by slot: foliage and boughs are vegetation, the stem below them is trunk."""
+"""SemanticKITTI's class id of each slot: leaves and branches are vegetation, the stem is trunk."""
 VARIANTS = 4
-"""Prototypes of each species."""
+"""Number of prototypes of each species."""
 
 SPECIES: dict[str, tuple[Finish, ...]] = {
     "round": (Finish("leaf", (0.20, 0.36, 0.10)), Finish("bark"), Finish("bark")),
@@ -27,7 +27,7 @@ SPECIES: dict[str, tuple[Finish, ...]] = {
     "bush": (Finish("leaf", (0.22, 0.35, 0.11)), Finish("bark"), Finish("bark")),
     "thuja": (Finish("leaf", (0.16, 0.29, 0.12)), Finish("bark"), Finish("bark")),
 }
-"""Finishes of each species; the first is tinted per plant."""
+"""The finishes of each species; the colour of the first one varies per plant."""
 
 
 def _rng(name: str, variant: int) -> np.random.Generator:
@@ -35,7 +35,7 @@ def _rng(name: str, variant: int) -> np.random.Generator:
 
 
 def _stem(height: float, radius: float, rng: np.random.Generator) -> tuple[Mesh, NDArray[np.float64]]:
-    """A slightly crooked trunk with roots spreading at its foot; also its path."""
+    """A slightly crooked trunk that widens at its foot, and its path (5, 3)."""
     levels = np.array([-0.2, 0.12, 0.45, 0.5 * height, height])
     lean = np.cumsum(rng.normal(0, 0.05, (5, 2)), axis=0) * (levels[:, None] > 0.2)
     path = np.c_[lean, levels]
@@ -50,7 +50,7 @@ def _boughs(foot: NDArray[np.float64], ends: NDArray[np.float64], radius: float)
 
 def _clumps(centres: NDArray[np.float64], spread: NDArray[np.float64] | float, count: int, size: float,
             rng: np.random.Generator) -> Mesh:  # fmt: skip
-    """Bunches of leaves around each centre."""
+    """Clusters of leaves, ``count`` triangles around each centre."""
     middle = np.repeat(centres, count, axis=0) + rng.normal(0, 1, (count * len(centres), 3)) * spread
     return leaves(middle, size * rng.uniform(0.6, 1.3, len(middle)), rng, LEAF)
 
@@ -58,7 +58,7 @@ def _clumps(centres: NDArray[np.float64], spread: NDArray[np.float64] | float, c
 def _shell(
     count: int, radii: tuple[float, float, float], middle: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Points near the surface of an ellipsoid above the origin."""
+    """(count, 3) points near the surface of an ellipsoid whose centre is ``middle`` metres above the origin."""
     out = rng.standard_normal((count, 3))
     out *= rng.uniform(0.55, 1.0, (count, 1)) ** 0.6 / np.linalg.norm(out, axis=1, keepdims=True)
     points: NDArray[np.float64] = out * radii + (0, 0, middle)
@@ -88,7 +88,7 @@ def _conifer(rng: np.random.Generator, height: float, clear: float, width: float
 
 
 def _skirt(height: float, clear: float, width: float) -> Mesh:
-    """The dense cone inside a conifer."""
+    """The opaque cone inside a conifer."""
     angle = np.linspace(0, 2 * np.pi, 9)[:-1]
     rings = [np.c_[0.33 * width * f * np.cos(angle), 0.33 * width * f * np.sin(angle), np.full(8, z)]
              for f, z in ((1.0, clear + 0.05 * height), (0.01, 0.95 * height))]  # fmt: skip
@@ -103,7 +103,7 @@ def _bush(rng: np.random.Generator, height: float, width: float) -> Mesh:
 
 @cache
 def coarse_plant(species: str, variant: int) -> Mesh:
-    """``plant`` for one that is only seen from afar: a quarter of its leaves, each twice as wide."""
+    """``plant`` with fewer triangles, to be seen from afar: a quarter of the leaves, each twice as wide."""
     mesh = plant(species, variant)
     leaf = mesh.slot == LEAF
     if species in ("spruce", "thuja"):
@@ -117,7 +117,7 @@ def coarse_plant(species: str, variant: int) -> Mesh:
 
 @cache
 def plant(species: str, variant: int) -> Mesh:
-    """One of the ``VARIANTS`` of a species of ``SPECIES``; slots LEAF, BARK, TWIG."""
+    """Prototype number ``variant`` (0 to ``VARIANTS`` - 1) of a species; slots LEAF, BARK, TWIG."""
     rng = _rng(species, variant)
     match species:
         case "round":
@@ -136,7 +136,7 @@ def plant(species: str, variant: int) -> Mesh:
 
 
 def hedge(length: float, height: float, depth: float, rng: np.random.Generator) -> Mesh:
-    """A clipped hedge along +x from the origin, half its depth to either side; leaves are slot 0, its inside slot 1."""
+    """A clipped hedge along +x from the origin, centred on the x axis; slot 0 = leaves, slot 1 = opaque core."""
     steps = max(2, int(length / 0.5) + 1)
     x = np.linspace(0, length, steps)
     half, top = 0.36 * depth, height - 0.08

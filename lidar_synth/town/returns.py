@@ -1,9 +1,9 @@
-"""What comes back to the sensor from where its rays end: range, reflectance, or nothing.
+"""The sensor model: from ray hits to returns with range and reflectance, or to no return.
 
-The model follows what labelled street scans of an HDL-64E show. Its reflectance is corrected for distance up to
-about 25 m and then falls; it hardly depends on the angle until a face is nearly grazed; glossy paint and glass
-answer only when they face the sensor; plates and signs send everything back; each laser has its own gain.
-A ray is lost at random, the more so the less light returns.
+The model is fitted to labelled street scans of an HDL-64E. Reflectance is corrected for distance up to about 25 m and
+then decreases; it hardly depends on the angle of incidence except near grazing incidence; glossy paint and glass
+return light only at normal incidence; number plates and signs are retroreflectors; each laser has its own gain.
+Rays are dropped at random, with a probability that grows as the returned signal falls.
 """
 
 from dataclasses import dataclass
@@ -26,21 +26,21 @@ _RANGES = np.array([0, 4, 8, 20, 25, 35, 50, 70, 130])
 _FALL = np.interp(np.arange(0, 130, _STEP), _RANGES, [0.72, 0.82, 0.98, 0.98, 0.90, 0.64, 0.40, 0.22, 0.10]).astype(
     np.float32
 )
-"""How reflectance falls with distance, by steps of ``_STEP`` metres."""
+"""Factor of reflectance by distance, in steps of ``_STEP`` metres."""
 _DARK = 0.10
-"""Below about this, the sensor reads 0."""
+"""Values below this are reduced further, to 0 at two thirds of it: the sensor measures 0 for dark surfaces."""
 _BLANK = 0.025
-"""Share of returns whose reflectance reads 0 for no visible reason."""
+"""Share of returns whose reflectance is 0 at random."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """How imperfect the sensor is.
+    """The measurement noise of the sensor.
 
     Args:
-        range_std: metres, of every range.
-        gain_std: spread of the lasers' gains.
-        threshold: returned signal at which half of the rays are lost.
+        range_std: metres, standard deviation of the range.
+        gain_std: standard deviation of the lasers' gains.
+        threshold: signal strength at which half of the rays are dropped.
     """
 
     range_std: float = 0.018
@@ -49,7 +49,7 @@ class Noise:
 
 
 def laser_gains(sensor: Sensor, noise: Noise) -> Floats:
-    """(H,) gain of each laser, always the same for a sensor; a few lasers are weak."""
+    """(H,) gain of each laser, the same for every scan of a sensor; a few lasers are weak."""
     rng = np.random.Generator(np.random.Philox(key=sensor.shape[0]))
     gains = rng.normal(1.15, noise.gain_std, sensor.shape[0])
     gains[rng.random(sensor.shape[0]) < 0.08] *= 0.6
@@ -57,7 +57,10 @@ def laser_gains(sensor: Sensor, noise: Noise) -> Floats:
 
 
 def patches(points: Floats, size: float) -> Floats:
-    """(N,) uniform in [0, 1), the same for all points (N, 3) of a cube of ``size`` metres: panes answer as wholes."""
+    """(N,) pseudo-random values, uniform in [0, 1), one per cube of ``size`` metres in which the points (N, 3) lie.
+
+    A hash of the cube's indices, so that all points of a window pane get the same value.
+    """
     x, y, z = np.floor(points / np.float32(size)).astype(np.int64).astype(np.uint64).T
     mixed = x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9)
     mixed = (mixed ^ (mixed >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -74,7 +77,7 @@ def see_through(
     surfaces: SurfaceTable,
     rng: np.random.Generator,
 ) -> None:
-    """Send on, in place, the rays that pass glass, wire mesh and leaves; at most three times."""
+    """Continue, in place, the rays that pass through glass, wire mesh and leaves, through at most three layers."""
     on = np.flatnonzero(hits.surface != MISS)
     for _ in range(3):
         share = _THROUGH[surfaces.material[hits.surface[on]]]
@@ -103,19 +106,19 @@ def measure(
     noise: Noise,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Which rays return, with what range and reflectance.
+    """Sample which rays return, and their range and reflectance.
 
     Args:
-        hits: where N rays end.
+        hits: the hits of N rays.
         directions: (N, 3) unit vectors.
-        laser: (N,) which laser sent each.
-        surfaces: of the scene.
-        gains: (H,) by laser.
-        noise: the sensor's.
-        rng: draws noise and losses.
+        laser: (N,) the laser of each ray.
+        surfaces: the surfaces of the scene.
+        gains: (H,) gain of each laser.
+        noise: the measurement noise of the sensor.
+        rng: samples noise and dropped rays.
 
     Returns:
-        The M rays that return, their ranges (M,) in metres and reflectances (M,) in [0, 1).
+        (M,) indices of the rays that return, (M,) ranges in metres and (M,) reflectances in [0, 1).
     """
     back = np.flatnonzero(hits.surface != MISS)
     surface, far = hits.surface[back], hits.distance[back]

@@ -1,7 +1,7 @@
-"""A picture of the scene by the rays of the camera: sun, shadow, sky, glass, texture, exposure, noise.
+"""Rendering of the camera image by ray casting: sun, shadows, sky, glass, textures, exposure, noise.
 
-The same triangles as the LiDAR sees, at the same moment. Textures are noise in world coordinates, so that they
-stay on things from picture to picture; leaves are cut out of their triangles by such noise too.
+The camera sees the same triangles as the LiDAR at the same time. Textures are noise in world coordinates, so that
+they stay fixed to surfaces from image to image; the same noise cuts leaf shapes out of the triangles of the foliage.
 """
 
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ Floats = NDArray[np.float32]
 _GRAIN, _GLOSS = column("grain"), column("gloss")
 _GLASS = np.array([INDEX["glass"], INDEX["carglass"]])
 _CUT = {INDEX["leaf"]: 0.42, INDEX["wire"]: 0.78}
-"""Share of these that the camera looks through."""
+"""Share of each of these materials that is open to camera rays."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """The weather of a stretch.
+    """The illumination of a stretch.
 
     Args:
-        sun: (3,) unit vector towards it.
-        direct: strength of the sun; 0 under clouds.
-        ambient: strength of the sky.
-        cloud: how covered the sky is, 0..1.
+        sun: (3,) unit vector towards the sun.
+        direct: strength of the sunlight; 0 under full cloud cover.
+        ambient: strength of the light of the sky.
+        cloud: cloud cover, 0..1.
     """
 
     sun: Floats
@@ -48,7 +48,7 @@ def draw_light(rng: np.random.Generator) -> Light:
 
 
 def sky(directions: Floats, light: Light) -> Floats:
-    """(N, 3) linear RGB of the sky along unit vectors; over-bright at the horizon and near the sun, as pictures are."""
+    """(N, 3) linear RGB of the sky along unit vectors; overexposed at the horizon and near the sun, as in photos."""
     up = np.clip(directions[:, 2:], 0, 1)
     blue = np.array([0.22, 0.44, 0.86], np.float32) * (1 - light.cloud) + 0.85 * light.cloud
     colour = blue * up**0.45 + np.array([1.0, 1.02, 1.04], np.float32) * (1 - up**0.45)
@@ -61,7 +61,7 @@ def sky(directions: Floats, light: Light) -> Floats:
 
 
 def _smooth(places: Floats, layer: float) -> Floats:
-    """(N,) smooth noise in 0..1 over the plane (N, 2); the layer picks one."""
+    """(N,) value noise in 0..1 at points of the plane (N, 2); each ``layer`` is an independent pattern."""
     base = np.floor(places)
     f = places - base
     f = f * f * (3 - 2 * f)
@@ -74,7 +74,7 @@ def _smooth(places: Floats, layer: float) -> Floats:
 
 
 def look(stage: Stage, eye: Floats, directions: Floats, surfaces: SurfaceTable) -> Hits:
-    """Where camera rays end: as ``Stage.cast``, but through the gaps between leaves and in wire mesh."""
+    """The first hits of camera rays: as ``Stage.cast``, but rays pass through the gaps of foliage and wire mesh."""
     origins = np.broadcast_to(eye, directions.shape)
     hits = stage.cast(origins, directions, eye)
     on = np.flatnonzero(hits.surface != MISS)
@@ -94,8 +94,8 @@ def look(stage: Stage, eye: Floats, directions: Floats, surfaces: SurfaceTable) 
 
 
 def _texture(place: Floats, normal: Floats, far: Floats, material: NDArray[np.uint8]) -> Floats:
-    """(N,) brightness of the material's texture around 1: noise of two sizes, no finer than a pixel, and courses of
-    bricks, tiles and slabs."""
+    """(N,) brightness factors of the texture, around 1: noise at two scales, no finer than a pixel, and the joints
+    between bricks, tiles, stones and slabs."""
     size = np.float32(0.02) * 2 ** np.ceil(np.log2(np.maximum(far / 12, 1)))
     fine = patches(place / size[:, None], 1.0) - 0.5
     coarse = patches(place, 0.55) - 0.5
@@ -112,7 +112,7 @@ def _texture(place: Floats, normal: Floats, far: Floats, material: NDArray[np.ui
 
 
 def shade(stage: Stage, eye: Floats, directions: Floats, surfaces: SurfaceTable, light: Light) -> tuple[Floats, Hits]:
-    """Linear RGB (N, 3) along camera rays, and where they end."""
+    """Linear RGB (N, 3) along camera rays, and their hits."""
     hits = look(stage, eye, directions, surfaces)
     miss = hits.surface == MISS
     image = np.empty_like(directions)
@@ -122,7 +122,7 @@ def shade(stage: Stage, eye: Floats, directions: Floats, surfaces: SurfaceTable,
     normal = hits.normal[on] * -np.sign(np.einsum("ij,ij->i", hits.normal[on], ray))[:, None]
     place, material = eye + far[:, None] * ray, surfaces.material[surface]
     colour = surfaces.colour[surface] ** 2.2 * _texture(place, normal, far, material)[:, None]
-    # Foliage is lit through and through: its triangles have no side.
+    # Light passes through foliage: both sides of its triangles are lit.
     leaf = (material == INDEX["leaf"]) | (material == INDEX["grass"])
     facing = normal @ light.sun
     facing = np.where(leaf, 0.35 + 0.5 * np.abs(facing), np.clip(facing, 0, 1))
@@ -141,7 +141,7 @@ def shade(stage: Stage, eye: Floats, directions: Floats, surfaces: SurfaceTable,
 
 
 def _reflect(seen: Floats, ray: Floats, normal: Floats, material: NDArray[np.uint8], lit: Floats, light: Light) -> None:
-    """Add, in place, the sky and sun in glass and glossy paint; low reflections show dark houses."""
+    """Add, in place, reflections of sky and sun on glass and glossy paint; near the horizon they show dark houses."""
     on = np.flatnonzero(_GLOSS[material] > 0.25)
     across = np.einsum("ij,ij->i", ray[on], normal[on])
     mirrored = ray[on] - 2 * across[:, None] * normal[on]
@@ -157,14 +157,14 @@ def _reflect(seen: Floats, ray: Floats, normal: Floats, material: NDArray[np.uin
 def render(
     stage: Stage, pose: Pose, surfaces: SurfaceTable, light: Light, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB picture of the scene.
+    """(H, W, 3) uint8 RGB camera image of the scene.
 
     Args:
-        stage: the scene of the moment.
+        stage: the stretch at the time of the scan.
         pose: (4, 4) sensor to world.
-        surfaces: of the scene.
+        surfaces: the surfaces of the scene.
         light: sun and sky.
-        rng: draws the camera's noise.
+        rng: samples the noise of the camera.
     """
     assert CAMERA.image_size is not None
     width, height = CAMERA.image_size
@@ -183,20 +183,20 @@ def render(
 
 
 def _exposure(image: Floats) -> float:
-    """The factor that sets the middle of the picture's lower half to a mid grey."""
+    """The exposure factor that maps the median of the lower half of the image to a mid grey."""
     lower = image[len(image) // 2 :] @ np.array([0.3, 0.59, 0.11], np.float32)
     return float(np.clip(0.20 / max(float(np.median(lower)), 0.02), 0.6, 3.5))
 
 
 def develop(image: Floats) -> NDArray[np.uint8]:
-    """uint8 sRGB of exposed linear RGB: what is too bright goes white slowly."""
+    """Tone mapping: uint8 sRGB of exposed linear RGB, with soft clipping of highlights."""
     curve = np.clip(image, 0, None)
     curve = np.clip(curve * (1 + 0.18 * curve) / (1 + 0.30 * curve), 0, 1) ** (1 / 2.2)
     return np.asarray(curve * 255 + 0.5, np.uint8)
 
 
 def _edges(hits: Hits, height: int, width: int) -> NDArray[np.bool_]:
-    """(H, W) where a pixel and its neighbour to the right or below end on different surfaces."""
+    """(H, W) pixels at the edges between surfaces, which are then antialiased."""
     surface = hits.surface.reshape(height, width)
     edge = np.zeros(surface.shape, bool)
     edge[:, :-1] |= surface[:, :-1] != surface[:, 1:]

@@ -31,11 +31,11 @@ BOARDS: dict[str, tuple[Outline, RGB, Outline, RGB]] = {
     "town": (_rectangle(1.20, 0.80), YELLOW, _rectangle(0.80, 0.08, 0.06), BLACK),
     "street": (_rectangle(0.90, 0.14), (0.12, 0.20, 0.50), _rectangle(0.70, 0.04), WHITE),
 }
-"""Each sign's board and the mark on it: outlines in metres (left, up) and colours."""
+"""The board of each sign and the symbol on it: (outline, colour, outline, colour); outlines in metres (left, up)."""
 
 
 def road_sign(kind: str, height: float) -> Thing:
-    """A traffic sign of a kind of ``BOARDS``, facing +x, the middle of its board at a height in metres."""
+    """A traffic sign facing +x; ``kind`` is a key of ``BOARDS``, ``height`` is the centre of the board in metres."""
     board, ground, mark, colour = BOARDS[kind]
 
     def flat(outline: Outline, x: float, slot: int) -> Mesh:
@@ -49,7 +49,7 @@ def road_sign(kind: str, height: float) -> Thing:
 
 
 def traffic_light(height: float, reach: float) -> Thing:
-    """Signals facing +x; with a reach also on an arm over the road towards +y."""
+    """Traffic lights on a pole, facing +x, and with ``reach`` > 0 (metres) also on an arm over the road towards +y."""
     parts = [tube([(0, 0, -0.2), (0, 0, height)], 0.06, 7)]
     spots = [(0.0, 2.3)]
     if reach:

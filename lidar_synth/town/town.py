@@ -1,5 +1,4 @@
-"""The town as a source of scans: ``Town(seed)[i]`` is scan number i, in any process and any order of access.
-
+"""The town as a source of scans: ``Town(seed)[i]`` is the same scan in every process and in any order of access.
 Twenty neighbouring scans share a stretch of road. The ego vehicle drives along it, with ``interval`` seconds from scan
 to scan, among static and moving objects. Stretches lie a kilometre apart in the world frame of the poses, so that
 accumulating scans by pose never mixes two of them.
@@ -28,7 +27,7 @@ from lidar_synth.town.shading import draw_light, render
 from lidar_synth.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, generator
 
 APART = 1000.0
-"""Metres between the origins of two stretches in the world of the poses."""
+"""Metres between the origins of two stretches in the world frame of the poses."""
 
 
 class Town:
@@ -72,7 +71,7 @@ class Town:
         self._worlds: OrderedDict[int, World] = OrderedDict()
         elevation, height = optics(self.sensor)
         columns = self.sensor.columns
-        # As the sensor writes them: ring by ring from the top, counter-clockwise from straight ahead.
+        # The order in which the sensor writes points: ring by ring from the top, counter-clockwise from straight ahead.
         order = np.r_[columns // 2 - 1 : -1 : -1, columns - 1 : columns // 2 - 1 : -1]
         self._laser, column = np.nonzero(free_rays(self.sensor)[:, order])
         azimuth = self.sensor.column_azimuths().astype(float)[order][column]
@@ -95,7 +94,7 @@ class Town:
         return self._scans
 
     def world(self, index: int) -> World:
-        """The stretch of road in which a scan is taken; the last two stay in memory."""
+        """The stretch of road of a scan; the last two stretches are cached."""
         stretch = index // STRETCH_FRAMES
         if stretch not in self._worlds:
             if len(self._worlds) > 1:
@@ -104,7 +103,7 @@ class Town:
         return self._worlds[stretch]
 
     def moment(self, index: int) -> tuple[Stage, Pose, np.random.Generator]:
-        """The scene of a scan, the sensor's pose in its stretch, and the scan's random numbers."""
+        """The scene of a scan, the sensor's pose in its stretch, and the random generator of the scan."""
         stretch, frame = divmod(index, STRETCH_FRAMES)
         rng = generator(SCAN, self.seed, stretch, frame)
         world, time = self.world(index), frame * self.interval
@@ -160,7 +159,7 @@ class Town:
     def _turn(
         self, stage: Stage, pose: Pose, surfaces: SurfaceTable, rng: np.random.Generator
     ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-        """Laser, surface, point in the sensor frame and reflectance of every return of one turn."""
+        """Laser, surface number, point in the sensor frame and reflectance of each return of one revolution."""
         turn = pose[:3, :3].astype(np.float32)
         directions = self._rays @ turn.T
         origins = pose[:3, 3].astype(np.float32) + self._heights[:, None] * turn[:, 2]

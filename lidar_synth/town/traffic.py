@@ -1,7 +1,7 @@
-"""The traffic of a stretch: who drives, walks and rides where.
+"""The traffic of a stretch: vehicles, pedestrians and cyclists.
 
-Every mover keeps to one street coordinate and runs along the other at its own speed. Two movers, or a mover
-and something solid, never share a place at any moment of the stretch: whoever would is left out.
+Every mover has a constant s or t and moves along the other coordinate at constant speed. A sampled mover is discarded
+if it would collide with an earlier mover or, where ``solid`` is set, with a static obstacle in any frame.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ Box = NDArray[np.float64]
 
 
 def _track(shape: Prototype, along: bool, at: float, start: float, velocity: float, times: Box, gap: float) -> Box:
-    """(T, 4) lowest and highest s, lowest and highest t that something takes at each time."""
+    """(T, 4) bounds (lowest s, highest s, lowest t, highest t) of a moving shape at each time, metres."""
     low, high = shape.mesh.bounds
     half = (np.abs([low[:2], high[:2]]).max(0) + gap)[:: 1 if along else -1]
     way, other = start + velocity * times, np.full(len(times), at)
@@ -39,7 +39,7 @@ def _track(shape: Prototype, along: bool, at: float, start: float, velocity: flo
 
 
 def _ego_track(street: Street, times: Box) -> Box:
-    """``_track`` of the ego vehicle, 4.7 m long and 1.8 m wide, with 1.2 m around it."""
+    """The track of the ego vehicle, 4.7 m long and 1.8 m wide, with a margin of 1.2 m."""
     s, t, yaw = np.array([ego_place(street, time) for time in times]).T
     along, across = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
     half_s, half_t = 2.35 * along + 0.9 * across + 1.2, 2.35 * across + 0.9 * along + 1.2
@@ -50,9 +50,9 @@ class Traffic:
     """All movers of a stretch.
 
     Args:
-        street, scene: where they move.
-        times: (T,) seconds at which they must be clear of one another.
-        rng: draws them.
+        street, scene: the stretch.
+        times: (T,) seconds, the times of the frames, at which movers must not collide.
+        rng: samples them.
     """
 
     def __init__(self, street: Street, scene: Scene, times: Box, rng: Rng) -> None:
@@ -78,7 +78,10 @@ class Traffic:
         scale: float = 1.0,
         solid: bool = False,
     ) -> None:
-        """Add a mover with a gap (metres) around it, unless it would meet another, or what is solid on its way."""
+        """Add a mover unless it would collide with another one or, if ``solid``, with a static obstacle.
+
+        ``gap`` is the margin around it in metres; the other arguments are those of ``Mover``.
+        """
         track = _track(shapes[0], along, at, start, way * speed, self._times, gap)
         low, high = self._street.ends
         if track[:, 0].min() < low or track[:, 1].max() > high or any(_meet(track, other) for other in self._tracks):
@@ -98,7 +101,7 @@ class Traffic:
         return (vehicles()[draw_vehicle(rng, _DRIVEN)],), PAINTS[rng.integers(len(PAINTS))]
 
     def _drive(self) -> None:
-        """Cars on the stretch's own lanes, a tram on its rails."""
+        """Add vehicles on the lanes of the stretch, and a tram on its rails."""
         street, rng = self._street, self._rng
         density = {"residential": 0.25, "main": 0.6, "junction": 0.55, "square": 0.4, "edge": 0.4}[street.kind]
         for lane in street.lanes:
@@ -132,7 +135,7 @@ class Traffic:
             )
 
     def _cross(self) -> None:
-        """Cars on side streets: waiting at their line or leaving."""
+        """Add vehicles on side streets, waiting at the stop line or driving away."""
         street, rng = self._street, self._rng
         for c in street.crossings:
             for side in c.sides:
@@ -147,7 +150,7 @@ class Traffic:
                     self._try(shapes, colour, False, c.s + sign * c.half / 2, start, sign, rng.uniform(4, 9), 0.5)
 
     def _walk(self) -> None:
-        """Pedestrians on pavements, on the square, on their way across."""
+        """Add pedestrians on pavements, on squares and crossing the street."""
         street, rng = self._street, self._rng
         strips = []
         for side in (RIGHT, LEFT):
@@ -166,7 +169,7 @@ class Traffic:
             self._person(False, rng.uniform(-10, street.length + 40), rng.uniform(-10, 10))
 
     def _person(self, along: bool, at: float, start: float) -> None:
-        """Someone who walks, or on a pavement also stands."""
+        """Add a pedestrian; some of those along the street stand."""
         rng = self._rng
         bag, stands = bool(rng.random() < 0.3), along and bool(rng.random() < 0.2)
         shapes = tuple(walker(p, stands, bag) for p in range(1 if stands else PHASES))
@@ -176,7 +179,7 @@ class Traffic:
         self._try(shapes, colour, along, at, start, way, speed, 0.25, 1.4 * scale, scale, solid=True)
 
     def _ride(self) -> None:
-        """Cyclists at the right edge of the carriageway or on their own way."""
+        """Add cyclists on cycleways or at the right edge of the carriageway."""
         street, rng = self._street, self._rng
         shapes = tuple(cyclist(p) for p in range(PHASES))
         for side, way in ((RIGHT, 1), (LEFT, -1)):
@@ -200,7 +203,7 @@ class Traffic:
 
 
 def _meet(a: Box, b: Box) -> bool:
-    """Whether two boxes (..., 4) ever overlap."""
+    """Whether two tracks (..., 4) overlap at any time."""
     return bool(
         ((a[..., 0] < b[..., 1]) & (a[..., 1] > b[..., 0]) & (a[..., 2] < b[..., 3]) & (a[..., 3] > b[..., 2])).any()
     )

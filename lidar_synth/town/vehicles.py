@@ -1,4 +1,4 @@
-"""Cars, vans, lorries, buses, trams and trailers with a real silhouette."""
+"""Prototypes of cars, vans, lorries, buses, trams and trailers."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -27,7 +27,20 @@ from lidar_synth.town.prototype import Prototype
 
 @dataclass(frozen=True)
 class _Shape:
-    """Measures of a car or van: metres, and shares of the length from the front."""
+    """Dimensions of a car or van.
+
+    Args:
+        length, width, height: metres.
+        belt: height of the belt line, metres.
+        cowl: lower edge of the windscreen, share of the length from the front.
+        screen: upper edge of the windscreen, share of the length.
+        roof_end: rear end of the roof, share of the length.
+        tail: lower edge of the rear window, share of the length.
+        boot: height of the boot lid, metres; 0 = none.
+        pillars: positions of the pillars between side windows, shares of the length.
+        panel_from: from here on the side is metal instead of glass, share of the length.
+        roof: width of the roof as a share of ``width``.
+    """
 
     length: float
     width: float
@@ -106,7 +119,7 @@ def _car(kind: str) -> Mesh:
 
 
 def _lorry(length: float, height: float, open_bed: bool) -> Mesh:
-    """A cab and, apart from it, a box or a dropside bed on a frame."""
+    """A lorry: a cab, and behind it a box or an open bed on a frame."""
     width, cab = 2.35, 1.9
     front = length / 2
     cab_stations = [
@@ -134,7 +147,7 @@ def _lorry(length: float, height: float, open_bed: bool) -> Mesh:
 
 
 def _coach(length: float, width: float, height: float, low: float, rails: bool) -> Mesh:
-    """A bus or, on rails, a tram: one long body with a band of windows."""
+    """A bus or, with ``rails``, a tram: one long body with a band of windows; ``low`` is the height of its sill."""
     stations = [Station(0.0, low, 1.0, height - 0.5, 0.93, 0.9, above=GLASS)]
     stations.append(Station(0.012, low, 1.0, height - 0.08, 0.99, 0.92, side=GLASS))
     for p in np.arange(0.1, 0.96, 0.1):
@@ -176,7 +189,7 @@ def _trailer() -> Mesh:
 
 @cache
 def vehicles() -> dict[str, Prototype]:
-    """Every vehicle without a rider, by kind."""
+    """The prototypes of all vehicles without a rider, by kind."""
     kinds = {k: Prototype(_car(k), FINISHES, "Van" if k in VANS else "Car", (10, 252)) for k in _SHAPES}
     return kinds | {
         "box_lorry": Prototype(_lorry(7.2, 3.3, False), FINISHES, "Truck", (18, 258)),

@@ -1,7 +1,7 @@
-"""A stretch of road, whole: its static world as triangles, its movers, the ego vehicle's way.
+"""A complete stretch of road: its plan, its static world as triangles, and its movers.
 
-Everything is drawn from a counter-based generator keyed by (seed, stretch), so that a stretch is the same
-whoever asks for it and in whatever order.
+Everything is sampled from a counter-based generator keyed by (seed, stretch), so that a stretch is the same in every
+process and in any order of access.
 """
 
 from dataclasses import dataclass
@@ -30,11 +30,11 @@ STRETCH_FRAMES = 20
 
 
 WORLD, LIGHT, SCAN, IMAGE = range(4)
-"""What random numbers are for."""
+"""Purposes of random numbers; each has its own generator."""
 
 
 def generator(purpose: int, seed: int, stretch: int, frame: int = 0) -> np.random.Generator:
-    """The random numbers for one purpose in a stretch, or in one of its frames."""
+    """The random generator for one purpose in a stretch or in one of its frames."""
     return np.random.Generator(np.random.Philox(key=(seed, purpose), counter=(0, 0, stretch, frame)))
 
 
@@ -44,11 +44,11 @@ class World:
 
     Args:
         street: its plan.
-        scene: what stands in it, and its ground.
+        scene: its ground and its objects.
         triangles: (F, 3, 3) float32, metres, the static world.
-        faces: (F,) int32 surface number of each.
+        faces: (F,) int32 surface number of each triangle.
         surfaces: all surfaces, of the static world and of the movers.
-        movers: what moves.
+        movers: vehicles, pedestrians and cyclists.
     """
 
     street: Street
@@ -60,17 +60,17 @@ class World:
 
     @cached_property
     def solid(self) -> Solid:
-        """The static world made ready for rays (half a second, once)."""
+        """The static world as an Embree scene (built on first access, half a second)."""
         return Solid(self.triangles)
 
 
 def build_world(seed: int, stretch: int, interval: float) -> World:
-    """The stretch number ``stretch`` of a seed's town.
+    """Build one stretch of a town.
 
     Args:
-        seed: of the town.
-        stretch: 0 and up.
-        interval: seconds from frame to frame.
+        seed: the seed of the town.
+        stretch: number of the stretch, 0 and up.
+        interval: seconds between neighbouring frames.
     """
     rng = generator(WORLD, seed, stretch)
     kind = str(rng.choice(STREETS, p=SHARES))

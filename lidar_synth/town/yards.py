@@ -1,4 +1,4 @@
-"""Building a lot: its house, its boundary, driveway, plants and what stands in its yard."""
+"""Construction of a lot: house, boundary, garage, plants and objects in the yard."""
 
 import numpy as np
 
@@ -16,11 +16,11 @@ from lidar_synth.town.vehicles import vehicles
 
 Rng = np.random.Generator
 HOUSE = (BUILDING,) * 10
-"""Classes of a building's slots."""
+"""SemanticKITTI's class id of each slot of a building."""
 
 
 def build_lot(lot: Lot, street: Street, scene: Scene, rng: Rng) -> None:
-    """Put a lot's house, boundary, plants and what stands in its yard into the scene."""
+    """Put the house, the boundary, the plants and the objects of a lot into the scene."""
     house = lot.front + lot.setback
     if lot.plan is not None:
         _put_facing(
@@ -46,7 +46,7 @@ def build_lot(lot: Lot, street: Street, scene: Scene, rng: Rng) -> None:
 
 
 def _put_facing(scene: Scene, thing: Thing, lot: Lot, s: float, front: float, width: float) -> None:
-    """A building whose front looks at the street, its lower-s corner at s."""
+    """Put a building whose front faces the street; s is the end of its front with the lower s."""
     if lot.side == LEFT:
         scene.put(thing, s, front)
     else:
@@ -69,10 +69,10 @@ def _use_driveway(scene: Scene, lot: Lot, house: float, rng: Rng) -> None:
 
 
 def _plant(scene: Scene, lot: Lot, street: Street, house: float, rng: Rng) -> None:
-    """Bushes and trees before, between and behind."""
+    """Put bushes and trees in front of, beside and behind the house."""
     depth = lot.setback if lot.plan else 16.0
     width = lot.end - lot.start
-    # The nearer the street, the more a plant weighs: those behind a house are hardly seen.
+    # Plants behind a house are hardly visible, so most are put near the street.
     for _ in range(rng.poisson((0.4 + lot.garden) * width * min(depth, 10) / 11)):
         s, t = rng.uniform(lot.start + 0.8, lot.end - 0.8), lot.front + rng.uniform(0.9, max(1.0, depth - 0.6))
         if lot.driveway and lot.driveway[0] - 1 < s < lot.driveway[1] + 1:
@@ -99,7 +99,7 @@ def _plant(scene: Scene, lot: Lot, street: Street, house: float, rng: Rng) -> No
 
 
 def _close_gap(scene: Scene, lot: Lot, behind: float, rng: Rng) -> None:
-    """What one sees between two houses: a hedge, a fence, a shed or bushes at the back."""
+    """Close the gaps beside a house at its back with a hedge, a fence, a shed or bushes."""
     assert lot.plan is not None
     for low, high in ((lot.start, lot.start + lot.at), (lot.start + lot.at + lot.plan.width, lot.end)):
         draw = rng.random()
