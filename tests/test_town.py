@@ -17,14 +17,14 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
 from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.town.boxes import boxes_of
 from lidar_synth.town.camera import CAMERA, pixel_rays
-from lidar_synth.town.cast import Stage, trace
+from lidar_synth.town.cast import Snapshot, trace
 from lidar_synth.town.ego import free_rays, optics
 from lidar_synth.town.materials import MATERIALS
 from lidar_synth.town.movers import ego_place
 from lidar_synth.town.prototype import Prototype
 from lidar_synth.town.returns import LEVELS
-from lidar_synth.town.scene import Placed
-from lidar_synth.town.shading import look
+from lidar_synth.town.scene import PlacedObject
+from lidar_synth.town.shading import camera_hits
 from lidar_synth.town.solid import Solid
 from lidar_synth.town.vehicles import vehicles
 
@@ -199,7 +199,7 @@ def test_nothing_is_seen_through_walls_or_cars(town: Town, scans: dict[int, Scan
     seen_movers = 0
     for index in INDICES:
         world, scan = town.world(index), scans[index]
-        stage, pose, _ = town.moment(index)
+        snapshot, pose, _ = town.moment(index)
         assert scan.ring is not None and scan.instance is not None
         start = np.zeros((len(scan), 3)) + np.array((0, 0, 1)) * optics(scan.sensor)[1][scan.ring][:, None]
         way = scan.points - start
@@ -211,7 +211,7 @@ def test_nothing_is_seen_through_walls_or_cars(town: Town, scans: dict[int, Scan
         behind = (first < far - 0.25) & solid[world.faces[face]]
         # At edges the ray worked out from a rounded point can differ from the one that was cast.
         assert behind.mean() < 1e-3
-        for mover in stage.movers:
+        for mover in snapshot.movers:
             found, surface, _ = trace(mover, origins, rays)
             assert ((found < far - 0.25) & solid[surface]).mean() < 1e-3
             seen_movers += int((scan.instance == mover.instance).sum())
@@ -226,20 +226,20 @@ def test_a_hidden_car_is_known_to_be_hidden(town: Town) -> None:
     lorry, car = vehicles()["box_lorry"], vehicles()["sedan"]
     pose = np.eye(4)
 
-    def stand(prototype: Prototype, x: float, y: float, number: int) -> Placed:
+    def stand(prototype: Prototype, x: float, y: float, number: int) -> PlacedObject:
         place = np.eye(4)
         place[:3, 3] = x, y, -1.73
-        return Placed(prototype, place, number, np.zeros(10, np.int32))
+        return PlacedObject(prototype, place, number, np.zeros(10, np.int32))
 
     near, behind, beside = stand(lorry, 14, 0, 1), stand(car, 30, 0, 2), stand(car, 30, 9, 3)
-    boxes = boxes_of([near, behind, beside], pose, Stage(bare, [near, behind, beside]))
+    boxes = boxes_of([near, behind, beside], pose, Snapshot(bare, [near, behind, beside]))
     assert boxes.occlusion[[0, 2]].tolist() == [0, 0] and boxes.occlusion[1] >= 2
     assert boxes.truncation.tolist() == [0, 0, 0]
-    alone = boxes_of([behind], pose, Stage(bare, [behind]))
+    alone = boxes_of([behind], pose, Snapshot(bare, [behind]))
     assert alone.occlusion.tolist() == [0]
-    cut = boxes_of([stand(car, 4, 4.2, 4)], pose, Stage(bare, []))
+    cut = boxes_of([stand(car, 4, 4.2, 4)], pose, Snapshot(bare, []))
     assert 0.1 < cut.truncation[0] < 0.9
-    away = boxes_of([stand(car, -20, 0, 5)], pose, Stage(bare, []))
+    away = boxes_of([stand(car, -20, 0, 5)], pose, Snapshot(bare, []))
     assert away.truncation[0] == away.occlusion[0] == away.image_box[0, 0] == -1
 
 
@@ -321,7 +321,7 @@ def test_a_users_sensor_works() -> None:
 
 
 def test_camera_and_lidar_see_the_same_things(town: Town, scans: dict[int, Scan]) -> None:
-    stage, pose, _ = town.moment(4)
+    snapshot, pose, _ = town.moment(4)
     surfaces = town.world(4).surfaces
     scan = scans[4]
     pixels, depth = CAMERA.pixels(scan.points)
@@ -329,13 +329,13 @@ def test_camera_and_lidar_see_the_same_things(town: Town, scans: dict[int, Scan]
     with np.errstate(invalid="ignore"):
         inside = (depth > 1) & (pixels >= 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     eye, rays = pixel_rays(pose, pixels[inside])
-    hits = look(stage, eye, rays, surfaces)
+    hits = camera_hits(snapshot, eye, rays, surfaces)
     seen = SEMANTIC_KITTI.decode(surfaces.raw)[hits.surface]
     assert inside.sum() > 5000
     assert (seen == scan.label[inside]).mean() > 0.9  # type: ignore[index]
     # A picture turned by two degrees no longer fits: the test can tell.
     _, aside = pixel_rays(pose, pixels[inside] + (20, 10))
-    turned = SEMANTIC_KITTI.decode(surfaces.raw)[look(stage, eye, aside, surfaces).surface]
+    turned = SEMANTIC_KITTI.decode(surfaces.raw)[camera_hits(snapshot, eye, aside, surfaces).surface]
     assert (turned == scan.label[inside]).mean() < (seen == scan.label[inside]).mean() - 0.03  # type: ignore[index]
 
 
@@ -344,10 +344,10 @@ def test_the_picture_shows_a_street(town: Town) -> None:
     assert image.shape == (376, 1408, 3) and image.dtype == np.uint8
     assert np.array_equal(image, town.image(4))
     assert image.std() > 30
-    stage, pose, _ = town.moment(4)
+    snapshot, pose, _ = town.moment(4)
     grid = np.stack(np.meshgrid(np.arange(0, 1408, 8), np.arange(0, 376, 8)), -1).reshape(-1, 2)
     eye, rays = pixel_rays(pose, grid)
-    hits = look(stage, eye, rays, town.world(4).surfaces)
+    hits = camera_hits(snapshot, eye, rays, town.world(4).surfaces)
     colour = image[grid[:, 1], grid[:, 0]].astype(float)
     label = SEMANTIC_KITTI.decode(town.world(4).surfaces.raw)[hits.surface]
     assert colour[hits.surface < 0].mean() > colour[(label == TRAIN_ID["road"]) & (hits.surface >= 0)].mean() + 30

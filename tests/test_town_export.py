@@ -14,7 +14,7 @@ from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.mixing import MixedScans
 from lidar_synth.town import LAYOUTS, Town, export_town
-from lidar_synth.town.export import _parts
+from lidar_synth.town.export import _groups
 
 COUNT = 3
 
@@ -190,10 +190,10 @@ def test_processes_write_the_same_files(tmp_path: Path, town: Town) -> None:
 
 
 def test_work_is_parted_by_stretch() -> None:
-    assert _parts(list(range(3)), 1) == [[0], [1], [2]]
-    assert _parts(list(range(45)), 2) == [list(range(20)), list(range(20, 40)), list(range(40, 45))]
-    assert _parts([3, 4, 5, 6], 2) == [[3, 4], [5, 6]]
-    assert _parts([19, 20], 1) == [[19], [20]]
+    assert _groups(list(range(3)), 1) == [[0], [1], [2]]
+    assert _groups(list(range(45)), 2) == [list(range(20)), list(range(20, 40)), list(range(40, 45))]
+    assert _groups([3, 4, 5, 6], 2) == [[3, 4], [5, 6]]
+    assert _groups([19, 20], 1) == [[19], [20]]
 
 
 def test_the_command_writes_pictures_and_takes_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

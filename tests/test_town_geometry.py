@@ -14,12 +14,12 @@ from lidar_synth.town.materials import MATERIALS, Finish, Surfaces
 from lidar_synth.town.meshes import Mesh, ball, boxes, loft, merge, prism, tube
 from lidar_synth.town.people import PHASES, cyclist, motorcyclist, sitter, walker
 from lidar_synth.town.plants import LEAF, SPECIES, VARIANTS, coarse_plant, plant
-from lidar_synth.town.returns import Noise, laser_gains, patches
+from lidar_synth.town.returns import Noise, cell_noise, laser_gains
 from lidar_synth.town.solid import Solid
 from lidar_synth.town.street import KINDS as STREETS
-from lidar_synth.town.street import LEFT, RIGHT, SHARES, draw_street
+from lidar_synth.town.street import LEFT, RIGHT, SHARES, sample_street
 from lidar_synth.town.vehicles import vehicles
-from lidar_synth.town.world import STRETCH_FRAMES, WORLD, build_world, generator
+from lidar_synth.town.world import STRETCH_FRAMES, WORLD, build_world, rng_for
 
 UP = np.array((0.0, 0.0, 1.0))
 
@@ -198,20 +198,20 @@ def test_kerbs_stand_between_road_and_pavement() -> None:
 
 @pytest.mark.parametrize("kind", STREETS)
 def test_streets_of_a_kind_differ(kind: str) -> None:
-    drawn = [draw_street(kind, 7.6, np.random.default_rng(k)) for k in range(20)]
+    drawn = [sample_street(kind, 7.6, np.random.default_rng(k)) for k in range(20)]
     assert len({(s.edge, s.parking, len(s.crossings)) for s in drawn}) > 10
     for street in drawn:
         assert street.kind == kind and street.length > 20
-        assert -street.edge[RIGHT] < street.lanes[0].t < 0 and street.lanes[0].way == 1
+        assert -street.edge[RIGHT] < street.lanes[0].t < 0 and street.lanes[0].direction == 1
         for lane in street.lanes:
-            assert -street.edge[RIGHT] < lane.t < street.edge[LEFT] and lane.way == (1 if lane.t < 0 else -1)
+            assert -street.edge[RIGHT] < lane.t < street.edge[LEFT] and lane.direction == (1 if lane.t < 0 else -1)
         assert street.ends[0] < -20 and street.ends[1] > street.length + 20
         if kind == "junction":
             assert any(c.sides == (RIGHT, LEFT) and 0 < c.s < street.length + 20 for c in street.crossings)
 
 
 def test_all_kinds_of_street_are_met() -> None:
-    assert {str(generator(WORLD, 0, k).choice(STREETS, p=SHARES)) for k in range(40)} == set(STREETS)
+    assert {str(rng_for(WORLD, 0, k).choice(STREETS, p=SHARES)) for k in range(40)} == set(STREETS)
     assert sum(SHARES) == pytest.approx(1)
 
 
@@ -244,11 +244,11 @@ def test_surfaces_become_columns() -> None:
 def test_patches_are_uniform_and_coarse() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-50, 50, (50_000, 3)).astype(np.float32)
-    value = patches(points, 0.5)
+    value = cell_noise(points, 0.5)
     assert value.min() >= 0 and value.max() < 1
     assert np.abs(np.histogram(value, 10, (0, 1))[0] / 50_000 - 0.1).max() < 0.01
     centre = (np.floor(points / 0.5) + 0.5) * np.float32(0.5)
-    assert np.array_equal(value, patches(centre, 0.5))
+    assert np.array_equal(value, cell_noise(centre, 0.5))
 
 
 def test_gains_belong_to_the_sensor() -> None:

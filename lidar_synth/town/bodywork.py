@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lidar_synth.town.materials import RGB, Finish
 from lidar_synth.town.meshes import Mesh, disc, loft, merge, quads, tube
 
-PAINT, GLASS, TYRE, TRIM, PLATE, HEAD, TAIL, INSIDE, RIM, SECOND = range(10)
+PAINT, GLASS, TYRE, TRIM, PLATE, HEAD, TAIL, INTERIOR, RIM, SECONDARY = range(10)
 
 
 FINISHES = (

@@ -16,7 +16,7 @@ from lidar_synth.town.solid import Solid
 
 HEIGHT = 1.73
 """Height of the sensor's origin above the road, metres."""
-_ASIDE = 0.026
+_LASER_OFFSET = 0.026
 """Lateral offset of the lasers from the sensor's axis, metres."""
 
 
@@ -44,13 +44,13 @@ def optics(sensor: Sensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     Returns:
         (H,) elevations in radians and (H,) heights in metres.
     """
-    seen = sensor.laser_elevations.astype(float)
+    beams = sensor.laser_elevations.astype(float)
     if sensor.heights is None:
-        return seen, np.zeros(len(seen))
+        return beams, np.zeros(len(beams))
     heights = np.asarray(sensor.heights)
     # Most returns of a beam come from the level road; objects on the road shorten the typical distance.
-    usual = np.minimum(1 / (np.maximum(np.sin(-seen), 1e-3) / HEIGHT + 1 / 110), 20.0)
-    return seen - heights / usual, heights
+    typical = np.minimum(1 / (np.maximum(np.sin(-beams), 1e-3) / HEIGHT + 1 / 110), 20.0)
+    return beams - heights / typical, heights
 
 
 @lru_cache(maxsize=8)
@@ -60,7 +60,7 @@ def free_rays(sensor: Sensor) -> NDArray[np.bool_]:
     azimuth = sensor.column_azimuths().astype(float)
     e, a = np.meshgrid(elevation, azimuth, indexing="ij")
     rays = np.stack([np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)], -1)
-    side = np.where(np.arange(len(elevation)) % 2, _ASIDE, -_ASIDE)[:, None]
+    side = np.where(np.arange(len(elevation)) % 2, _LASER_OFFSET, -_LASER_OFFSET)[:, None]
     start = np.stack([side * np.sin(a), side * np.cos(a), np.broadcast_to(height[:, None], a.shape)], -1)
     distance, _, _ = Solid(body().triangles).first(
         start.reshape(-1, 3).astype(np.float32), rays.reshape(-1, 3).astype(np.float32)

@@ -77,14 +77,14 @@ def export_town(
     number = SEQUENCES.get(layout, 0) if sequence is None else sequence
     if not 0 <= number < 100:
         raise ConfigError(f"sequence {number}", "0 to 99")
-    _claim(Path(out), town, layout, number, camera)
+    _claim_folder(Path(out), town, layout, number, camera)
     writer = LAYOUTS[layout](out, calibration=town.calibration)
     names = [f"{number:02d}/{i:06d}" if layout in SEQUENCES else None for i in range(len(town))]
     missing = [i for i, name in enumerate(names) if not writer.complete(i, name)]
-    work = partial(_write_some, town, writer, names, camera)
+    work = partial(_write_group, town, writer, names, camera)
     with (
         tqdm(total=len(missing), unit="scan", disable=not progress) as bar,
-        in_processes(work, _parts(missing, jobs), jobs) as done,
+        in_processes(work, _groups(missing, jobs), jobs) as done,
     ):
         for count in done:
             bar.update(count)
@@ -95,33 +95,33 @@ def export_town(
     return len(missing), len(town) - len(missing)
 
 
-def _claim(out: Path, town: Town, layout: str, sequence: int, camera: bool) -> None:
+def _claim_folder(out: Path, town: Town, layout: str, sequence: int, camera: bool) -> None:
     """Write the settings and a README into the folder.
 
     Raises:
         ConfigError: if the folder was written with other settings.
     """
-    facts = {"layout": layout, "sequence": sequence, "seed": town.seed, "interval": town.interval, "camera": camera}
-    claim(out / SETTINGS, facts | {"sensor": town.sensor.to_dict()})
+    settings = {"layout": layout, "sequence": sequence, "seed": town.seed, "interval": town.interval, "camera": camera}
+    claim(out / SETTINGS, settings | {"sensor": town.sensor.to_dict()})
     if not (out / "README.md").exists():
-        text = _README.format(**facts, sensor=town.sensor.name, frames=STRETCH_FRAMES, settings=SETTINGS)
+        text = _README.format(**settings, sensor=town.sensor.name, frames=STRETCH_FRAMES, settings=SETTINGS)
         write_file(out / "README.md", text.encode())
 
 
-def _parts(indices: list[int], jobs: int) -> list[list[int]]:
+def _groups(indices: list[int], jobs: int) -> list[list[int]]:
     """The indices in groups that do not cross stretches, small enough that every process gets some; one index per
     group with one process, which keeps its stretch in memory anyway."""
-    most = 1 if jobs == 1 else max(1, min(STRETCH_FRAMES, -(-len(indices) // jobs)))
+    limit = 1 if jobs == 1 else max(1, min(STRETCH_FRAMES, -(-len(indices) // jobs)))
     parts: list[list[int]] = []
     for i in indices:
-        if parts and len(parts[-1]) < most and parts[-1][-1] // STRETCH_FRAMES == i // STRETCH_FRAMES:
+        if parts and len(parts[-1]) < limit and parts[-1][-1] // STRETCH_FRAMES == i // STRETCH_FRAMES:
             parts[-1].append(i)
         else:
             parts.append([i])
     return parts
 
 
-def _write_some(town: Town, writer: Writer, names: list[str | None], camera: bool, indices: list[int]) -> int:
+def _write_group(town: Town, writer: Writer, names: list[str | None], camera: bool, indices: list[int]) -> int:
     for i in indices:
         writer.write(town[i], i, name=names[i], image=town.image(i) if camera else None)
     return len(indices)

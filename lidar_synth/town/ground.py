@@ -19,7 +19,7 @@ Rect = tuple[float, float, float, float, int]
 Array = NDArray[np.float64]
 
 
-class Kind(NamedTuple):
+class GroundKind(NamedTuple):
     """One kind of ground: its finish, SemanticKITTI's class id, and its height above the carriageway, metres."""
 
     finish: Finish
@@ -27,21 +27,21 @@ class Kind(NamedTuple):
     lift: float
 
 
-KINDS: dict[str, Kind] = {
-    "grass": Kind(Finish("grass"), 72, 0.10),
-    "soil": Kind(Finish("soil"), 72, 0.09),
-    "field": Kind(Finish("soil", (0.52, 0.46, 0.27)), 72, 0.05),
-    "yard": Kind(Finish("gravel"), 49, 0.08),
-    "road": Kind(Finish("asphalt"), 40, 0.0),
-    "old_road": Kind(Finish("asphalt", (0.33, 0.32, 0.31)), 40, 0.0),
-    "marking": Kind(Finish("marking"), 60, 0.0),
-    "parking": Kind(Finish("paving", (0.40, 0.38, 0.37)), 44, 0.015),
-    "driveway": Kind(Finish("paving", (0.55, 0.50, 0.46)), 44, 0.11),
-    "sidewalk": Kind(Finish("paving"), 48, 0.12),
-    "cycleway": Kind(Finish("asphalt", (0.45, 0.27, 0.24)), 48, 0.12),
-    "kerb": Kind(Finish("kerbstone"), 48, 0.12),
-    "plaza": Kind(Finish("cobble"), 49, 0.12),
-    "rails": Kind(Finish("gravel", (0.38, 0.35, 0.33)), 49, 0.03),
+KINDS: dict[str, GroundKind] = {
+    "grass": GroundKind(Finish("grass"), 72, 0.10),
+    "soil": GroundKind(Finish("soil"), 72, 0.09),
+    "field": GroundKind(Finish("soil", (0.52, 0.46, 0.27)), 72, 0.05),
+    "yard": GroundKind(Finish("gravel"), 49, 0.08),
+    "road": GroundKind(Finish("asphalt"), 40, 0.0),
+    "old_road": GroundKind(Finish("asphalt", (0.33, 0.32, 0.31)), 40, 0.0),
+    "marking": GroundKind(Finish("marking"), 60, 0.0),
+    "parking": GroundKind(Finish("paving", (0.40, 0.38, 0.37)), 44, 0.015),
+    "driveway": GroundKind(Finish("paving", (0.55, 0.50, 0.46)), 44, 0.11),
+    "sidewalk": GroundKind(Finish("paving"), 48, 0.12),
+    "cycleway": GroundKind(Finish("asphalt", (0.45, 0.27, 0.24)), 48, 0.12),
+    "kerb": GroundKind(Finish("kerbstone"), 48, 0.12),
+    "plaza": GroundKind(Finish("cobble"), 49, 0.12),
+    "rails": GroundKind(Finish("gravel", (0.38, 0.35, 0.33)), 49, 0.03),
 }
 """The kinds of ground by name."""
 

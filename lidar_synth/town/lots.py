@@ -25,7 +25,7 @@ class Lot:
         front: |t| of its front boundary, metres.
         setback: metres from the front boundary to the house.
         plan: the plan of its house, or None for an empty lot.
-        at: metres along s from ``start`` to the house.
+        house_offset: metres along s from ``start`` to the house.
         driveway: (start, end) of a paved strip along s, metres, or None.
         boundary: the kind of its front boundary, one of ``boundaries.KINDS``.
         garden: density of its plants, 0..1.
@@ -37,7 +37,7 @@ class Lot:
     front: float
     setback: float
     plan: BuildingPlan | None
-    at: float
+    house_offset: float
     driveway: tuple[float, float] | None
     boundary: str
     garden: float
@@ -48,7 +48,7 @@ class Lot:
         return 2 * self.side - 1
 
 
-def draw_house(style: str, width: float, depth: float, rng: Rng) -> BuildingPlan:
+def sample_house(style: str, width: float, depth: float, rng: Rng) -> BuildingPlan:
     """The sampled plan of a house, row, block, shop or hall of the given width and depth in metres."""
     match style:
         case "house":
@@ -83,7 +83,7 @@ def _style(street: Street, side: int, rng: Rng) -> str:
     return str(rng.choice(["house", "row", "block", "shop", "hall"], p=[0.25, 0.12, 0.28, 0.27, 0.08]))
 
 
-def draw_lots(street: Street, rng: Rng) -> list[Lot]:
+def sample_lots(street: Street, rng: Rng) -> list[Lot]:
     """Sampled lots on both sides, from one end of the stretch to the other."""
     lots = []
     for side in (RIGHT, LEFT):
@@ -94,7 +94,7 @@ def draw_lots(street: Street, rng: Rng) -> list[Lot]:
             s = low
             while high - s > 7:
                 on_plaza = street.plaza == side and s + 9 > -12 and s < street.length + 12
-                lot = _draw_lot(
+                lot = _sample_lot(
                     street, side, s, high, front + (PLAZA_DEPTH if on_plaza else 0.0), setback, boundary, rng
                 )
                 lots.append(lot)
@@ -102,7 +102,7 @@ def draw_lots(street: Street, rng: Rng) -> list[Lot]:
     return lots
 
 
-def _draw_lot(
+def _sample_lot(
     street: Street, side: int, s: float, high: float, front: float, setback: float, boundary: str, rng: Rng
 ) -> Lot:
     style = _style(street, side, rng)
@@ -134,7 +134,7 @@ def _draw_lot(
     if rng.random() < 0.25 and style not in ("shop", "row"):
         boundary = str(rng.choice(KINDS))
     near = -45 < s + width / 2 < street.length + 50
-    plan = replace(draw_house(style, width, rng.uniform(8, 12), rng), detail=near)
+    plan = replace(sample_house(style, width, rng.uniform(8, 12), rng), detail=near)
     return Lot(
         s,
         end,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.town.prototype import Prototype
-from lidar_synth.town.scene import Placed, Pose, Scene
+from lidar_synth.town.scene import PlacedObject, Pose, Scene
 from lidar_synth.town.street import Street
 
 
@@ -20,7 +20,7 @@ class Mover:
         along: True if it moves along s, False if it moves along t.
         at: the constant coordinate, metres.
         start: the changing coordinate at time 0, metres.
-        way: +1 or -1, the direction in which it faces.
+        direction: +1 or -1, the direction in which it faces.
         speed: m/s; 0 for one that waits.
         instance: its instance number.
         surfaces: the surface number of each slot.
@@ -32,7 +32,7 @@ class Mover:
     along: bool
     at: float
     start: float
-    way: int
+    direction: int
     speed: float
     instance: int
     surfaces: NDArray[np.int32]
@@ -40,9 +40,9 @@ class Mover:
 
     def place(self, time: float) -> tuple[float, float, float]:
         """Its s and t (metres) and its yaw relative to the street (radians) at a time in seconds."""
-        on = self.start + self.way * self.speed * time
-        yaw = (0.0 if self.along else np.pi / 2) + (np.pi if self.way < 0 else 0.0)
-        return (on, self.at, yaw) if self.along else (self.at, on, yaw)
+        moving = self.start + self.direction * self.speed * time
+        yaw = (0.0 if self.along else np.pi / 2) + (np.pi if self.direction < 0 else 0.0)
+        return (moving, self.at, yaw) if self.along else (self.at, moving, yaw)
 
     def shape(self, time: float) -> Prototype:
         """Its prototype at a time in seconds."""
@@ -51,7 +51,9 @@ class Mover:
         ]
 
 
-def stand(movers: list[Mover], scene: Scene, time: float, about: tuple[float, float], reach: float) -> list[Placed]:
+def place_movers(
+    movers: list[Mover], scene: Scene, time: float, about: tuple[float, float], reach: float
+) -> list[PlacedObject]:
     """The movers within ``reach`` metres of street coordinates ``about``, placed in the world at a time in seconds."""
     places = np.array([m.place(time) for m in movers]).reshape(-1, 3)
     near = np.flatnonzero(np.hypot(places[:, 0] - about[0], places[:, 1] - about[1]) < reach)
@@ -59,7 +61,7 @@ def stand(movers: list[Mover], scene: Scene, time: float, about: tuple[float, fl
     s, t, yaw = places[near].T
     poses = scene.poses(s, t, yaw, lengths)
     return [
-        Placed(m.shape(time), pose, m.instance, m.surfaces, m.scale)
+        PlacedObject(m.shape(time), pose, m.instance, m.surfaces, m.scale)
         for m, pose in zip((movers[i] for i in near), poses, strict=True)
     ]
 
@@ -69,16 +71,16 @@ def ego_place(street: Street, time: float) -> tuple[float, float, float]:
 
     The vehicle follows its lane with a small lateral drift, or turns in an arc into the right lane of a side street.
     """
-    way, lane = street.speed * time, street.lanes[0].t
+    travelled, lane = street.speed * time, street.lanes[0].t
     if street.turn is None:
-        return way, float(lane + 0.15 * np.sin(0.11 * way)), 0.0
+        return travelled, float(lane + 0.15 * np.sin(0.11 * travelled)), 0.0
     crossing, side = street.turn
     sign = 2 * side - 1
     radius = (4.0, 8.0)[side]
     target = crossing.s + sign * crossing.half / 2
-    angle = float(np.clip((way - (target - radius)) / radius, 0, np.pi / 2))
-    beyond = max(0.0, way - (target - radius) - radius * np.pi / 2)
-    s = min(way, target - radius) + radius * np.sin(angle)
+    angle = float(np.clip((travelled - (target - radius)) / radius, 0, np.pi / 2))
+    beyond = max(0.0, travelled - (target - radius) - radius * np.pi / 2)
+    s = min(travelled, target - radius) + radius * np.sin(angle)
     return float(s), float(lane + sign * (radius * (1 - np.cos(angle)) + beyond)), sign * angle
 
 

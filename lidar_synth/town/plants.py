@@ -42,20 +42,20 @@ def _stem(height: float, radius: float, rng: np.random.Generator) -> tuple[Mesh,
     return tube(path, radius * np.array([1.7, 1.25, 1.0, 0.9, 0.75]), 8, BARK), path
 
 
-def _boughs(foot: NDArray[np.float64], ends: NDArray[np.float64], radius: float) -> Mesh:
+def _branches(foot: NDArray[np.float64], ends: NDArray[np.float64], radius: float) -> Mesh:
     return merge(
         tube([foot, 0.5 * (foot + e) + (0, 0, 0.1), e], [radius, 0.6 * radius, 0.02], 4, TWIG, caps=False) for e in ends
     )
 
 
-def _clumps(centres: NDArray[np.float64], spread: NDArray[np.float64] | float, count: int, size: float,
+def _leaf_clusters(centres: NDArray[np.float64], spread: NDArray[np.float64] | float, count: int, size: float,
             rng: np.random.Generator) -> Mesh:  # fmt: skip
     """Clusters of leaves, ``count`` triangles around each centre."""
     middle = np.repeat(centres, count, axis=0) + rng.normal(0, 1, (count * len(centres), 3)) * spread
     return leaves(middle, size * rng.uniform(0.6, 1.3, len(middle)), rng, LEAF)
 
 
-def _shell(
+def _ellipsoid_points(
     count: int, radii: tuple[float, float, float], middle: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """(count, 3) points near the surface of an ellipsoid whose centre is ``middle`` metres above the origin."""
@@ -68,11 +68,11 @@ def _shell(
 def _broadleaf(rng: np.random.Generator, height: float, clear: float, width: float, size: float, droop: float) -> Mesh:
     trunk, path = _stem(clear, rng.uniform(0.13, 0.24), rng)
     middle, up = (height + clear) / 2, (height - clear) / 2 + 0.3
-    heart = _shell(46, (0.44 * width, 0.44 * width, 0.9 * up), middle, rng)
-    boughs = _boughs(path[-1], heart[rng.permutation(len(heart))[:6]], 0.08)
+    crown = _ellipsoid_points(46, (0.44 * width, 0.44 * width, 0.9 * up), middle, rng)
+    branches = _branches(path[-1], crown[rng.permutation(len(crown))[:6]], 0.08)
     spread = np.array([0.42, 0.42, 0.34 + droop])
-    inside = (0, 0, middle) + 0.7 * (_shell(80, (width / 2, width / 2, up), 0, rng))
-    return merge([trunk, boughs, _clumps(heart - (0, 0, droop), spread, 12, 1.06 * size, rng),
+    inside = (0, 0, middle) + 0.7 * (_ellipsoid_points(80, (width / 2, width / 2, up), 0, rng))
+    return merge([trunk, branches, _leaf_clusters(crown - (0, 0, droop), spread, 12, 1.06 * size, rng),
                   leaves(inside, 0.11 * width, rng, LEAF)])  # fmt: skip
 
 
@@ -83,11 +83,15 @@ def _conifer(rng: np.random.Generator, height: float, clear: float, width: float
     angle = rng.uniform(0, 2 * np.pi, 420)
     centres = np.c_[reach * np.cos(angle), reach * np.sin(angle), clear + (height - clear) * level - 0.25 * reach]
     return merge(
-        [trunk, leaves(centres, (0.08 + 0.05 * width) * (1.2 - 0.5 * level), rng, LEAF), _skirt(height, clear, width)]
+        [
+            trunk,
+            leaves(centres, (0.08 + 0.05 * width) * (1.2 - 0.5 * level), rng, LEAF),
+            _inner_cone(height, clear, width),
+        ]
     )
 
 
-def _skirt(height: float, clear: float, width: float) -> Mesh:
+def _inner_cone(height: float, clear: float, width: float) -> Mesh:
     """The opaque cone inside a conifer."""
     angle = np.linspace(0, 2 * np.pi, 9)[:-1]
     rings = [np.c_[0.33 * width * f * np.cos(angle), 0.33 * width * f * np.sin(angle), np.full(8, z)]
@@ -96,9 +100,9 @@ def _skirt(height: float, clear: float, width: float) -> Mesh:
 
 
 def _bush(rng: np.random.Generator, height: float, width: float) -> Mesh:
-    heart = _shell(14, (0.42 * width, 0.42 * width, 0.42 * height), 0.52 * height, rng)
-    twigs = _boughs(np.zeros(3), heart[:3], 0.025)
-    return merge([twigs, _clumps(heart, 0.18, 12, 0.16, rng), _clumps(heart * 0.5, 0.12, 3, 0.3, rng)])
+    crown = _ellipsoid_points(14, (0.42 * width, 0.42 * width, 0.42 * height), 0.52 * height, rng)
+    twigs = _branches(np.zeros(3), crown[:3], 0.025)
+    return merge([twigs, _leaf_clusters(crown, 0.18, 12, 0.16, rng), _leaf_clusters(crown * 0.5, 0.12, 3, 0.3, rng)])
 
 
 @cache

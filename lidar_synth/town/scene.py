@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lidar_synth.town.furniture import Thing
+from lidar_synth.town.furniture import StaticObject
 from lidar_synth.town.ground import Ground
 from lidar_synth.town.materials import RGB, Surfaces
 from lidar_synth.town.meshes import Mesh, merge
@@ -19,7 +19,7 @@ Pose = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedObject:
     """An object with an instance number, placed in the world: a vehicle, a person or a rider.
 
     Args:
@@ -44,7 +44,7 @@ class Scene:
     Args:
         ground: the ground of the stretch.
         surfaces: all surfaces, of static objects and of movers.
-        standing: static objects that are not in ``meshes`` yet: (object, s, t, yaw, lift).
+        pending: static objects that are not in ``meshes`` yet: (object, s, t, yaw, lift).
         meshes: static triangles in the world, with surface numbers as slots.
         placed: static objects with an instance number.
         footprints: (lowest s, highest s, lowest t, highest t) of obstacles, metres.
@@ -53,39 +53,41 @@ class Scene:
 
     ground: Ground
     surfaces: Surfaces = field(default_factory=Surfaces)
-    standing: list[tuple[Thing, float, float, float, float]] = field(default_factory=list)
+    pending: list[tuple[StaticObject, float, float, float, float]] = field(default_factory=list)
     meshes: list[Mesh] = field(default_factory=list)
-    placed: list[Placed] = field(default_factory=list)
+    placed: list[PlacedObject] = field(default_factory=list)
     footprints: list[tuple[float, float, float, float]] = field(default_factory=list)
     instances: int = 0
 
-    def add(self, mesh: Mesh, surfaces: NDArray[np.int32]) -> None:
+    def add_mesh(self, mesh: Mesh, surfaces: NDArray[np.int32]) -> None:
         """Add a mesh in world coordinates; ``surfaces`` holds the surface number of each slot."""
         self.meshes.append(Mesh(mesh.triangles, surfaces[mesh.slot]))
 
-    def put(self, thing: Thing, s: float, t: float, yaw: float = 0.0, lift: float = 0.0, solid: float = 0.0) -> None:
+    def put(
+        self, item: StaticObject, s: float, t: float, yaw: float = 0.0, lift: float = 0.0, solid: float = 0.0
+    ) -> None:
         """Put a static object on the ground.
 
         Args:
-            thing: the object.
+            item: the object.
             s, t: street coordinates of its origin, metres.
             yaw: radians relative to the street's heading.
             lift: metres above the ground.
             solid: half the side of the square around its origin that pedestrians and cyclists avoid, metres.
         """
-        self.standing.append((thing, s, t, yaw, lift))
+        self.pending.append((item, s, t, yaw, lift))
         if solid:
             self.footprints.append((s - solid, s + solid, t - solid, t + solid))
 
     def mesh(self) -> Mesh:
         """All static triangles in the world, with surface numbers as slots."""
-        places = np.array([row[1:] for row in self.standing]).reshape(-1, 4)
+        places = np.array([row[1:] for row in self.pending]).reshape(-1, 4)
         points = self.ground.points(places[:, 0], places[:, 1]) + places[:, 3:] * (0, 0, 1)
         yaws = self.ground.course.heading(places[:, 0]) + places[:, 2]
-        for (thing, *_), point, yaw in zip(self.standing, points, yaws, strict=True):
-            rows = [self.surfaces.add(f, raw) for f, raw in zip(thing.finishes, thing.raw, strict=True)]
-            self.add(thing.mesh.moved(point, float(yaw)), np.array(rows, np.int32))
-        self.standing.clear()
+        for (item, *_), point, yaw in zip(self.pending, points, yaws, strict=True):
+            rows = [self.surfaces.add(f, raw) for f, raw in zip(item.finishes, item.raw, strict=True)]
+            self.add_mesh(item.mesh.moved(point, float(yaw)), np.array(rows, np.int32))
+        self.pending.clear()
         return merge(self.meshes)
 
     def poses(self, s: ArrayLike, t: ArrayLike, yaw: ArrayLike, length: ArrayLike) -> Pose:
@@ -115,7 +117,7 @@ class Scene:
         pose[..., 3, 3] = 1
         return pose
 
-    def dress(self, prototype: Prototype, colour: RGB, moving: bool) -> tuple[int, NDArray[np.int32]]:
+    def add_instance(self, prototype: Prototype, colour: RGB, moving: bool) -> tuple[int, NDArray[np.int32]]:
         """Register a new instance; return its number and the surface number of each slot."""
         self.instances += 1
         rows = [self.surfaces.add(f, prototype.raw[int(moving)], self.instances) for f in prototype.painted(colour)]
@@ -123,16 +125,16 @@ class Scene:
 
     def park(self, prototype: Prototype, colour: RGB, s: float, t: float, yaw: float, scale: float = 1.0) -> None:
         """Put a static object with an instance number on the ground."""
-        instance, surfaces = self.dress(prototype, colour, moving=False)
+        instance, surfaces = self.add_instance(prototype, colour, moving=False)
         low, high = prototype.mesh.bounds
         pose = self.poses(s, t, yaw, high[0] - low[0])
-        placed = Placed(prototype, pose, instance, surfaces, scale)
+        placed = PlacedObject(prototype, pose, instance, surfaces, scale)
         self.placed.append(placed)
-        self.add(prototype.mesh.moved(scale=scale).posed(pose), surfaces)
+        self.add_mesh(prototype.mesh.moved(scale=scale).posed(pose), surfaces)
         half = np.abs(np.array([[np.cos(yaw), np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])) @ (high[:2] - low[:2]) / 2
         self.footprints.append((s - half[0], s + half[0], t - half[1], t + half[1]))
 
-    def free(self, s: float, t: float, half: tuple[float, float]) -> bool:
+    def is_free(self, s: float, t: float, half: tuple[float, float]) -> bool:
         """Whether no obstacle lies within the half extents ``half`` (along s, along t) around a position, metres."""
         if not self.footprints:
             return True

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidar_synth.town.furniture import GALVANISED, OTHER, POLE, SIGN, Thing
+from lidar_synth.town.furniture import GALVANISED, OTHER, POLE, SIGN, StaticObject
 from lidar_synth.town.materials import RGB, Finish
 from lidar_synth.town.meshes import Mesh, boxes, disc, fan, merge, tube
 
@@ -34,7 +34,7 @@ BOARDS: dict[str, tuple[Outline, RGB, Outline, RGB]] = {
 """The board of each sign and the symbol on it: (outline, colour, outline, colour); outlines in metres (left, up)."""
 
 
-def road_sign(kind: str, height: float) -> Thing:
+def road_sign(kind: str, height: float) -> StaticObject:
     """A traffic sign facing +x; ``kind`` is a key of ``BOARDS``, ``height`` is the centre of the board in metres."""
     board, ground, mark, colour = BOARDS[kind]
 
@@ -43,12 +43,12 @@ def road_sign(kind: str, height: float) -> Thing:
 
     pole = tube([(0, 0, -0.2), (0, 0, height + 0.3)], 0.038, 6)
     mesh = merge([pole, flat(board, 0.05, 1), flat(mark, 0.054, 2), flat(board, 0.042, 3)])
-    return Thing(
+    return StaticObject(
         mesh, (GALVANISED, Finish("sign", ground), Finish("sign", colour), GALVANISED), (POLE, SIGN, SIGN, SIGN)
     )
 
 
-def traffic_light(height: float, reach: float) -> Thing:
+def traffic_light(height: float, reach: float) -> StaticObject:
     """Traffic lights on a pole, facing +x, and with ``reach`` > 0 (metres) also on an arm over the road towards +y."""
     parts = [tube([(0, 0, -0.2), (0, 0, height)], 0.06, 7)]
     spots = [(0.0, 2.3)]
@@ -60,6 +60,6 @@ def traffic_light(height: float, reach: float) -> Thing:
         parts += [disc((0.225, y, z + 0.15 + 0.3 * i), (1, 0, 0), 0.1, 8, 2 + i) for i in range(3)]
     colours: tuple[RGB, ...] = ((0.1, 0.5, 0.25), (0.35, 0.25, 0.05), (0.3, 0.05, 0.05))
     dark = Finish("plastic", (0.07, 0.09, 0.08))
-    return Thing(
+    return StaticObject(
         merge(parts), (GALVANISED, dark, *(Finish("lamp", c) for c in colours)), (POLE, OTHER, OTHER, OTHER, OTHER)
     )

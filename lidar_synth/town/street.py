@@ -44,7 +44,7 @@ class Lane(NamedTuple):
     """A lane of moving traffic along s: t of its centre in metres, and its direction (+1 or -1)."""
 
     t: float
-    way: int
+    direction: int
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ _SPEEDS = {
 }
 
 
-def draw_street(kind: str, seconds: float, rng: np.random.Generator) -> Street:
+def sample_street(kind: str, seconds: float, rng: np.random.Generator) -> Street:
     """The sampled plan of a street of a kind, long enough for the ego vehicle to drive ``seconds``."""
     turns = rng.random() < _TURNS[kind]
     speed = rng.uniform(4.5, 7.0) if turns else rng.uniform(*_SPEEDS[kind])

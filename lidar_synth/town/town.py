@@ -17,14 +17,14 @@ from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.town.boxes import boxes_of
 from lidar_synth.town.camera import CAMERA
-from lidar_synth.town.cast import Stage
+from lidar_synth.town.cast import Snapshot
 from lidar_synth.town.ego import HEIGHT, free_rays, optics
 from lidar_synth.town.materials import SurfaceTable
-from lidar_synth.town.movers import ego_place, ego_pose, stand
+from lidar_synth.town.movers import ego_place, ego_pose, place_movers
 from lidar_synth.town.returns import Noise, laser_gains, measure, see_through
 from lidar_synth.town.scene import Pose
-from lidar_synth.town.shading import draw_light, render
-from lidar_synth.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, generator
+from lidar_synth.town.shading import render, sample_light
+from lidar_synth.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, rng_for
 
 APART = 1000.0
 """Metres between the origins of two stretches in the world frame of the poses."""
@@ -102,15 +102,15 @@ class Town:
             self._worlds[stretch] = build_world(self.seed, stretch, self.interval)
         return self._worlds[stretch]
 
-    def moment(self, index: int) -> tuple[Stage, Pose, np.random.Generator]:
+    def moment(self, index: int) -> tuple[Snapshot, Pose, np.random.Generator]:
         """The scene of a scan, the sensor's pose in its stretch, and the random generator of the scan."""
         stretch, frame = divmod(index, STRETCH_FRAMES)
-        rng = generator(SCAN, self.seed, stretch, frame)
+        rng = rng_for(SCAN, self.seed, stretch, frame)
         world, time = self.world(index), frame * self.interval
         pose = ego_pose(world.street, world.scene, time, HEIGHT, rng.normal(0, 0.003, 2))
         about = ego_place(world.street, time)[:2]
-        movers = stand(world.movers, world.scene, time, about, self.sensor.range_max + 20)
-        return Stage(world, movers), pose, rng
+        movers = place_movers(world.movers, world.scene, time, about, self.sensor.range_max + 20)
+        return Snapshot(world, movers), pose, rng
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """(376, 1408, 3) uint8 RGB, the image that the camera of ``calibration`` takes with scan ``index``.
@@ -118,10 +118,10 @@ class Town:
         Raises:
             IndexError: on an index outside 0 to ``len - 1``.
         """
-        stage, pose, _ = self.moment(self._checked(index))
+        snapshot, pose, _ = self.moment(self._checked(index))
         stretch, frame = divmod(index, STRETCH_FRAMES)
-        light = draw_light(generator(LIGHT, self.seed, stretch))
-        return render(stage, pose, self.world(index).surfaces, light, generator(IMAGE, self.seed, stretch, frame))
+        light = sample_light(rng_for(LIGHT, self.seed, stretch))
+        return render(snapshot, pose, self.world(index).surfaces, light, rng_for(IMAGE, self.seed, stretch, frame))
 
     def _checked(self, index: int) -> int:
         if not 0 <= index < len(self):
@@ -134,12 +134,12 @@ class Town:
         Raises:
             IndexError: on an index outside 0 to ``len - 1``.
         """
-        stage, pose, rng = self.moment(self._checked(index))
+        snapshot, pose, rng = self.moment(self._checked(index))
         world = self.world(index)
-        laser, surface, points, reflectance = self._turn(stage, pose, world.surfaces, rng)
+        laser, surface, points, reflectance = self._turn(snapshot, pose, world.surfaces, rng)
         raw, instance = world.surfaces.raw[surface], world.surfaces.instance[surface]
         returned = np.bincount(instance, minlength=world.scene.instances + 1)
-        objects = [o for o in (*world.scene.placed, *stage.movers) if o.prototype.name and returned[o.instance]]
+        objects = [o for o in (*world.scene.placed, *snapshot.movers) if o.prototype.name and returned[o.instance]]
         placed = pose.copy()
         placed[0, 3] += APART * (index // STRETCH_FRAMES)
         return Scan(
@@ -150,22 +150,22 @@ class Town:
             raw_label=raw | instance.astype(np.uint32) << np.uint32(16),
             instance=instance,
             ring=laser.astype(np.int16),
-            boxes=boxes_of(objects, pose, stage),
+            boxes=boxes_of(objects, pose, snapshot),
             pose=placed,
             id=f"town-{self.seed}-{index:06d}",
             domain=SYNTHETIC,
         )
 
     def _turn(
-        self, stage: Stage, pose: Pose, surfaces: SurfaceTable, rng: np.random.Generator
+        self, snapshot: Snapshot, pose: Pose, surfaces: SurfaceTable, rng: np.random.Generator
     ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
         """Laser, surface number, point in the sensor frame and reflectance of each return of one revolution."""
         turn = pose[:3, :3].astype(np.float32)
         directions = self._rays @ turn.T
         origins = pose[:3, 3].astype(np.float32) + self._heights[:, None] * turn[:, 2]
         eye = origins.mean(0)
-        hits = stage.cast(origins, directions, eye)
-        see_through(stage, hits, origins, directions, eye, surfaces, rng)
+        hits = snapshot.cast(origins, directions, eye)
+        see_through(snapshot, hits, origins, directions, eye, surfaces, rng)
         back, far, reflectance = measure(hits, directions, self._laser, surfaces, self._gains, self._noise, rng)
         points = far[:, None] * self._rays[back]
         points[:, 2] += self._heights[back]

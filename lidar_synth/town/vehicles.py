@@ -9,10 +9,10 @@ from lidar_synth.town.bodywork import (
     FINISHES,
     GLASS,
     HEAD,
-    INSIDE,
+    INTERIOR,
     PAINT,
     PLATE,
-    SECOND,
+    SECONDARY,
     TAIL,
     TRIM,
     Station,
@@ -102,7 +102,7 @@ def _seats(s: _Shape) -> Mesh:
     rows = [0.5 * s.length - s.length * f for f in (s.screen + 0.10, min(s.screen + 0.33, s.roof_end - 0.1))]
     low = [(x - 0.12, -0.40 * s.width, 0.4) for x in rows] + [(-0.38 * s.length, -0.42 * s.width, 0.30)]
     high = [(x + 0.10, 0.40 * s.width, s.belt + 0.15) for x in rows] + [(0.22 * s.length, 0.42 * s.width, 0.45)]
-    return boxes(low, high, INSIDE)
+    return boxes(low, high, INTERIOR)
 
 
 def _car(kind: str) -> Mesh:
@@ -133,9 +133,9 @@ def _lorry(length: float, height: float, open_bed: bool) -> Mesh:
         half, rim = width / 2, bed + 0.5
         low = [(-front, -half, bed), (-front, -half, bed), (-front, half - 0.04, bed), (-front, -half, bed)]
         high = [(back, half, bed + 0.08), (back, -half + 0.04, rim), (back, half, rim), (-front + 0.04, half, rim)]
-        load = [boxes(low, high, SECOND), boxes([(-front + 0.5, -0.8, bed)], [(back - 1.0, 0.7, bed + 0.8)], TRIM)]
+        load = [boxes(low, high, SECONDARY), boxes([(-front + 0.5, -0.8, bed)], [(back - 1.0, 0.7, bed + 0.8)], TRIM)]
     else:
-        load = [boxes([(-front, -width / 2, bed - 0.1)], [(back, width / 2, height)], SECOND)]
+        load = [boxes([(-front, -width / 2, bed - 0.1)], [(back, width / 2, height)], SECONDARY)]
     return merge([
         shell(cab_stations, cab, width - 0.15).moved((front - cab / 2, 0, 0)),
         *load,
@@ -161,7 +161,7 @@ def _coach(length: float, width: float, height: float, low: float, rails: bool) 
         wheels(axles, 0.36 if rails else 0.48, width, arch=not rails),
         face(length / 2 + 0.006, low + 0.2, low + 0.4, width * 0.9, (HEAD, PLATE), low + 0.1),
         face(-length / 2 - 0.006, low + 0.4, low + 0.7, width * 0.9, (TAIL, PLATE), low + 0.2),
-        boxes([(-0.45 * length, -0.4 * width, low + 0.1)], [(0.42 * length, 0.4 * width, 1.15)], INSIDE),
+        boxes([(-0.45 * length, -0.4 * width, low + 0.1)], [(0.42 * length, 0.4 * width, 1.15)], INTERIOR),
     ])  # fmt: skip
 
 
@@ -184,7 +184,7 @@ def _trailer() -> Mesh:
             (back + 0.04, side, 0.9)]  # fmt: skip
     bars = tubes([([(front, y, 0.5), (2.2, 0, 0.45)], 0.04) for y in (-0.6, 0.6)], 4, TRIM)
     lights = face(back - 0.01, 0.4, 0.5, 1.4, (TAIL, PLATE), 0.38)
-    return merge([boxes(low, high, SECOND), bars, wheels([-0.1], 0.28, 1.75, arch=False), lights])
+    return merge([boxes(low, high, SECONDARY), bars, wheels([-0.1], 0.28, 1.75, arch=False), lights])
 
 
 @cache
