@@ -64,7 +64,8 @@ class Town:
     ) -> None:
         if seed < 0 or scans < 0 or not 0 < interval < 60:
             raise ConfigError(
-                f"seed {seed}, {scans} scans, {interval} s apart", "a seed and a number from 0 up, 0 to 60 s"
+                f"a town with seed {seed}, {scans} scans and an interval of {interval} s",
+                "seed >= 0, scans >= 0 and 0 < interval < 60 s",
             )
         self.seed, self.sensor, self.interval = seed, load_sensor(sensor), interval
         self._scans, self._noise = scans, noise or Noise()
@@ -125,7 +126,7 @@ class Town:
 
     def _checked(self, index: int) -> int:
         if not 0 <= index < len(self):
-            raise IndexError(f"scan {index} of a town of {len(self)}")
+            raise IndexError(f"scan {index} of a town of {len(self)} scans")
         return index
 
     def __getitem__(self, index: int) -> Scan:
