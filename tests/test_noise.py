@@ -14,7 +14,7 @@ from lidar_synth.noise import gaussian, keyed_rng, philox, uniform
 
 WORD = st.integers(0, 2**32 - 1)
 
-KNOWN = [  # kat_vectors of Random123: counter, key, output of philox4x32-10; lowest word first
+KNOWN = [  # kat_vectors of Random123: counter, key and output of philox4x32-10; lowest word first
     ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
     (
         (0xFFFFFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0xFFFFFFFF),

@@ -138,8 +138,8 @@ def test_columns_run_clockwise_from_the_rear_and_row_0_is_the_highest() -> None:
     assert cell[5] // 32 < cell[0] // 32
     for just_left_and_right_of_the_seam in ([-9, 1e-9, 0], [-9, 0, 0], [-9, -1e-9, 0]):  # +-pi in float32
         assert locate(np.array([just_left_and_right_of_the_seam], np.float32), sensor).cell % 32 == 0
-    straight_up = locate(np.array([[0, 0, 9], [0, 0, -9]], np.float32), sensor).cell
-    assert (straight_up // 32).tolist() == [0, 7]
+    straight_up_and_down = locate(np.array([[0, 0, 9], [0, 0, -9]], np.float32), sensor).cell
+    assert (straight_up_and_down // 32).tolist() == [0, 7]
 
 
 @settings(max_examples=200)
@@ -178,39 +178,39 @@ def test_batches_on_any_device_equal_single_projections(sensor: Sensor, device: 
         assert np.array_equal(xyz[:, image.mask].T, unproject(image).points)
 
 
-def in_file_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
+def scan_in_ring_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
     """A scan ring by ring, each counter-clockwise from straight ahead, and (N,) the row of each point."""
     sensor = presets()["hdl64e_kitti360"]
-    full, points, rows = image_of(sensor.by_beams(), 5, share=share), [], []
-    full.range[full.mask] = np.maximum(full.range[full.mask], 5)  # rings of nearer points are ambiguous in crops
+    image, points, rows = image_of(sensor.by_beams(), 5, share=share), [], []
+    image.range[image.mask] = np.maximum(image.range[image.mask], 5)  # rings of nearer points are ambiguous in crops
     for row in range(sensor.shape[0]):
         order = np.argsort(-sensor.column_azimuths() % (2 * np.pi))
-        order = order[full.range[row, order] > 0]
-        points.append(full.range[row, order, None] * sensor.by_beams().ray_directions()[row, order])
+        order = order[image.range[row, order] > 0]
+        points.append(image.range[row, order, None] * sensor.by_beams().ray_directions()[row, order])
         rows.append(np.full(len(order), row))
-    found = np.concatenate(points).astype(np.float32)
-    return Scan(found, np.linspace(0, 1, len(found), dtype=np.float32), sensor), np.concatenate(rows)
+    xyz = np.concatenate(points).astype(np.float32)
+    return Scan(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32), sensor), np.concatenate(rows)
 
 
 def test_unfolding_assigns_rings_to_their_beams_even_if_some_are_missing() -> None:
-    whole, rows = in_file_order()
+    full_scan, rows = scan_in_ring_order()
     for kept in (rows >= 0, rows < 39, rows >= 20, (rows < 10) | (rows > 30)):
-        image = unfold(whole[kept])
-        assert np.array_equal(image.range, unfold(replace(whole, ring=rows.astype(np.int16))[kept]).range)
+        image = unfold(full_scan[kept])
+        assert np.array_equal(image.range, unfold(replace(full_scan, ring=rows.astype(np.int16))[kept]).range)
         assert np.array_equal(np.flatnonzero(image.mask.any(1)), np.unique(rows[kept]))
         assert np.array_equal(project(unproject(image)).mask, image.mask)
     with pytest.raises(DataError, match=r"rings found for the 64 lasers.*project\(\)"):
-        unfold(whole[np.random.default_rng(0).permutation(len(whole))])
+        unfold(full_scan[np.random.default_rng(0).permutation(len(full_scan))])
 
 
 @given(first=st.integers(0, 359), width=st.integers(60, 360), share=st.sampled_from([0.3, 0.95]))
 @settings(max_examples=25)
 def test_a_crop_unfolds_like_the_same_part_of_the_complete_scan(first: int, width: int, share: float) -> None:
-    whole, rows = in_file_order(share)
-    azimuth = np.degrees(np.arctan2(whole.points[:, 1], whole.points[:, 0]))
+    full_scan, rows = scan_in_ring_order(share)
+    azimuth = np.degrees(np.arctan2(full_scan.points[:, 1], full_scan.points[:, 0]))
     kept = (azimuth - first) % 360 < width
-    known = replace(whole, ring=rows.astype(np.int16))[kept]
-    image, expected = unfold(whole[kept]), unfold(known)
+    known = replace(full_scan, ring=rows.astype(np.int16))[kept]
+    image, expected = unfold(full_scan[kept]), unfold(known)
     assert np.array_equal(image.range, expected.range)
     assert np.array_equal(image.reflectance, expected.reflectance)
 
@@ -218,31 +218,31 @@ def test_a_crop_unfolds_like_the_same_part_of_the_complete_scan(first: int, widt
 @pytest.mark.parametrize("half", ["left", "right", "rear"])
 def test_rings_are_found_in_half_a_scan(half: str) -> None:
     """R2Flow's rule looks for the step from the fourth quadrant to the first, which half a scan may not contain."""
-    whole, rows = in_file_order()
-    x, y = whole.points[:, 0], whole.points[:, 1]
+    full_scan, rows = scan_in_ring_order()
+    x, y = full_scan.points[:, 0], full_scan.points[:, 1]
     kept = {"left": y > 0, "right": y < 0, "rear": x < 0}[half]
-    assert np.array_equal(ring_numbers(whole.points[kept]), rows[kept])
+    assert np.array_equal(ring_numbers(full_scan.points[kept]), rows[kept])
 
 
 @given(seed=st.integers(0, 10_000), strays=st.integers(1, 3), at_seam=st.booleans())
 @settings(max_examples=25)
 def test_stray_points_do_not_start_rings(seed: int, strays: int, at_seam: bool) -> None:
-    whole, rows = in_file_order()
+    full_scan, rows = scan_in_ring_order()
     rng = np.random.default_rng(seed)
-    place = rng.integers(1, len(whole), strays)
+    place = rng.integers(1, len(full_scan), strays)
     if at_seam:
         place = rng.choice(np.flatnonzero(np.diff(rows)) + 1) + rng.integers(-2, 3, strays)
-    order = np.insert(np.arange(len(whole)), place, rng.integers(0, len(whole), strays))
-    ring = ring_numbers(whole.points[order])
+    order = np.insert(np.arange(len(full_scan)), place, rng.integers(0, len(full_scan), strays))
+    ring = ring_numbers(full_scan.points[order])
     moved = ring != rows[order]
     assert ring.max() == 63
     assert moved.sum() <= 5 * strays, "only the strays and points between them"
-    assert unfold(whole[order]).mask.any(1).all()
+    assert unfold(full_scan[order]).mask.any(1).all()
 
 
 def test_points_that_are_not_in_ring_order_are_refused() -> None:
-    whole, rows = in_file_order()
-    azimuth = np.arctan2(whole.points[:, 1], whole.points[:, 0]) % (2 * np.pi)
+    full_scan, rows = scan_in_ring_order()
+    azimuth = np.arctan2(full_scan.points[:, 1], full_scan.points[:, 0]) % (2 * np.pi)
     orders = {
         "column by column": np.argsort(azimuth, kind="stable"),
         "clockwise": np.lexsort((-azimuth, rows)),
@@ -251,7 +251,7 @@ def test_points_that_are_not_in_ring_order_are_refused() -> None:
         "a narrow sector": np.flatnonzero(np.abs(azimuth - 2) < 0.05),
     }
     for name, order in orders.items():
-        scan = replace(whole[order], id=name)
+        scan = replace(full_scan[order], id=name)
         with pytest.raises(DataError, match=f"{name}.*ring by ring, as KITTI stores them"):
             unfold(scan)
 
@@ -285,8 +285,8 @@ def test_neighbours_vote_across_the_seam_but_not_beyond_the_cutoff() -> None:
     rays = sensor.ray_directions()
     behind_column_0 = rays[4, 0] * 50  # all neighbours differ by more than a metre: the nearest in range decides
     at_the_seam = rays[4, -1] * 30.2  # hidden behind a cell at 20 m: its wall continues in columns 0 and 1
-    crowd = rays[4, 10] * 30.9  # four of five votes are within the cutoff
-    points = np.concatenate([shown, [behind_column_0, at_the_seam, crowd]]).astype(np.float32)
+    near_its_neighbours = rays[4, 10] * 30.9  # four of five votes are within the cutoff
+    points = np.concatenate([shown, [behind_column_0, at_the_seam, near_its_neighbours]]).astype(np.float32)
     filled = fill_points(labels, image, locate(points, sensor))
     assert filled[-3:].tolist() == [12, 12, 12]
     image[4, 10], image[3:6, 9], image[3:6, 11] = 28, 33, 33  # one near neighbour, many beyond the cutoff

@@ -15,12 +15,12 @@ ROOTS = ("kitti360", "semantic_kitti", "kitti_object", "kitti_raw")
 
 
 def scans_below(root: Path) -> list[Scan]:
-    found = []
+    scans = []
     for path in sorted(p for folder in ROOTS for p in (root / folder).rglob("*.bin")):
         points = read_points(path)
         sensor = load_sensor("hdl64e_semantic_kitti" if "semantic" in str(path) else "hdl64e_kitti")
-        found.append(Scan(points[:, :3], points[:, 3], sensor, id=str(path.relative_to(root))))
-    return found
+        scans.append(Scan(points[:, :3], points[:, 3], sensor, id=str(path.relative_to(root))))
+    return scans
 
 
 @pytest.fixture(scope="module")

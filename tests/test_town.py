@@ -114,8 +114,8 @@ def test_label_raw_label_and_instance_agree(scans: dict[int, Scan]) -> None:
 
 
 def test_every_class_occurs(scans: dict[int, Scan]) -> None:
-    met = np.unique(np.concatenate([s.label for s in scans.values()]))
-    assert set(met) == set(range(len(NAMES))) | {IGNORE}
+    occurring = np.unique(np.concatenate([s.label for s in scans.values()]))
+    assert set(occurring) == set(range(len(NAMES))) | {IGNORE}
     raw = np.unique(np.concatenate([s.raw_label & 0xFFFF for s in scans.values()]))
     assert {10, 252, 30, 254, 60} <= set(raw.tolist())
 
@@ -148,7 +148,7 @@ def test_reflectance_is_quantised_and_differs_between_materials(scans: dict[int,
 
 
 def test_boxes_contain_the_points_of_their_instance(scans: dict[int, Scan]) -> None:
-    total = strange = 0
+    total = foreign = 0
     for scan in scans.values():
         boxes = scan.boxes
         assert boxes is not None and len(np.unique(boxes.instance)) == len(boxes)
@@ -158,19 +158,19 @@ def test_boxes_contain_the_points_of_their_instance(scans: dict[int, Scan]) -> N
             assert own.any() and wider.contain(scan.points[own])[i].all(), (scan.id, boxes.names[i])
         inside = boxes.contain(scan.points, above_floor=0.3)
         total += int(inside.sum())
-        strange += int((inside & (scan.instance != boxes.instance[:, None])).sum())
-    assert total > 1000 and strange < 0.02 * total
+        foreign += int((inside & (scan.instance != boxes.instance[:, None])).sum())
+    assert total > 1000 and foreign < 0.02 * total
 
 
 def test_box_names_match_the_classes_of_their_points(scans: dict[int, Scan]) -> None:
-    of = {"Car": "car", "Van": "car", "Truck": "truck", "Pedestrian": "person", "Cyclist": "bicyclist",
+    class_of = {"Car": "car", "Van": "car", "Truck": "truck", "Pedestrian": "person", "Cyclist": "bicyclist",
           "Person_sitting": "person", "Tram": "other-vehicle"}  # fmt: skip
     for scan in scans.values():
         assert scan.boxes is not None and scan.label is not None
         for name, number in zip(scan.boxes.names, scan.boxes.instance, strict=True):
             classes = np.unique(scan.label[scan.instance == number])
             assert len(classes) == 1
-            assert name not in of or NAMES[classes[0]] == of[name]
+            assert name not in class_of or NAMES[classes[0]] == class_of[name]
 
 
 def test_image_boxes_and_truncation_match_the_boxes(scans: dict[int, Scan]) -> None:
@@ -196,26 +196,26 @@ def test_image_boxes_and_truncation_match_the_boxes(scans: dict[int, Scan]) -> N
 
 def test_no_ray_passes_through_walls_or_cars(town: Town, scans: dict[int, Scan]) -> None:
     """A ray returns from the first surface that it hits, except for glass, wire and leaves."""
-    seen_movers = 0
+    mover_points = 0
     for index in INDICES:
         world, scan = town.world(index), scans[index]
         snapshot, pose, _ = town.moment(index)
         assert scan.ring is not None and scan.instance is not None
         start = np.zeros((len(scan), 3)) + np.array((0, 0, 1)) * optics(scan.sensor)[1][scan.ring][:, None]
-        way = scan.points - start
-        far = np.linalg.norm(way, axis=1)
+        offset = scan.points - start
+        measured = np.linalg.norm(offset, axis=1)
         origins = (start @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-        rays = ((way / far[:, None]) @ pose[:3, :3].T).astype(np.float32)
+        rays = ((offset / measured[:, None]) @ pose[:3, :3].T).astype(np.float32)
         solid = ~np.isin(np.array(list(MATERIALS))[world.surfaces.material], ["glass", "carglass", "leaf", "wire"])
         first, face, _ = Solid(world.triangles).first(origins, rays)
-        behind = (first < far - 0.25) & solid[world.faces[face]]
+        behind = (first < measured - 0.25) & solid[world.faces[face]]
         # At edges, the ray computed from a rounded point can miss what the original ray hit.
         assert behind.mean() < 1e-3
         for mover in snapshot.movers:
-            found, surface, _ = trace(mover, origins, rays)
-            assert ((found < far - 0.25) & solid[surface]).mean() < 1e-3
-            seen_movers += int((scan.instance == mover.instance).sum())
-    assert seen_movers > 100
+            distance, surface, _ = trace(mover, origins, rays)
+            assert ((distance < measured - 0.25) & solid[surface]).mean() < 1e-3
+            mover_points += int((scan.instance == mover.instance).sum())
+    assert mover_points > 100
 
 
 def test_occlusion_and_truncation_of_hidden_cut_and_invisible_cars(town: Town) -> None:
@@ -226,20 +226,20 @@ def test_occlusion_and_truncation_of_hidden_cut_and_invisible_cars(town: Town) -
     lorry, car = vehicles()["box_lorry"], vehicles()["sedan"]
     pose = np.eye(4)
 
-    def stand(prototype: Prototype, x: float, y: float, number: int) -> PlacedObject:
-        place = np.eye(4)
-        place[:3, 3] = x, y, -1.73
-        return PlacedObject(prototype, place, number, np.zeros(10, np.int32))
+    def place(prototype: Prototype, x: float, y: float, number: int) -> PlacedObject:
+        object_pose = np.eye(4)
+        object_pose[:3, 3] = x, y, -1.73
+        return PlacedObject(prototype, object_pose, number, np.zeros(10, np.int32))
 
-    near, behind, beside = stand(lorry, 14, 0, 1), stand(car, 30, 0, 2), stand(car, 30, 9, 3)
+    near, behind, beside = place(lorry, 14, 0, 1), place(car, 30, 0, 2), place(car, 30, 9, 3)
     boxes = boxes_of([near, behind, beside], pose, Snapshot(bare, [near, behind, beside]))
     assert boxes.occlusion[[0, 2]].tolist() == [0, 0] and boxes.occlusion[1] >= 2
     assert boxes.truncation.tolist() == [0, 0, 0]
     alone = boxes_of([behind], pose, Snapshot(bare, [behind]))
     assert alone.occlusion.tolist() == [0]
-    cut = boxes_of([stand(car, 4, 4.2, 4)], pose, Snapshot(bare, []))
+    cut = boxes_of([place(car, 4, 4.2, 4)], pose, Snapshot(bare, []))
     assert 0.1 < cut.truncation[0] < 0.9
-    away = boxes_of([stand(car, -20, 0, 5)], pose, Snapshot(bare, []))
+    away = boxes_of([place(car, -20, 0, 5)], pose, Snapshot(bare, []))
     assert away.truncation[0] == away.occlusion[0] == away.image_box[0, 0] == -1
 
 
@@ -256,14 +256,17 @@ def test_neighbouring_scans_overlap_when_accumulated_by_pose(scans: dict[int, Sc
     assert first.pose is not None and second.pose is not None
     assert 1 < np.linalg.norm(second.pose[:3, 3] - first.pose[:3, 3]) < 8
     tree = cKDTree(cloud(4))
-    apart = tree.query(cloud(5), distance_upper_bound=3)[0]
-    near = np.isfinite(apart)
+    distance_to_first = tree.query(cloud(5), distance_upper_bound=3)[0]
+    near = np.isfinite(distance_to_first)
     assert near.mean() > 0.9
-    assert np.percentile(apart[near], 75) < 0.25
+    assert np.percentile(distance_to_first[near], 75) < 0.25
     # With the pose of the other scan the same clouds do not match, so the test depends on the poses.
-    unmoved = tree.query(cloud(5, first.pose), distance_upper_bound=3)[0]
+    without_motion = tree.query(cloud(5, first.pose), distance_upper_bound=3)[0]
     heights = [np.abs(q[:, 2]).mean() for q in (cloud(4), cloud(5))]
-    assert np.mean(np.minimum(unmoved, 3)) > np.mean(np.minimum(apart, 3)) and abs(heights[0] - heights[1]) < 1
+    assert (
+        np.mean(np.minimum(without_motion, 3)) > np.mean(np.minimum(distance_to_first, 3))
+        and abs(heights[0] - heights[1]) < 1
+    )
 
 
 def test_stretches_are_far_apart_in_the_world(scans: dict[int, Scan]) -> None:

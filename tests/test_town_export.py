@@ -94,9 +94,9 @@ def test_boxes_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> No
         expected = boxes[boxes.truncation >= 0] if layout == "kitti" else boxes[near]
         assert len(read) >= len(expected) > 0
         for value, name in zip(expected.values, expected.names, strict=True):
-            apart = np.linalg.norm(read.values[:, :3] - value[:3], axis=1)
-            match = int(apart.argmin())
-            assert apart[match] < 3 * tolerance
+            distance = np.linalg.norm(read.values[:, :3] - value[:3], axis=1)
+            match = int(distance.argmin())
+            assert distance[match] < 3 * tolerance
             assert np.allclose(read.values[match, 3:6], value[3:6], atol=tolerance)
             if layout == "kitti":
                 assert read.names[match] == name
@@ -122,9 +122,9 @@ def test_the_calibration_is_read_back(written: tuple[str, Path], town: Town, sca
     camera = open_scans(root).calibration(0)
     assert camera is not None
     expected, depth = town.calibration.pixels(scans[0].points)
-    found, _ = camera.pixels(scans[0].points)
+    actual, _ = camera.pixels(scans[0].points)
     ahead = depth > 1
-    assert np.allclose(found[ahead], expected[ahead], atol=0.01)
+    assert np.allclose(actual[ahead], expected[ahead], atol=0.01)
 
 
 def test_the_folder_has_a_readme_and_its_settings(written: tuple[str, Path]) -> None:

@@ -24,12 +24,12 @@ from lidar_synth.town.world import STRETCH_FRAMES, WORLD, build_world, rng_for
 UP = np.array((0.0, 0.0, 1.0))
 
 
-def hits(mesh: Mesh, origins: np.ndarray, ways: np.ndarray) -> np.ndarray:
+def hits(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Distances to the mesh, inf where rays miss it."""
-    return Solid(mesh.triangles).first(origins.astype(np.float32), ways.astype(np.float32))[0]
+    return Solid(mesh.triangles).first(origins.astype(np.float32), directions.astype(np.float32))[0]
 
 
-def outside_in(count: int, seed: int = 0, radius: float = 50.0) -> tuple[np.ndarray, np.ndarray]:
+def rays_towards_origin(count: int, seed: int = 0, radius: float = 50.0) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions of rays from all sides towards the origin."""
     rng = np.random.default_rng(seed)
     start = rng.standard_normal((count, 3))
@@ -45,16 +45,16 @@ def test_rays_hit_the_faces_of_a_box(low: tuple[float, ...], size: tuple[float, 
     assert len(mesh) == 12
     middle = (a + b) / 2
     for axis in range(3):
-        way = np.zeros(3)
-        way[axis] = 1.0
-        found = hits(mesh, np.array([middle - 20 * way]), np.array([way]))
-        assert np.isclose(found[0], 20 - size[axis] / 2, atol=1e-3)
+        direction = np.zeros(3)
+        direction[axis] = 1.0
+        distances = hits(mesh, np.array([middle - 20 * direction]), np.array([direction]))
+        assert np.isclose(distances[0], 20 - size[axis] / 2, atol=1e-3)
 
 
 @pytest.mark.parametrize("mesh", [boxes([(-1, -1, -1)], [(1, 1, 1)]), ball((0, 0, 0), 1.0, rings=8, sides=12),
                                   tube([(0, 0, -1), (0, 0, 1)], 1.0, 12)])  # fmt: skip
 def test_closed_shapes_let_no_ray_through(mesh: Mesh) -> None:
-    assert np.isfinite(hits(mesh, *outside_in(2000))).all()
+    assert np.isfinite(hits(mesh, *rays_towards_origin(2000))).all()
 
 
 def test_a_prism_is_open_at_the_bottom_only() -> None:
@@ -127,10 +127,10 @@ def test_rays_enter_the_crown_of_a_plant(species: str) -> None:
         assert len(coarse_plant(species, variant)) < 0.7 * len(mesh)
         low, high = mesh.bounds
         middle = np.array((0, 0, 0.6 * high[2]))
-        start, ways = outside_in(3000, variant)
-        side = np.abs(ways[:, 2]) < 0.3
-        found = hits(mesh, start[side] + middle, ways[side])
-        depth = 50 - found[np.isfinite(found)]
+        start, directions = rays_towards_origin(3000, variant)
+        side = np.abs(directions[:, 2]) < 0.3
+        distances = hits(mesh, start[side] + middle, directions[side])
+        depth = 50 - distances[np.isfinite(distances)]
         # Some rays end outside, some deep inside; with a smooth surface, all would end at the same depth.
         assert len(depth) > 0.2 * side.sum() and depth.std() > 0.015 * (high - low)[:2].mean()
     assert (plant(species, 0).slot == LEAF).mean() > 0.5
@@ -162,10 +162,10 @@ def test_the_mesh_of_the_ground_matches_its_height_and_kind(stretch: int) -> Non
     mesh = ground.mesh(np.random.default_rng(0))
     points = ground.points(s[keep], t[keep])
     # No ground lies above the points, and the first hit below is the expected surface.
-    found = hits(mesh, points + UP * 30, np.tile((0, 0, -1.0), (len(points), 1)))
+    distances = hits(mesh, points + UP * 30, np.tile((0, 0, -1.0), (len(points), 1)))
     assert keep.sum() > 500
-    assert np.abs(30 - found).max() < 0.16
-    assert np.percentile(np.abs(30 - found), 97) < 0.02
+    assert np.abs(30 - distances).max() < 0.16
+    assert np.percentile(np.abs(30 - distances), 97) < 0.02
     slot = mesh.slot[
         Solid(mesh.triangles).first(
             (points + UP * 30).astype(np.float32), np.tile(np.float32([0, 0, -1]), (len(points), 1))
@@ -179,8 +179,8 @@ def test_the_ground_has_no_holes() -> None:
     mesh = world.scene.ground.mesh(np.random.default_rng(0))
     rng = np.random.default_rng(0)
     points = world.scene.ground.points(rng.uniform(-80, 110, 20_000), rng.uniform(-80, 80, 20_000))
-    found = hits(mesh, points + UP * 50, np.tile((0, 0, -1.0), (len(points), 1)))
-    assert np.isinf(found).sum() <= 2
+    distances = hits(mesh, points + UP * 50, np.tile((0, 0, -1.0), (len(points), 1)))
+    assert np.isinf(distances).sum() <= 2
 
 
 def test_a_kerb_closes_the_step_between_road_and_pavement() -> None:
@@ -198,9 +198,9 @@ def test_a_kerb_closes_the_step_between_road_and_pavement() -> None:
 
 @pytest.mark.parametrize("kind", STREETS)
 def test_sampled_streets_of_a_kind_vary_and_are_valid(kind: str) -> None:
-    drawn = [sample_street(kind, 7.6, np.random.default_rng(k)) for k in range(20)]
-    assert len({(s.edge, s.parking, len(s.crossings)) for s in drawn}) > 10
-    for street in drawn:
+    streets = [sample_street(kind, 7.6, np.random.default_rng(k)) for k in range(20)]
+    assert len({(s.edge, s.parking, len(s.crossings)) for s in streets}) > 10
+    for street in streets:
         assert street.kind == kind and street.length > 20
         assert -street.edge[RIGHT] < street.lanes[0].t < 0 and street.lanes[0].direction == 1
         for lane in street.lanes:
@@ -219,15 +219,17 @@ def test_movers_do_not_collide() -> None:
     world = max((build_world(0, k, 0.4) for k in (0, 7)), key=lambda w: len(w.movers))
     assert len(world.movers) > 15
     for time in 0.4 * np.arange(STRETCH_FRAMES):
-        spans = []
+        extents = []
         for mover in world.movers:
             s, t, yaw = mover.place(time)
             low, high = mover.shape(time).mesh.bounds
             half = mover.scale * (high - low)[:2] / 2
-            spans.append((s, t, *(half if abs(np.cos(yaw)) > 0.5 else half[::-1])))
-        s, t, half_s, half_t = np.array(spans).T
-        meet = (np.abs(s[:, None] - s) < half_s[:, None] + half_s) & (np.abs(t[:, None] - t) < half_t[:, None] + half_t)
-        assert not (meet & ~np.eye(len(s), dtype=bool)).any()
+            extents.append((s, t, *(half if abs(np.cos(yaw)) > 0.5 else half[::-1])))
+        s, t, half_s, half_t = np.array(extents).T
+        overlap = (np.abs(s[:, None] - s) < half_s[:, None] + half_s) & (
+            np.abs(t[:, None] - t) < half_t[:, None] + half_t
+        )
+        assert not (overlap & ~np.eye(len(s), dtype=bool)).any()
 
 
 def test_surfaces_are_frozen_into_columns() -> None:
@@ -241,7 +243,7 @@ def test_surfaces_are_frozen_into_columns() -> None:
     assert table.reflectance[road] == np.float32(MATERIALS["asphalt"].reflectance)
 
 
-def test_patches_are_uniform_and_coarse() -> None:
+def test_cell_noise_is_uniform_and_constant_within_a_cell() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-50, 50, (50_000, 3)).astype(np.float32)
     value = cell_noise(points, 0.5)
@@ -262,7 +264,7 @@ def test_laser_gains_are_fixed_for_a_sensor() -> None:
 
 def test_merging_concatenates_triangles_and_slots() -> None:
     parts = [boxes([(0, 0, 0)], [(1, 1, 1)], slot) for slot in (1, 2)]
-    whole = merge(parts)
-    assert len(whole) == 24 and whole.slot.tolist() == [1] * 12 + [2] * 12
+    merged = merge(parts)
+    assert len(merged) == 24 and merged.slot.tolist() == [1] * 12 + [2] * 12
     assert len(merge([])) == 0
     assert len(loft(np.zeros((3, 4, 3)), np.arange(6).reshape(2, 3))) == 12

@@ -69,7 +69,7 @@ class Normalisation:
         return float(np.log2(self.range_max + self.offset)) if self.kind == "log" else self.range_max
 
     def inside(self, distance: torch.Tensor) -> torch.Tensor:
-        """Whether each range (any shape, metres) is a return, which is to say inside the limits."""
+        """Whether each range (any shape, metres) is a return, that is, inside the limits."""
         return (distance > self.range_min) & (distance < self.range_max)
 
     def encode(self, distance: torch.Tensor) -> torch.Tensor:

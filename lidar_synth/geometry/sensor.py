@@ -19,8 +19,8 @@ from lidar_synth.errors import ConfigError, shorten
 from lidar_synth.files.parsing import parse_yaml, read_yaml
 
 Rays = Literal["centre", "corner"]
-"""Where in its cell a ray points: the centre (a point returns to its own cell) or, as the public code of
-R2Flow and LiDM has it, the upper left corner."""
+"""The point of a cell through which its ray passes: the centre (so that unprojected points project back to the same
+cell) or the upper left corner, as in the public code of R2Flow and LiDM."""
 
 MOST_CELLS = 1 << 22
 """Rows times columns of a sensor; the largest that are sold have 2^19."""

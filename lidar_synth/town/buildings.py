@@ -43,6 +43,7 @@ def _balconies(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
 
 
 def _roof(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
+    """The roof with chimney and skylights, or a flat roof."""
     w, d, z, over = plan.width, plan.depth, plan.eaves, 0.45
     if plan.roof == "flat":
         edge = boxes([(-0.1, -0.1, z - 0.2)], [(w + 0.1, d + 0.1, z + 0.25)], SLAB)
@@ -70,6 +71,7 @@ def _roof(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
 
 
 def _skylights(slope: list[tuple[float, float, float]], count: int, rng: np.random.Generator) -> Mesh:
+    """``count`` windows at random positions on a slope, given by its corners."""
     a, b, c, d = np.array(slope, float)
     up = np.cross(b - a, d - a)
     up = 0.04 * up / np.linalg.norm(up)

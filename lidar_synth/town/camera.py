@@ -15,6 +15,7 @@ _PLACE = (0.80, 0.30, -0.18)
 
 
 def _calibration() -> Calibration:
+    """The calibration from the position, pitch and intrinsics of the camera."""
     c, s = np.cos(_PITCH), np.sin(_PITCH)
     level = np.eye(4)
     level[:3, 3] = np.negative(_PLACE)

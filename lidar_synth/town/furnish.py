@@ -29,20 +29,21 @@ def furnish(street: Street, lots: list[Lot], scene: Scene, rng: Rng) -> None:
     """Put all static objects of the street and its squares into the scene."""
     for side in (RIGHT, LEFT):
         _park_along(street, lots, side, scene, rng)
-        _trees(street, side, scene, rng)
-        _lamps(street, side, scene, rng)
-        _signs(street, side, scene, rng)
-        _small_things(street, side, scene, rng)
+        _put_trees(street, side, scene, rng)
+        _put_lamps(street, side, scene, rng)
+        _put_signs(street, side, scene, rng)
+        _put_street_furniture(street, side, scene, rng)
         if street.kind == "edge":
             edge_of_town(street, side, scene, rng)
     for c in street.crossings:
-        _park_crossing(street, c, scene, rng)
-        _corner_posts(street, c, scene, rng)
+        _park_on_side_street(street, c, scene, rng)
+        _put_corner_posts(street, c, scene, rng)
     if street.plaza is not None:
         square(street, street.plaza, scene, rng)
 
 
 def _park_along(street: Street, lots: list[Lot], side: int, scene: Scene, rng: Rng) -> None:
+    """Park vehicles along one side of the street."""
     how = street.parking[side]
     if how == "none":
         return
@@ -66,7 +67,8 @@ def _park_along(street: Street, lots: list[Lot], side: int, scene: Scene, rng: R
             s += length / 2 + rng.uniform(0.6, 1.6)
 
 
-def _park_crossing(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> None:
+def _park_on_side_street(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> None:
+    """Park vehicles along a side street."""
     kinds = vehicles()
     if c.half < 2.9 and rng.random() < 0.5:
         return
@@ -89,7 +91,8 @@ def _park_crossing(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> Non
             t += rng.uniform(6.0, 7.5)
 
 
-def _trees(street: Street, side: int, scene: Scene, rng: Rng) -> None:
+def _put_trees(street: Street, side: int, scene: Scene, rng: Rng) -> None:
+    """Put trees, weeds and bushes onto the verge of one side."""
     sign = 2 * side - 1
     verge = street.band(side, "grass")
     bay = street.band(side, "parking")
@@ -118,7 +121,8 @@ def _trees(street: Street, side: int, scene: Scene, rng: Rng) -> None:
                     scene.put(furniture.random_plant("bush", rng, 0.6), s, sign * (verge[0] + verge[1]) / 2, solid=0.5)
 
 
-def _lamps(street: Street, side: int, scene: Scene, rng: Rng) -> None:
+def _put_lamps(street: Street, side: int, scene: Scene, rng: Rng) -> None:
+    """Put street lamps along one side, and masts onto the median."""
     if street.kind == "edge" and rng.random() < 0.6:
         return
     sign = 2 * side - 1
@@ -140,7 +144,8 @@ def _lamps(street: Street, side: int, scene: Scene, rng: Rng) -> None:
             scene.put(furniture.mast(7.5, 0.11, False), s, 0.0)
 
 
-def _signs(street: Street, side: int, scene: Scene, rng: Rng) -> None:
+def _put_signs(street: Street, side: int, scene: Scene, rng: Rng) -> None:
+    """Put road signs along one side."""
     sign = 2 * side - 1
     at = street.edge[side] + 0.45 + (2.1 if street.parking[side] in ("bay", "kerb") else 0.0)
     facing = np.pi if side == RIGHT else 0.0
@@ -150,7 +155,7 @@ def _signs(street: Street, side: int, scene: Scene, rng: Rng) -> None:
             scene.put(road_sign(kind, rng.uniform(1.9, 2.4)), s, sign * at, facing + rng.normal(0, 0.15), solid=0.3)
 
 
-def _corner_posts(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> None:
+def _put_corner_posts(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> None:
     """Put traffic lights at large junctions, and street-name and right-of-way signs at other ones."""
     for side in c.sides:
         sign = 2 * side - 1
@@ -171,7 +176,7 @@ def _corner_posts(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> None
                     scene.put(furniture.bollard(), s + direction * 1.5 * k, t, solid=0.2)
 
 
-def _small_things(street: Street, side: int, scene: Scene, rng: Rng) -> None:
+def _put_street_furniture(street: Street, side: int, scene: Scene, rng: Rng) -> None:
     """Put bins, cabinets, bicycles, motorcycles, bus stops and advertising columns along the front of the lots."""
     sign, front = 2 * side - 1, street.front(side)
     if street.kind == "edge":

@@ -74,6 +74,7 @@ _SIZES = {"house": (8.5, 13.5), "row": (6.0, 8.5), "block": (15.0, 26.0), "shop"
 
 
 def _style(street: Street, side: int, rng: Rng) -> str:
+    """The sampled style of a building: house, row, block, shop or hall."""
     if street.kind == "residential":
         return str(rng.choice(["house", "row", "block"], p=[0.74, 0.14, 0.12]))
     if street.kind == "edge":
@@ -105,6 +106,7 @@ def sample_lots(street: Street, rng: Rng) -> list[Lot]:
 def _sample_lot(
     street: Street, side: int, s: float, high: float, front: float, setback: float, boundary: str, rng: Rng
 ) -> Lot:
+    """A sampled lot that starts at s and ends at ``high`` at the latest."""
     style = _style(street, side, rng)
     low, top = _SIZES[style]
     if rng.random() < (0.72 if street.kind == "edge" else 0.07) or high - s < low + 2:

@@ -66,6 +66,7 @@ def pave(street: Street, rng: np.random.Generator) -> Paint:
 
 
 def _pavements(street: Street, c: SideStreet, paint: Paint) -> None:
+    """Paint the pavements and kerbs of a side street."""
     if not c.pavement:
         return
     for side in c.sides:
@@ -105,6 +106,7 @@ def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> N
 
 
 def _markings(street: Street, paint: Paint) -> None:
+    """Paint the lane markings of the street."""
     full_length = paint.reach[:2]
     dashes = {
         round((a.t + b.t) / 2, 3)

@@ -29,6 +29,7 @@ _BODY = (
 
 
 def _torso(hip: tuple[float, float, float], neck: tuple[float, float, float], top: int, head: int) -> Mesh:
+    """The torso and the head of a person, between the hip and the neck."""
     h, n = np.array(hip), np.array(neck)
     chest = h + 0.62 * (n - h)
     skull = n + (n - h) / np.linalg.norm(n - h) * 0.16 + (0.02, 0, 0)
@@ -126,6 +127,7 @@ def motorcyclist() -> Prototype:
 
 
 def _mounted(person: Mesh, machine: Mesh, name: str, raw: tuple[int, int]) -> Prototype:
+    """The prototype of a rider together with the bicycle or motorcycle."""
     below = Mesh(machine.triangles, machine.slot + len(_BODY))
     frame = (Finish("paint", (0.2, 0.22, 0.26)), *bodywork.FINISHES[1:])
     return Prototype(merge([person, below]), (*_BODY, *frame), name, raw)

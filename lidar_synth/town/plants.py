@@ -31,6 +31,7 @@ SPECIES: dict[str, tuple[Finish, ...]] = {
 
 
 def _rng(name: str, variant: int) -> np.random.Generator:
+    """The random generator of a prototype; keyed by its species and variant, so that plants never change."""
     return np.random.Generator(np.random.Philox(key=(sorted(SPECIES).index(name), variant)))
 
 
@@ -43,6 +44,7 @@ def _stem(height: float, radius: float, rng: np.random.Generator) -> tuple[Mesh,
 
 
 def _branches(foot: NDArray[np.float64], ends: NDArray[np.float64], radius: float) -> Mesh:
+    """Branches from ``foot`` (3,) to each of ``ends`` (K, 3)."""
     return merge(
         tube([foot, 0.5 * (foot + e) + (0, 0, 0.1), e], [radius, 0.6 * radius, 0.02], 4, TWIG, caps=False) for e in ends
     )
@@ -66,6 +68,7 @@ def _ellipsoid_points(
 
 
 def _broadleaf(rng: np.random.Generator, height: float, clear: float, width: float, size: float, droop: float) -> Mesh:
+    """A broadleaf tree; sizes in metres, ``clear`` is the height of the trunk below the crown."""
     trunk, path = _stem(clear, rng.uniform(0.13, 0.24), rng)
     middle, up = (height + clear) / 2, (height - clear) / 2 + 0.3
     crown = _ellipsoid_points(46, (0.44 * width, 0.44 * width, 0.9 * up), middle, rng)
@@ -77,6 +80,7 @@ def _broadleaf(rng: np.random.Generator, height: float, clear: float, width: flo
 
 
 def _conifer(rng: np.random.Generator, height: float, clear: float, width: float) -> Mesh:
+    """A conifer; sizes in metres, ``clear`` is the height at which its leaves begin."""
     trunk, _ = _stem(0.8 * height, 0.02 + 0.012 * height, rng)
     level = 1 - rng.uniform(0, 1, 420) ** 0.6
     reach = width / 2 * (1 - level) * np.sqrt(rng.uniform(0.25, 1, 420)) + 0.06
@@ -100,6 +104,7 @@ def _inner_cone(height: float, clear: float, width: float) -> Mesh:
 
 
 def _bush(rng: np.random.Generator, height: float, width: float) -> Mesh:
+    """A bush; sizes in metres."""
     crown = _ellipsoid_points(14, (0.42 * width, 0.42 * width, 0.42 * height), 0.52 * height, rng)
     twigs = _branches(np.zeros(3), crown[:3], 0.025)
     return merge([twigs, _leaf_clusters(crown, 0.18, 12, 0.16, rng), _leaf_clusters(crown * 0.5, 0.12, 3, 0.3, rng)])

@@ -11,6 +11,7 @@ Floats = NDArray[np.float32]
 
 
 def _embree() -> tuple[Any, Any]:
+    """Embree's scene and triangle mesh classes."""
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene

@@ -109,6 +109,7 @@ class Street:
 
 
 def _ends(kind: str, length: float, rng: np.random.Generator) -> tuple[float, float]:
+    """Sampled ends of the street; infinite where it continues."""
     share = {"edge": 0.1, "main": 0.3}.get(kind, 0.6)
     back = -rng.uniform(30, 85) if rng.random() < share else -np.inf
     return back, length + rng.uniform(30, 85) if rng.random() < share else np.inf
@@ -132,6 +133,7 @@ def _crossings(kind: str, length: float, ends: tuple[float, float], rng: np.rand
 
 
 def _residential(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
+    """Sampled bands, kerbs, parking and lanes of a residential street."""
     parking = [str(rng.choice(["none", "street", "bay", "kerb"], p=[0.34, 0.30, 0.18, 0.18])) for _ in range(2)]
     lane = rng.uniform(2.5, 3.0)
     edge = [lane + (2.0 if p == "street" else 0.0) for p in parking]
@@ -145,6 +147,7 @@ def _residential(rng: np.random.Generator) -> tuple[list[list[Band]], list[float
 
 
 def _main(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane], float]:
+    """Sampled bands, kerbs, parking, lanes and median of a main road."""
     each = int(rng.choice([1, 2], p=[0.6, 0.4]))
     width = rng.uniform(3.1, 3.6)
     median = float(rng.choice([0.0, rng.uniform(1.0, 3.6)], p=[0.6, 0.4]))
@@ -166,6 +169,7 @@ def _main(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list
 
 
 def _edge(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
+    """Sampled bands, kerbs, parking and lanes of a road at the edge of town."""
     width = rng.uniform(2.9, 3.6)
     bands = []
     for _ in range(2):

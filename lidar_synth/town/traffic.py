@@ -26,10 +26,10 @@ _DRIVEN = {
 }  # fmt: skip
 
 
-Track = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 
-def _track(shape: Prototype, along: bool, at: float, start: float, velocity: float, times: Track, gap: float) -> Track:
+def _track(shape: Prototype, along: bool, at: float, start: float, velocity: float, times: Array, gap: float) -> Array:
     """(T, 4) bounds (lowest s, highest s, lowest t, highest t) of a moving shape at each time, metres."""
     low, high = shape.mesh.bounds
     half = (np.abs([low[:2], high[:2]]).max(0) + gap)[:: 1 if along else -1]
@@ -38,7 +38,7 @@ def _track(shape: Prototype, along: bool, at: float, start: float, velocity: flo
     return np.stack([s - half[0], s + half[0], t - half[1], t + half[1]], 1)
 
 
-def _ego_track(street: Street, times: Track) -> Track:
+def _ego_track(street: Street, times: Array) -> Array:
     """The track of the ego vehicle, 4.7 m long and 1.8 m wide, with a margin of 1.2 m."""
     s, t, yaw = np.array([ego_place(street, time) for time in times]).T
     along, across = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
@@ -55,7 +55,7 @@ class Traffic:
         rng: samples them.
     """
 
-    def __init__(self, street: Street, scene: Scene, times: Track, rng: Rng) -> None:
+    def __init__(self, street: Street, scene: Scene, times: Array, rng: Rng) -> None:
         self._street, self._scene, self._times, self._rng = street, scene, times, rng
         self._tracks = [_ego_track(street, times)]
         self.movers: list[Mover] = []
@@ -80,7 +80,8 @@ class Traffic:
     ) -> None:
         """Add a mover unless it would collide with another one or, if ``solid``, with a static obstacle.
 
-        ``gap`` is the margin around it in metres; the other arguments are those of ``Mover``.
+        ``colour`` is that of its paint or clothes, and ``gap`` the margin around it in metres; the other arguments are
+        those of ``Mover``.
         """
         track = _track(shapes[0], along, at, start, direction * speed, self._times, gap)
         low, high = self._street.ends
@@ -95,6 +96,7 @@ class Traffic:
         self.movers.append(Mover(shapes, stride, along, at, start, direction, speed, instance, surfaces, scale))
 
     def _sample_mover(self) -> tuple[tuple[Prototype, ...], RGB]:
+        """A sampled vehicle or motorcyclist: its prototypes and its colour."""
         rng = self._rng
         if rng.random() < 0.04:
             return (motorcyclist(),), CLOTHES[rng.integers(len(CLOTHES))]
@@ -204,7 +206,7 @@ class Traffic:
                 )
 
 
-def _overlap(a: Track, b: Track) -> bool:
+def _overlap(a: Array, b: Array) -> bool:
     """Whether two tracks (..., 4) overlap at any time."""
     return bool(
         ((a[..., 0] < b[..., 1]) & (a[..., 1] > b[..., 0]) & (a[..., 2] < b[..., 3]) & (a[..., 3] > b[..., 2])).any()

@@ -73,6 +73,7 @@ VANS = ("minivan", "van", "panel_van")
 
 
 def _stations(s: _Shape) -> list[Station]:
+    """The cross-sections of a car or van, front to rear."""
     nose = 0.66 * s.belt + 0.08
     bend = s.belt - 0.05
     stations = [
@@ -99,6 +100,7 @@ def _stations(s: _Shape) -> list[Station]:
 
 
 def _seats(s: _Shape) -> Mesh:
+    """Seats and floor, which rays through the windows hit."""
     rows = [0.5 * s.length - s.length * f for f in (s.screen + 0.10, min(s.screen + 0.33, s.roof_end - 0.1))]
     low = [(x - 0.12, -0.40 * s.width, 0.4) for x in rows] + [(-0.38 * s.length, -0.42 * s.width, 0.30)]
     high = [(x + 0.10, 0.40 * s.width, s.belt + 0.15) for x in rows] + [(0.22 * s.length, 0.42 * s.width, 0.45)]

@@ -53,6 +53,7 @@ def _put_facing_street(scene: Scene, item: StaticObject, lot: Lot, s: float, fro
 
 
 def _furnish_driveway(scene: Scene, lot: Lot, house: float, rng: Rng) -> None:
+    """Put a garage, a parked vehicle and a bin onto the driveway, each at random."""
     assert lot.driveway is not None
     middle = sum(lot.driveway) / 2
     if rng.random() < 0.6:

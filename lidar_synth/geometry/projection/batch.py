@@ -1,4 +1,4 @@
-"""The same projection for batches of torch tensors on any device, cell for cell and bit for bit."""
+"""Projection and unprojection of batches of torch tensors on any device, bit-identical to those on the CPU."""
 
 from typing import NamedTuple
 
