@@ -1,6 +1,6 @@
-"""The errors of the package: one base, and a message that helps.
+"""The exceptions of the package.
 
-Every error says what was given, what was expected and what to type, in that order::
+Every message states what was given, what was expected and what to type, in that order::
 
     raise DataError("scan.bin is 1001 bytes long",
                     "a multiple of 16: float32 x, y, z, reflectance for each point",
@@ -9,12 +9,12 @@ Every error says what was given, what was expected and what to type, in that ord
 
 
 class LidarSynthError(Exception):
-    """Base class of every error that the package raises on purpose.
+    """Base class of the exceptions that the package raises on purpose.
 
     Args:
-        given: what was found, with the path, shape or value.
-        expected: what would have been right.
-        hint: what the reader of the message can type or change.
+        given: the input that caused the error, with its path, shape or value.
+        expected: what a valid input is.
+        hint: what the user can type or change.
 
     Example:
         >>> from lidar_synth import LidarSynthError, open_scans
@@ -26,30 +26,30 @@ class LidarSynthError(Exception):
     """
 
     def __init__(self, given: str, expected: str = "", hint: str = "") -> None:
-        # One string in args, so that the error survives pickling between worker processes.
+        # A single string in args, so that the exception can be pickled between worker processes.
         super().__init__(given + (f"; expected {expected}" if expected else "") + (f". {hint}" if hint else ""))
 
 
 def shorten(text: str, most: int) -> str:
-    """A text for a message: at most so many characters of it."""
+    """The first ``most`` characters of a text, with "..." if it is longer."""
     return text if len(text) <= most else f"{text[:most]} ..."
 
 
 class DataError(LidarSynthError, ValueError):
-    """A file, array or scan whose content is not what it has to be."""
+    """A file, array or scan with invalid content."""
 
 
 class ConfigError(LidarSynthError, ValueError):
-    """An option, argument or configuration key that cannot be served."""
+    """An invalid option, argument or configuration key."""
 
 
 class FileError(LidarSynthError, OSError):
-    """A path that is missing, unreadable, unwritable or on a full disk."""
+    """A path that is missing or cannot be read or written, or a full disk."""
 
 
 class LibraryError(LidarSynthError, OSError):
-    """An optional library, or a system library behind it, that is not installed."""
+    """An optional library, or a system library that it needs, is not installed."""
 
 
 class ProcessError(LidarSynthError, OSError):
-    """A process of the package that died, or that does not answer in time."""
+    """A process of the package that died or did not answer in time."""

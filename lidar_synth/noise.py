@@ -1,15 +1,14 @@
 """Random numbers that are a function of (seed, index) alone.
 
-The design's contract: the noise of scan ``index`` under ``seed`` is the same on every device, in every
-batch and in every order, so that a teacher and its student, or two checkpoints, can be compared from the
-same noise, and a bake can be resumed or spread over machines. A counter-based generator gives it:
-Philox4x32 with ten rounds (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011), whose
-output depends on nothing but its 64-bit key (the seed) and its 128-bit counter::
+The noise of scan ``index`` under ``seed`` is the same on every device, in every batch and in every order. So a teacher
+and its student, or two checkpoints, can be compared from the same noise, and a bake can be resumed or distributed over
+machines. The generator is counter-based: Philox4x32 with ten rounds (Salmon et al., "Parallel random numbers: as easy
+as 1, 2, 3", SC 2011), whose output depends only on its 64-bit key (the seed) and its 128-bit counter::
 
     counter = (block, index mod 2^32, index div 2^32, stream)
 
-A block is four 32-bit words; element ``e`` of a scan (row-major) comes from word ``e mod 4`` of block
-``e div 4``, so that a smaller shape is a prefix of a larger one. Streams keep numbers of different use apart.
+A block is four 32-bit words. Element ``e`` of a scan (row-major) comes from word ``e mod 4`` of block ``e div 4``, so
+that a smaller shape is a prefix of a larger one. Each kind of random number has its own stream.
 """
 
 import math
@@ -44,8 +43,8 @@ def gaussian(
     Args:
         seed: 0 <= seed < 2^64.
         indices: B numbers, 0 <= index < 2^63, in any order.
-        shape: of one sample, such as (C, H, W).
-        device: where the noise is made.
+        shape: shape of one sample, such as (C, H, W).
+        device: the device of the result.
         dtype: floating type of the result.
 
     Returns:
@@ -78,51 +77,51 @@ def uniform(
 ) -> Tensor:
     """Uniform float32 numbers in the open interval (0, 1), one sample per index.
 
-    Odd multiples of 2^-24, exact in float32, so that every device gives the same bits. Independent of
-    ``gaussian`` of the same seed and index.
+    The values are odd multiples of 2^-24, exact in float32, so that every device gives the same bits. They are
+    independent of ``gaussian`` with the same seed and index.
 
     Args:
         seed: 0 <= seed < 2^64.
         indices: B numbers, 0 <= index < 2^63, in any order.
-        shape: of one sample; () gives one number per index.
-        device: where they are made.
+        shape: shape of one sample; () gives one number per index.
+        device: the device of the result.
 
     Returns:
-        (B, *shape) numbers.
+        (B, *shape) numbers; sample b depends on ``seed`` and ``indices[b]`` only.
 
     Raises:
         ConfigError: on a seed, an index or a shape out of range.
     """
     words, count = _words(seed, indices, shape, device, _UNIFORM)
-    # 23 bits: the half after a 24th would round to 1.
+    # Only 23 bits are used: with 24, the added half would round the largest value to 1.
     return _samples(((words >> 9).float() + 0.5) * 2.0**-23, shape, count, device)
 
 
 def keyed_rng(*key: int) -> np.random.Generator:
-    """A numpy generator that is a function of its key, such as (seed, epoch, position), and of nothing else.
+    """A numpy generator whose numbers depend only on its key, such as (seed, epoch, position).
 
     Args:
-        key: integers, 0 <= k < 2^64. Keys that differ, also in length, give independent numbers.
+        key: integers, 0 <= k < 2^64. Different keys, also of different length, give independent numbers.
 
     Raises:
         ConfigError: on an integer out of range.
     """
     if any(not 0 <= k < 2**64 for k in key):
-        raise ConfigError(f"the key {key} of a generator", "integers, 0 <= k < 2^64")
-    # Two words for each, and their number first: numpy's seed sequence takes (1,) and (1, 0) for the same.
+        raise ConfigError(f"the key {key} of a random generator", "integers, 0 <= k < 2^64")
+    # Two words per integer, and the number of integers first: numpy's SeedSequence treats (1,) and (1, 0) as equal.
     return np.random.default_rng([len(key), *(word for k in key for word in (k & _WORD, k >> 32))])
 
 
 def key_words(seed: int, index: int, count: int) -> NDArray[np.uint64]:
-    """Keys for functions that are keyed themselves, such as permutations.
+    """Random 64-bit keys, for keyed functions such as permutations.
 
     Args:
         seed: 0 <= seed < 2^64.
         index: 0 <= index < 2^63.
-        count: how many.
+        count: number of keys.
 
     Returns:
-        (count,) random words of 64 bits, independent of ``gaussian`` and ``uniform`` of the same seed and index.
+        (count,) uint64, independent of ``gaussian`` and ``uniform`` with the same seed and index.
 
     Raises:
         ConfigError: on a seed, an index or a count out of range.
@@ -134,10 +133,10 @@ def key_words(seed: int, index: int, count: int) -> NDArray[np.uint64]:
 
 
 def philox(counter: Tensor, seed: int) -> Tensor:
-    """Philox4x32-10.
+    """The counter-based generator Philox4x32-10.
 
     Args:
-        counter: (4, ...) int64, words 0 .. 2^32 - 1, the first one lowest.
+        counter: (4, ...) int64, words 0 .. 2^32 - 1, the least significant one first.
         seed: the key, 0 <= seed < 2^64.
 
     Returns:
@@ -146,8 +145,8 @@ def philox(counter: Tensor, seed: int) -> Tensor:
     c0, c1, c2, c3 = counter.unbind()
     key0, key1 = seed & _WORD, seed >> 32
     for _ in range(_ROUNDS):
-        # A product of two words fills 64 bits: signed overflow wraps, and what it leaves above bit 31 of
-        # the upper half is cut off. Lower halves meet only xor before the next cut.
+        # The product of two 32-bit words needs 64 bits. Signed overflow wraps around and the shift extends the sign,
+        # so the upper half is masked to 32 bits. The lower half is masked one round later: only xor is applied before.
         product0, product1 = c0 * _MULTIPLIERS[0], c2 * _MULTIPLIERS[1]
         c0, c1 = (product1 >> 32).bitwise_xor_(c1).bitwise_xor_(key0).bitwise_and_(_WORD), product1
         c2, c3 = (product0 >> 32).bitwise_xor_(c3).bitwise_xor_(key1).bitwise_and_(_WORD), product0
@@ -158,7 +157,7 @@ def philox(counter: Tensor, seed: int) -> Tensor:
 def _words(
     seed: int, indices: Sequence[int], shape: Sequence[int], device: torch.device | str, stream: int
 ) -> tuple[Tensor, int]:
-    """(4, B, blocks) random words and the number of elements of a sample."""
+    """(4, B, blocks) random 32-bit words, and the number of elements of one sample."""
     count = math.prod(shape)
     if not 0 <= seed < 2**64:
         raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
@@ -166,7 +165,7 @@ def _words(
         raise ConfigError(f"index {next(i for i in indices if not 0 <= i < 2**63)}", "0 <= index < 2^63")
     if min(shape, default=1) < 1 or count >= 2**34:
         raise ConfigError(f"noise of shape {tuple(shape)}", "positive sizes, less than 2^34 elements in all")
-    # Float64 is at hand on CPU and CUDA; for another device the noise is made on the CPU and moved.
+    # CPU and CUDA have float64; for other devices the noise is computed on the CPU and copied.
     place = torch.device(device) if torch.device(device).type == "cuda" else torch.device("cpu")
     blocks = torch.arange(-(-count // 4), device=place)
     index = torch.tensor(list(indices), dtype=torch.int64, device=place)[:, None]
@@ -175,5 +174,5 @@ def _words(
 
 
 def _samples(lanes: Tensor, shape: Sequence[int], count: int, device: torch.device | str) -> Tensor:
-    """(B, *shape) on ``device`` from (4, B, blocks)."""
+    """Reshape words (4, B, blocks) to samples (B, *shape) on ``device``."""
     return lanes.movedim(0, -1).flatten(1)[:, :count].reshape(-1, *shape).to(device)

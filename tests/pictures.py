@@ -1,4 +1,4 @@
-"""What several tests of this part share."""
+"""A small sensor and functions that read pages, for the tests of visualisation."""
 
 import base64
 import io
@@ -19,9 +19,9 @@ CAR, ROAD = TRAIN_ID["car"], TRAIN_ID["road"]
 
 
 def page_data(page: str) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
-    assert found
-    data: dict[str, Any] = json.loads(found[1])
+    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
+    assert match
+    data: dict[str, Any] = json.loads(match[1])
     return data
 
 

@@ -1,4 +1,4 @@
-"""Small real and synthetic datasets on disk for the tests of trainers: casts of a street in every layout they read."""
+"""Small "real" and synthetic datasets on disk for the tests of trainers, in every layout that the trainers read."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,20 +30,20 @@ def street(seed: int, boxes: bool = True) -> Scan:
 
 
 def kitti(root: Path, count: int, boxes: bool = True) -> Path:
-    """Real scans in KITTI's object layout."""
+    """Write scans in KITTI's object layout, which count as real."""
     write_all("kitti_object", root, [street(i, boxes) for i in range(count)], calibration=CAMERA)
     write_planes(root)
     return root
 
 
 def semantic_kitti(root: Path, count: int) -> Path:
-    """Real scans in SemanticKITTI's layout, sequence 00."""
+    """Write scans in SemanticKITTI's layout, sequence 00, which count as real."""
     write_all("semantic_kitti", root, [street(i) for i in range(count)])
     return root
 
 
 def synthetic(root: Path, count: int, boxes: bool = True, labels: bool = True) -> Path:
-    """A folder of synthetic scans with labels and boxes."""
+    """Write a folder of synthetic scans with labels and boxes."""
     scans = [street(1000 + i, boxes) for i in range(count)]
     scans = [s if labels else replace(s, label=None, raw_label=None, instance=None) for s in scans]
     write_all("npz", root, [replace(s, domain=1) for s in scans])
@@ -51,7 +51,7 @@ def synthetic(root: Path, count: int, boxes: bool = True, labels: bool = True) -
 
 
 def held(boxes: Boxes, points: np.ndarray) -> np.ndarray:
-    """(M,) points that each box holds, two centimetres beyond its faces, where all of a cast car's returns lie; without
-    the road's."""
+    """(M,) number of points in each box, enlarged by 2 cm on each side to contain all returns of a car; without the
+    road."""
     wide = boxes.values + np.array([0, 0, 0, 0.04, 0.04, 0.04, 0], np.float32)
     return Boxes(wide, boxes.names).contain(points, 0.1).sum(1)

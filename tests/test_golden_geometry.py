@@ -1,4 +1,4 @@
-"""Geometry against numbers from running the peers' code, their rules chosen where they differ from ours."""
+"""Geometry compared with outputs of the code of R2Flow and LiDM, with their conventions where they differ from ours."""
 
 from pathlib import Path
 
@@ -19,18 +19,18 @@ POINTS = np.load(HERE / "r2flow_projection_synthetic.npz")
 
 
 def hdl64(columns: int, low: float = 0.0, high: float = 1e6, rows: int = 64) -> Sensor:
-    """The peers' grid; R2Flow's images are stored before its range mask."""
+    """The grid of R2Flow and LiDM; the golden images of R2Flow are stored before its range mask."""
     return Sensor("peer", columns, low, high, rows=rows, fov_up=3.0, fov_down=-25.0)
 
 
 def lidm(columns: int, rows: int = 64) -> Sensor:
-    """LiDM's limits 1 and 56 m are exclusive, ours inclusive."""
+    """LiDM's grid; its range limits of 1 and 56 m are exclusive, ours are inclusive."""
     return hdl64(columns, float(np.nextafter(np.float32(1), 2)), float(np.nextafter(np.float32(56), 0)), rows)
 
 
 @pytest.mark.parametrize("key", sorted(k for k in POINTS if "spherical" in k or k.startswith("synthetic/unfolding")))
 def test_r2flow_projection_of_random_points(key: str) -> None:
-    """All but the unfolding of more rings than rows, an oddity of the peer that is not copied."""
+    """All except the unfolding of more rings than rows, where R2Flow's behaviour is not copied."""
     name, _, kind = key.partition("/")
     columns = int(kind.split("x")[1])
     points = POINTS[f"{name}/points"]
@@ -51,7 +51,7 @@ def test_lidm_projection_of_random_points(columns: int) -> None:
 
 @pytest.mark.parametrize("columns", [1024, 2048])
 def test_r2flow_ray_angles(columns: int) -> None:
-    """R2Flow's azimuth grows counter-clockwise, ours clockwise."""
+    """R2Flow's azimuth increases counter-clockwise, ours clockwise."""
     elevation, azimuth = hdl64(columns).ray_angles("corner")
     rows, cols = (R2FLOW[f"angles_64x{columns}/{k}"].numpy() for k in ("rows", "cols"))
     expected = R2FLOW[f"angles_64x{columns}/values"].numpy()
@@ -104,7 +104,7 @@ def test_lidm_projection_of_a_real_scan(golden: Path, kitti_scan: Scan) -> None:
 
 @pytest.mark.parametrize(("name", "offset"), [("log", 1e-4), ("linear", 0.0)])
 def test_lidm_scales_and_points(golden: Path, kitti_scan: Scan, name: str, offset: float) -> None:
-    """LiDM adds 0.1 mm before the logarithm and does not take it off again; its points come from corners."""
+    """LiDM adds 0.1 mm before the logarithm and does not subtract it again; its rays point to cell corners."""
     expected = np.load(golden / "lidm_projection.npz")
     scale: Normalisation = NORMALISATIONS[f"lidm_{name}"]
     image = project(kitti_scan, lidm(1024))
@@ -118,7 +118,7 @@ def test_lidm_scales_and_points(golden: Path, kitti_scan: Scan, name: str, offse
     assert np.array_equal(decoded.mask, np.asarray(expected[f"{name}/mask"]).reshape(64, 1024) > 0)
 
 
-def test_someone_elses_projection_of_a_semantic_kitti_scan(real_scans: Path) -> None:
+def test_a_third_party_projection_of_a_semantic_kitti_scan(real_scans: Path) -> None:
     theirs = np.load(real_scans / "semantic_kitti/range_images_64x1024/00_000000.npz")["image"]
     points = read_points(real_scans / "semantic_kitti/sequences/00/velodyne/000000.bin")
     image = project(Scan(points[:, :3], points[:, 3], hdl64(1024)))

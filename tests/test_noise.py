@@ -1,4 +1,4 @@
-"""Noise by contract: a function of (seed, index) alone."""
+"""Random numbers are a function of (seed, index) alone."""
 
 import math
 
@@ -14,7 +14,7 @@ from lidar_synth.noise import gaussian, keyed_rng, philox, uniform
 
 WORD = st.integers(0, 2**32 - 1)
 
-KNOWN = [  # kat_vectors of Random123: counter, key, output of philox4x32-10; lowest word first
+KNOWN = [  # kat_vectors of Random123: counter, key and output of philox4x32-10; lowest word first
     ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
     (
         (0xFFFFFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0xFFFFFFFF),
@@ -30,7 +30,7 @@ KNOWN = [  # kat_vectors of Random123: counter, key, output of philox4x32-10; lo
 
 
 def philox_by_integers(counter: tuple[int, ...], seed: int) -> list[int]:
-    """The published algorithm in Python's integers, which do not overflow."""
+    """The published algorithm with Python integers, which do not overflow."""
     c, k = list(counter), [seed % 2**32, seed >> 32]
     for _ in range(10):
         high0, low0 = divmod(0xD2511F53 * c[0], 2**32)
@@ -41,18 +41,20 @@ def philox_by_integers(counter: tuple[int, ...], seed: int) -> list[int]:
 
 
 @pytest.mark.parametrize(("counter", "key", "output"), KNOWN)
-def test_known_answers(counter: tuple[int, ...], key: tuple[int, int], output: tuple[int, ...]) -> None:
+def test_philox_gives_the_published_test_vectors(
+    counter: tuple[int, ...], key: tuple[int, int], output: tuple[int, ...]
+) -> None:
     seed = key[0] | key[1] << 32
     assert philox(torch.tensor(counter), seed).tolist() == list(output)
     assert philox_by_integers(counter, seed) == list(output)
 
 
 @given(counter=st.tuples(WORD, WORD, WORD, WORD), seed=st.integers(0, 2**64 - 1))
-def test_tensors_do_what_integers_do(counter: tuple[int, ...], seed: int) -> None:
+def test_philox_on_tensors_equals_philox_on_integers(counter: tuple[int, ...], seed: int) -> None:
     assert philox(torch.tensor(counter), seed).tolist() == philox_by_integers(counter, seed)
 
 
-def test_layout_of_the_counter() -> None:
+def test_numbers_follow_the_documented_counter_layout() -> None:
     seed, index = 2**63 + 5, 2**40 + 7
     words = [philox_by_integers((block, index % 2**32, index >> 32, 0), seed) for block in range(3)]
     expected = []
@@ -65,8 +67,8 @@ def test_layout_of_the_counter() -> None:
     assert uniform(seed, [index]).item() == ((words[0] >> 9) + 0.5) / 2**23
 
 
-def test_the_numbers_that_banks_rest_on() -> None:
-    """Changing these makes every scan of every seed another one: a new version of the contract."""
+def test_gaussian_numbers_never_change() -> None:
+    """If these numbers change, every scan of every seed changes."""
     expected = [[0.991137683391571, -0.9246625900268555], [1.1363673210144043, -0.6758829951286316]]
     assert torch.allclose(gaussian(0, [0, 1], (2,)), torch.tensor(expected), atol=1e-7)
 
@@ -76,7 +78,7 @@ def test_the_numbers_that_banks_rest_on() -> None:
     indices=st.lists(st.integers(0, 2**63 - 1), min_size=1, max_size=5),
     size=st.integers(1, 40),
 )
-def test_a_sample_knows_neither_its_batch_nor_its_size(seed: int, indices: list[int], size: int) -> None:
+def test_a_sample_depends_on_neither_its_batch_nor_its_shape(seed: int, indices: list[int], size: int) -> None:
     for draw in (gaussian, uniform):
         together = draw(seed, indices, (size,))
         for row, index in zip(together, indices, strict=True):
@@ -84,20 +86,20 @@ def test_a_sample_knows_neither_its_batch_nor_its_size(seed: int, indices: list[
             assert torch.equal(row, draw(seed, [index], (2, size))[0, 0])
 
 
-def test_every_part_of_seed_and_index_counts() -> None:
+def test_all_bits_of_seed_and_index_matter() -> None:
     draws = [gaussian(s, [i], (8,)) for s in (0, 1, 2**32, 2**63) for i in (0, 1, 2**31, 2**32, 2**62)]
     assert len({tuple(d.flatten().tolist()) for d in draws}) == 20
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_devices_agree() -> None:
+def test_cpu_and_cuda_agree() -> None:
     for draw in (gaussian, uniform):
         cpu, cuda = draw(9, [3, 2**40], (2, 64, 1024)), draw(9, [3, 2**40], (2, 64, 1024), "cuda")
         assert cuda.device.type == "cuda"
         assert (cpu - cuda.cpu()).abs().max() <= 1e-6
 
 
-def test_normal_and_independent() -> None:
+def test_gaussian_numbers_are_normal_and_independent() -> None:
     x = gaussian(11, range(100), (2, 16, 64)).double().numpy().reshape(100, -1)
     assert stats.kstest(x.ravel(), "norm").pvalue > 0.001
     assert abs(x.mean()) < 4 / math.sqrt(x.size)
@@ -115,14 +117,14 @@ def test_normal_and_independent() -> None:
             assert abs(r) < 4 / math.sqrt(a.size), (name, power)
 
 
-def test_uniform_and_open() -> None:
+def test_uniform_numbers_are_uniform_in_the_open_interval() -> None:
     u = uniform(5, range(20000))
     assert stats.kstest(u.numpy(), "uniform").pvalue > 0.001
     ends = torch.tensor([0, 2**32 - 1]) >> 9
     assert ((ends.float() + 0.5) * 2.0**-23).tolist() == [2.0**-24, 1 - 2.0**-24]
 
 
-def test_dtypes() -> None:
+def test_dtypes_are_rounded_from_float64() -> None:
     exact = gaussian(1, range(3), (7,), dtype=torch.float64)
     for dtype in (torch.float32, torch.bfloat16, torch.float16):
         assert torch.equal(gaussian(1, range(3), (7,), dtype=dtype), exact.to(dtype))
@@ -139,13 +141,15 @@ def test_dtypes() -> None:
         (0, [0], (2, 0), r"noise of shape \(2, 0\); expected positive sizes"),
     ],
 )
-def test_out_of_range(seed: int, indices: list[int], shape: tuple[int, ...], message: str) -> None:
+def test_arguments_out_of_range_are_refused(
+    seed: int, indices: list[int], shape: tuple[int, ...], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         gaussian(seed, indices, shape)
 
 
 @given(st.lists(st.integers(0, 2**64 - 1), max_size=4), st.lists(st.integers(0, 2**64 - 1), max_size=4))
-def test_numpy_generators_are_functions_of_their_key(a: list[int], b: list[int]) -> None:
+def test_keyed_generators_depend_only_on_their_key(a: list[int], b: list[int]) -> None:
     def first(key: list[int]) -> int:
         return int(keyed_rng(*key).integers(2**63))
 
@@ -154,7 +158,7 @@ def test_numpy_generators_are_functions_of_their_key(a: list[int], b: list[int])
     assert len({first([*a, *zeros]) for zeros in ([], [0], [0, 0])}) == 3
 
 
-def test_keys_of_large_numbers_do_not_run_together() -> None:
+def test_keys_with_large_integers_do_not_collide() -> None:
     assert keyed_rng(0, 1 + (5 << 32)).random() != keyed_rng(1 << 32, 5).random()
 
 

@@ -1,4 +1,4 @@
-"""Ranges, reflectance and labels to tensors and back."""
+"""Encoding and decoding of ranges, reflectance and labels."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -37,21 +37,21 @@ def test_decode_inverts_encode_inside_the_limits_and_drops_the_rest(name: str, d
     assert Normalisation(**scale.to_dict()) == scale
 
 
-def test_no_return_is_minus_one_and_the_farthest_return_one() -> None:
+def test_no_return_is_encoded_as_minus_one_and_the_farthest_return_as_one() -> None:
     scale = NORMALISATIONS["r2flow"]
     x = scale.encode(torch.tensor([0.0, 79.9999, 1.45, 80.0]))
     assert x.tolist() == [-1, pytest.approx(1, abs=1e-6), -1, -1]
     assert scale.decode(torch.tensor([-3.0, -1.0, 1.0, 3.0])).tolist() == [0, 0, 0, 0]  # 80 m is outside
 
 
-def test_reflectance() -> None:
+def test_reflectance_is_decoded_and_clamped() -> None:
     r = torch.linspace(0, 1, 11)
     assert torch.allclose(decode_reflectance(encode_reflectance(r)), r, atol=1e-7)
     assert decode_reflectance(torch.tensor([-2.0, 2.0])).tolist() == [0, 1]
 
 
 @given(noise=st.floats(-0.45, 0.45), seed=st.integers(0, 100))
-def test_labels_survive_any_noise_below_half_a_bit(noise: float, seed: int) -> None:
+def test_labels_are_decoded_correctly_under_noise_below_half_a_bit(noise: float, seed: int) -> None:
     label = torch.cat([torch.arange(19), torch.tensor([IGNORE])]).to(torch.uint8).view(1, 4, 5)
     bits = encode_labels(label)
     signs = torch.randint(0, 2, bits.shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
@@ -60,7 +60,7 @@ def test_labels_survive_any_noise_below_half_a_bit(noise: float, seed: int) -> N
     assert torch.allclose(confidence, torch.full_like(confidence, 1 - abs(noise)), atol=1e-6)
 
 
-def test_the_code_is_five_bits_highest_first_and_19_for_no_label() -> None:
+def test_labels_have_five_bits_highest_first_and_unlabelled_is_19() -> None:
     bits = encode_labels(torch.tensor([[[0, 18, IGNORE]]], dtype=torch.uint8))
     assert bits[0, :, 0].T.tolist() == [[-1] * 5, [1, -1, -1, 1, -1], [1, -1, -1, 1, 1]]
     assert decode_labels(torch.zeros(1, 5, 1, 1))[1].item() == 0
@@ -68,7 +68,7 @@ def test_the_code_is_five_bits_highest_first_and_19_for_no_label() -> None:
     assert (label.item(), confidence.item()) == (15, 0)
 
 
-def test_bad_input_is_refused() -> None:
+def test_invalid_input_is_refused() -> None:
     with pytest.raises(DataError, match=r"train ids \[20\]"):
         encode_labels(torch.full((1, 2, 2), 20, dtype=torch.uint8))
     with pytest.raises(ConfigError, match="log, linear or inverse"):
@@ -78,7 +78,7 @@ def test_bad_input_is_refused() -> None:
 
 
 @pytest.mark.parametrize("channels", [("range",), ("reflectance", "range"), tuple(CHANNELS)])
-def test_a_range_image_survives_the_way_to_a_tensor_and_back(channels: tuple[str, ...]) -> None:
+def test_a_range_image_is_unchanged_by_encoding_and_decoding(channels: tuple[str, ...]) -> None:
     sensor = presets()["town"]
     image = project(random_scan(sensor))
     tensors = TensorFormat(channels, NORMALISATIONS["r2flow"])
@@ -105,7 +105,7 @@ def test_a_cell_without_a_return_has_no_label_reflectance_or_confidence() -> Non
     assert fields["reflectance"].tolist() == [[[pytest.approx(0.7), 0]]]
 
 
-def test_a_tensor_that_does_not_fit_is_refused() -> None:
+def test_invalid_tensors_and_formats_are_refused() -> None:
     tensors = TensorFormat(("range", "reflectance"), NORMALISATIONS["r2flow"])
     with pytest.raises(DataError, match=r"shape \(1, 3, 4, 4\); expected \(B, 2, H, W\)"):
         tensors.decode(torch.zeros(1, 3, 4, 4))

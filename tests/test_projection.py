@@ -1,4 +1,4 @@
-"""Points to range image and back: inverses, invariants, and the same bits on numpy and torch."""
+"""Projection and unprojection: inverses, invariants, and bit-identical results with numpy and torch."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def image_of(sensor: Sensor, seed: int, share: float = 0.7) -> RangeImage:
 
 
 @pytest.mark.parametrize("beams", [False, True])
-def test_every_cell_returns_to_itself(sensor: Sensor, beams: bool) -> None:
+def test_unprojecting_and_projecting_keeps_every_cell(sensor: Sensor, beams: bool) -> None:
     sensor = sensor.by_beams() if beams else sensor
     image = image_of(sensor, 1)
     back = project(unproject(image))
@@ -54,7 +54,7 @@ def test_every_cell_returns_to_itself(sensor: Sensor, beams: bool) -> None:
 
 @settings(max_examples=60)
 @given(kind=st.sampled_from(sorted(SMALL)), data=st.data())
-def test_every_cell_returns_to_itself_whatever_the_image(kind: str, data: st.DataObject) -> None:
+def test_unprojecting_and_projecting_keeps_any_image(kind: str, data: st.DataObject) -> None:
     sensor = SMALL[kind]
     ranges = st.one_of(st.just(0.0), st.floats(1.5, 79.5, width=32))
     image = RangeImage(data.draw(hnp.arrays(np.float32, sensor.shape, elements=ranges)), sensor)
@@ -81,10 +81,10 @@ def test_a_kept_point_moves_by_at_most_half_a_cell(sensor: Sensor) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(presets()))
-def test_the_nearest_point_of_each_cell_wins_as_in_brute_force(name: str) -> None:
+def test_projection_equals_a_brute_force_search_for_the_nearest_points(name: str) -> None:
     sensor = presets()[name]
     scan = random_scan(sensor, 4000, seed=3)
-    scan = scan[np.r_[0:4000, 0:4000]]  # every point twice: the first of equals has to win
+    scan = scan[np.r_[0:4000, 0:4000]]  # every point twice: the first of the two has to win
     cells = locate(scan.points, sensor)
     best: dict[int, int] = {}
     for i, (cell, distance) in enumerate(zip(cells.cell, cells.range, strict=True)):
@@ -99,8 +99,8 @@ def test_the_nearest_point_of_each_cell_wins_as_in_brute_force(name: str) -> Non
     assert np.all(image.label[~image.mask] == IGNORE)
 
 
-def test_range_limits_hold_before_the_scatter() -> None:
-    """A return nearer than the limit must not erase the one behind it (R2Flow masks afterwards)."""
+def test_points_outside_the_range_limits_hide_no_other_point() -> None:
+    """A return nearer than the limit must not hide the one behind it (R2Flow masks after the projection)."""
     sensor = SMALL["linear"]
     points = np.array([[0.5, 0, 0], [20, 0, 0], [90, 0, 0], [0, 0, 0]], np.float32)
     image = project(Scan(points, np.arange(4, dtype=np.float32) / 4, sensor))
@@ -109,14 +109,14 @@ def test_range_limits_hold_before_the_scatter() -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(SMALL))
-def test_returns_at_exactly_the_range_limits_are_seen(kind: str) -> None:
-    """Both limits are inclusive, in every way to project; one float32 further they are not."""
+def test_returns_at_exactly_the_range_limits_are_kept(kind: str) -> None:
+    """Both limits are inclusive in every projection; the next float32 beyond a limit is dropped."""
     low, high = np.float32(2.5), np.float32(40)
     outside = np.nextafter(low, np.float32(0)), np.nextafter(high, np.float32(50))
     sensor = replace(SMALL[kind], range_min=float(low), range_max=float(high))
     points = np.zeros((4, 3), np.float32)
     for i, distance in enumerate((low, high, *outside)):
-        points[i, :2] = [(distance, 0), (0, distance), (-distance, 0), (0, -distance)][i]  # a direction for each
+        points[i, :2] = [(distance, 0), (0, distance), (-distance, 0), (0, -distance)][i]  # four different directions
     scan = Scan(points, np.zeros(4, np.float32), sensor)
     assert (locate(points, sensor).cell >= 0).tolist() == [True, True, False, False]
     assert locate(points, sensor).range[:2].tolist() == [low, high]
@@ -127,7 +127,7 @@ def test_returns_at_exactly_the_range_limits_are_seen(kind: str) -> None:
     assert sorted(batch.range[batch.range > 0].tolist()) == [low, high]
 
 
-def test_conventions() -> None:
+def test_columns_run_clockwise_from_the_rear_and_row_0_is_the_highest() -> None:
     """Straight ahead is the edge between W/2-1 and W/2, columns run clockwise, the seam is behind, row 0 is up."""
     sensor = SMALL["linear"]
     points = np.array(
@@ -138,14 +138,14 @@ def test_conventions() -> None:
     assert cell[5] // 32 < cell[0] // 32
     for just_left_and_right_of_the_seam in ([-9, 1e-9, 0], [-9, 0, 0], [-9, -1e-9, 0]):  # +-pi in float32
         assert locate(np.array([just_left_and_right_of_the_seam], np.float32), sensor).cell % 32 == 0
-    straight_up = locate(np.array([[0, 0, 9], [0, 0, -9]], np.float32), sensor).cell
-    assert (straight_up // 32).tolist() == [0, 7]
+    straight_up_and_down = locate(np.array([[0, 0, 9], [0, 0, -9]], np.float32), sensor).cell
+    assert (straight_up_and_down // 32).tolist() == [0, 7]
 
 
 @settings(max_examples=200)
 @given(hnp.arrays(np.float32, (50, 2), elements=st.floats(-200, 200, width=32)))
-def test_angles_are_right_and_the_same_in_torch(xy: np.ndarray) -> None:
-    xy = xy + np.float32(0)  # without negative zeros, whose side of the seam is a matter of taste
+def test_angles_are_accurate_and_bit_identical_in_torch(xy: np.ndarray) -> None:
+    xy = xy + np.float32(0)  # no negative zeros: their side of the seam is undefined
     y, x = torch.from_numpy(xy).unbind(-1)
     ours = np.array([atan2(b, a) for b, a in xy], np.float32)
     assert np.abs(ours - np.arctan2(*xy.astype(np.float64).T)).max() < 5e-7
@@ -162,7 +162,7 @@ def devices() -> list[str]:
 
 @pytest.mark.parametrize("device", devices())
 @pytest.mark.parametrize("beams", [False, True])
-def test_batches_on_any_device_are_the_same_cell_for_cell(sensor: Sensor, device: str, beams: bool) -> None:
+def test_batches_on_any_device_equal_single_projections(sensor: Sensor, device: str, beams: bool) -> None:
     sensor = sensor.by_beams() if beams else sensor
     scans = [random_scan(sensor, n, seed) for seed, n in enumerate((5000, 1, 3000))]
     points = np.concatenate([np.c_[s.points, s.reflectance, s.label] for s in scans]).astype(np.float32)
@@ -178,71 +178,71 @@ def test_batches_on_any_device_are_the_same_cell_for_cell(sensor: Sensor, device
         assert np.array_equal(xyz[:, image.mask].T, unproject(image).points)
 
 
-def in_file_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
-    """A scan ring by ring, each counter-clockwise from straight ahead; (N,) the row of each point."""
+def scan_in_ring_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
+    """A scan ring by ring, each counter-clockwise from straight ahead, and (N,) the row of each point."""
     sensor = presets()["hdl64e_kitti360"]
-    full, points, rows = image_of(sensor.by_beams(), 5, share=share), [], []
-    full.range[full.mask] = np.maximum(full.range[full.mask], 5)  # nearer ones are where crops get hard to tell
+    image, points, rows = image_of(sensor.by_beams(), 5, share=share), [], []
+    image.range[image.mask] = np.maximum(image.range[image.mask], 5)  # rings of nearer points are ambiguous in crops
     for row in range(sensor.shape[0]):
         order = np.argsort(-sensor.column_azimuths() % (2 * np.pi))
-        order = order[full.range[row, order] > 0]
-        points.append(full.range[row, order, None] * sensor.by_beams().ray_directions()[row, order])
+        order = order[image.range[row, order] > 0]
+        points.append(image.range[row, order, None] * sensor.by_beams().ray_directions()[row, order])
         rows.append(np.full(len(order), row))
-    found = np.concatenate(points).astype(np.float32)
-    return Scan(found, np.linspace(0, 1, len(found), dtype=np.float32), sensor), np.concatenate(rows)
+    xyz = np.concatenate(points).astype(np.float32)
+    return Scan(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32), sensor), np.concatenate(rows)
 
 
-def test_unfolding_puts_each_ring_on_its_beam_even_when_rings_are_missing() -> None:
-    whole, rows = in_file_order()
+def test_unfolding_assigns_rings_to_their_beams_even_if_some_are_missing() -> None:
+    full_scan, rows = scan_in_ring_order()
     for kept in (rows >= 0, rows < 39, rows >= 20, (rows < 10) | (rows > 30)):
-        image = unfold(whole[kept])
-        assert np.array_equal(image.range, unfold(replace(whole, ring=rows.astype(np.int16))[kept]).range)
+        image = unfold(full_scan[kept])
+        assert np.array_equal(image.range, unfold(replace(full_scan, ring=rows.astype(np.int16))[kept]).range)
         assert np.array_equal(np.flatnonzero(image.mask.any(1)), np.unique(rows[kept]))
         assert np.array_equal(project(unproject(image)).mask, image.mask)
     with pytest.raises(DataError, match=r"rings found for the 64 lasers.*project\(\)"):
-        unfold(whole[np.random.default_rng(0).permutation(len(whole))])
+        unfold(full_scan[np.random.default_rng(0).permutation(len(full_scan))])
 
 
 @given(first=st.integers(0, 359), width=st.integers(60, 360), share=st.sampled_from([0.3, 0.95]))
 @settings(max_examples=25)
-def test_a_crop_unfolds_as_its_part_of_the_whole_scan(first: int, width: int, share: float) -> None:
-    whole, rows = in_file_order(share)
-    azimuth = np.degrees(np.arctan2(whole.points[:, 1], whole.points[:, 0]))
+def test_a_crop_unfolds_like_the_same_part_of_the_complete_scan(first: int, width: int, share: float) -> None:
+    full_scan, rows = scan_in_ring_order(share)
+    azimuth = np.degrees(np.arctan2(full_scan.points[:, 1], full_scan.points[:, 0]))
     kept = (azimuth - first) % 360 < width
-    known = replace(whole, ring=rows.astype(np.int16))[kept]
-    image, expected = unfold(whole[kept]), unfold(known)
+    known = replace(full_scan, ring=rows.astype(np.int16))[kept]
+    image, expected = unfold(full_scan[kept]), unfold(known)
     assert np.array_equal(image.range, expected.range)
     assert np.array_equal(image.reflectance, expected.reflectance)
 
 
 @pytest.mark.parametrize("half", ["left", "right", "rear"])
-def test_half_a_scan_is_not_put_into_one_row(half: str) -> None:
-    """The peers' rule looks for the step from the fourth quadrant to the first, which such a half does not have."""
-    whole, rows = in_file_order()
-    x, y = whole.points[:, 0], whole.points[:, 1]
+def test_rings_are_found_in_half_a_scan(half: str) -> None:
+    """R2Flow's rule looks for the step from the fourth quadrant to the first, which half a scan may not contain."""
+    full_scan, rows = scan_in_ring_order()
+    x, y = full_scan.points[:, 0], full_scan.points[:, 1]
     kept = {"left": y > 0, "right": y < 0, "rear": x < 0}[half]
-    assert np.array_equal(ring_numbers(whole.points[kept]), rows[kept])
+    assert np.array_equal(ring_numbers(full_scan.points[kept]), rows[kept])
 
 
 @given(seed=st.integers(0, 10_000), strays=st.integers(1, 3), at_seam=st.booleans())
 @settings(max_examples=25)
-def test_stray_points_make_no_rings_of_their_own(seed: int, strays: int, at_seam: bool) -> None:
-    whole, rows = in_file_order()
+def test_stray_points_do_not_start_rings(seed: int, strays: int, at_seam: bool) -> None:
+    full_scan, rows = scan_in_ring_order()
     rng = np.random.default_rng(seed)
-    place = rng.integers(1, len(whole), strays)
+    place = rng.integers(1, len(full_scan), strays)
     if at_seam:
         place = rng.choice(np.flatnonzero(np.diff(rows)) + 1) + rng.integers(-2, 3, strays)
-    order = np.insert(np.arange(len(whole)), place, rng.integers(0, len(whole), strays))
-    ring = ring_numbers(whole.points[order])
+    order = np.insert(np.arange(len(full_scan)), place, rng.integers(0, len(full_scan), strays))
+    ring = ring_numbers(full_scan.points[order])
     moved = ring != rows[order]
     assert ring.max() == 63
-    assert moved.sum() <= 5 * strays, "only the strays, and points that stand between them"
-    assert unfold(whole[order]).mask.any(1).all()
+    assert moved.sum() <= 5 * strays, "only the strays and points between them"
+    assert unfold(full_scan[order]).mask.any(1).all()
 
 
-def test_points_that_are_in_no_rings_are_refused() -> None:
-    whole, rows = in_file_order()
-    azimuth = np.arctan2(whole.points[:, 1], whole.points[:, 0]) % (2 * np.pi)
+def test_points_that_are_not_in_ring_order_are_refused() -> None:
+    full_scan, rows = scan_in_ring_order()
+    azimuth = np.arctan2(full_scan.points[:, 1], full_scan.points[:, 0]) % (2 * np.pi)
     orders = {
         "column by column": np.argsort(azimuth, kind="stable"),
         "clockwise": np.lexsort((-azimuth, rows)),
@@ -251,12 +251,12 @@ def test_points_that_are_in_no_rings_are_refused() -> None:
         "a narrow sector": np.flatnonzero(np.abs(azimuth - 2) < 0.05),
     }
     for name, order in orders.items():
-        scan = replace(whole[order], id=name)
+        scan = replace(full_scan[order], id=name)
         with pytest.raises(DataError, match=f"{name}.*ring by ring, as KITTI stores them"):
             unfold(scan)
 
 
-def test_a_known_ring_needs_no_order() -> None:
+def test_unfolding_with_ring_numbers_needs_no_order() -> None:
     sensor = presets()["hdl32e_nuscenes"]
     image = image_of(sensor, 2)
     scan = unproject(image)
@@ -266,7 +266,7 @@ def test_a_known_ring_needs_no_order() -> None:
     assert np.allclose(unfold(scan[mixed]).range, image.range, rtol=3e-7)
 
 
-def test_a_table_of_beams_is_cut_halfway_between_them() -> None:
+def test_row_edges_of_a_beam_table_are_halfway_between_beams() -> None:
     sensor = SMALL["table"]
     beams = np.radians(sensor.elevations)
     halves = (beams[1:] + beams[:-1]) / 2
@@ -276,17 +276,17 @@ def test_a_table_of_beams_is_cut_halfway_between_them() -> None:
             assert locate(point, sensor).cell // 16 == expected
 
 
-def test_neighbours_are_asked_across_the_seam_but_not_beyond_the_cutoff() -> None:
+def test_neighbours_vote_across_the_seam_but_not_beyond_the_cutoff() -> None:
     sensor = SMALL["linear"]
     image = np.full(sensor.shape, 30, np.float32)
     labels = np.full(sensor.shape, 12, np.uint8)
     image[:, -4:], labels[:, -4:] = 20, 3
     shown = unproject(RangeImage(image, sensor)).points
     rays = sensor.ray_directions()
-    behind_column_0 = rays[4, 0] * 50  # all neighbours differ by more than a metre: the nearest in range
-    at_the_seam = rays[4, -1] * 30.2  # hidden behind a cell at 20 m: its wall goes on in columns 0 and 1
-    crowd = rays[4, 10] * 30.9  # four of five votes are within the cutoff
-    points = np.concatenate([shown, [behind_column_0, at_the_seam, crowd]]).astype(np.float32)
+    behind_column_0 = rays[4, 0] * 50  # all neighbours differ by more than a metre: the nearest in range decides
+    at_the_seam = rays[4, -1] * 30.2  # hidden behind a cell at 20 m: its wall continues in columns 0 and 1
+    near_its_neighbours = rays[4, 10] * 30.9  # four of five votes are within the cutoff
+    points = np.concatenate([shown, [behind_column_0, at_the_seam, near_its_neighbours]]).astype(np.float32)
     filled = fill_points(labels, image, locate(points, sensor))
     assert filled[-3:].tolist() == [12, 12, 12]
     image[4, 10], image[3:6, 9], image[3:6, 11] = 28, 33, 33  # one near neighbour, many beyond the cutoff
@@ -298,10 +298,10 @@ def test_neighbours_are_asked_across_the_seam_but_not_beyond_the_cutoff() -> Non
     assert filled[-1] == 5
 
 
-def test_hidden_points_ask_their_neighbours() -> None:
+def test_hidden_points_take_the_label_of_their_neighbours() -> None:
     sensor = SMALL["linear"]
     wall = np.full(sensor.shape, 30, np.float32)
-    wall[3:6, 10:20] = 8  # a car before the wall
+    wall[3:6, 10:20] = 8  # a car in front of the wall
     labels = np.where(wall < 10, 0, 12).astype(np.uint8)
     car = unproject(RangeImage(wall, sensor))
     hidden = sensor.ray_directions()[4, 10] * 30.2  # wall behind the car's left edge
@@ -315,7 +315,7 @@ def test_hidden_points_ask_their_neighbours() -> None:
         fill_points(labels, wall, cells, window=4)
 
 
-def test_bad_input_is_refused() -> None:
+def test_invalid_input_is_refused() -> None:
     sensor = SMALL["linear"]
     scan = random_scan(sensor, 10)
     with pytest.raises(DataError, match="float32"):

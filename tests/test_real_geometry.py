@@ -1,4 +1,4 @@
-"""The way there and back on every full HDL-64E scan of the real datasets."""
+"""Projection, unfolding and label transfer on every HDL-64E scan of the real datasets."""
 
 from pathlib import Path
 
@@ -15,12 +15,12 @@ ROOTS = ("kitti360", "semantic_kitti", "kitti_object", "kitti_raw")
 
 
 def scans_below(root: Path) -> list[Scan]:
-    found = []
+    scans = []
     for path in sorted(p for folder in ROOTS for p in (root / folder).rglob("*.bin")):
         points = read_points(path)
         sensor = load_sensor("hdl64e_semantic_kitti" if "semantic" in str(path) else "hdl64e_kitti")
-        found.append(Scan(points[:, :3], points[:, 3], sensor, id=str(path.relative_to(root))))
-    return found
+        scans.append(Scan(points[:, :3], points[:, 3], sensor, id=str(path.relative_to(root))))
+    return scans
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def elevation(points: np.ndarray) -> np.ndarray:
     return np.arcsin(points[:, 2].astype(np.float64) / np.linalg.norm(points.astype(np.float64), axis=1))
 
 
-def test_every_cell_returns_to_itself(scans: list[Scan]) -> None:
+def test_unprojecting_and_projecting_keeps_every_cell(scans: list[Scan]) -> None:
     full = [s for s in scans if len(s) > FULL_TURN]
     assert len(full) >= 29
     for scan in full:
@@ -57,8 +57,8 @@ def test_a_kept_point_moves_by_at_most_half_a_cell(scans: list[Scan]) -> None:
         assert np.abs(turned).max() <= np.pi / sensor.columns + 1e-6, scan.id
 
 
-def test_unfolding_finds_the_beam_of_each_ring_also_in_cut_scans(scans: list[Scan]) -> None:
-    """The truncated scan has the upper 39 rings, the camera-cropped one the upper 46: both start in row 0."""
+def test_unfolding_finds_the_beam_of_each_ring_also_in_cropped_scans(scans: list[Scan]) -> None:
+    """The truncated scan has the upper 39 rings, and the camera-cropped one the upper 46; both start in row 0."""
     rows = {s.id: np.flatnonzero(unfold(s).mask.any(axis=1)) for s in scans}
     for scan_id, filled in rows.items():
         count = {"drive_0052": 39, "velodyne_reduced": 46}
@@ -66,7 +66,7 @@ def test_unfolding_finds_the_beam_of_each_ring_also_in_cut_scans(scans: list[Sca
         assert filled.tolist() == list(range(expected)), scan_id
 
 
-def test_halves_have_the_rings_of_the_whole_scan(scans: list[Scan]) -> None:
+def test_halves_have_the_rings_of_the_complete_scan(scans: list[Scan]) -> None:
     for scan in (s for s in scans if len(s) > FULL_TURN):
         ring, (x, y, _) = ring_numbers(scan.points), scan.points.T
         for kept in (x > 0, x < 0, y > 0, y < 0, x < 5):
@@ -75,8 +75,8 @@ def test_halves_have_the_rings_of_the_whole_scan(scans: list[Scan]) -> None:
             assert unfold(scan[kept]).mask.any(1).sum() == expected.max() + 1, scan.id
 
 
-def test_the_beam_table_is_where_the_rings_are(scans: list[Scan]) -> None:
-    """Median over full scans of each ring's elevation against the preset's ``beams``."""
+def test_the_beam_table_matches_the_rings_of_real_scans(scans: list[Scan]) -> None:
+    """Compares the median elevation of each ring over full scans with the preset's ``beams``."""
     sensor: Sensor = load_sensor("hdl64e_kitti360")
     medians = []
     for scan in (s for s in scans if len(s) > FULL_TURN):
@@ -86,8 +86,8 @@ def test_the_beam_table_is_where_the_rings_are(scans: list[Scan]) -> None:
     assert np.degrees(np.abs(np.median(medians, axis=0) - sensor.laser_elevations)).max() < 0.03
 
 
-def test_labels_come_back_to_every_point(real_scans: Path) -> None:
-    """Labels shown by the cells, filled back: nearly all points of a labelled scan get their own class."""
+def test_labels_are_transferred_back_to_points(real_scans: Path) -> None:
+    """Nearly all points of a labelled scan get their own class back from the labels of the cells."""
     points = read_points(real_scans / "semantic_kitti/sequences/00/velodyne/000000.bin")
     raw = np.fromfile(real_scans / "semantic_kitti/sequences/00/labels/000000.label", np.uint32)
     label = (raw & 0xFF).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Scans, boxes and the meaning of labels."""
+"""Scans, boxes, class tables and error messages."""
 
 import copy
 
@@ -33,7 +33,7 @@ def test_a_box_contains_its_corners_and_nothing_beyond(seed: int) -> None:
         assert not several.contain(outward[i])[i].any()
 
 
-def test_corners_turn_with_the_yaw_and_the_floor_can_be_left_out() -> None:
+def test_corners_follow_the_yaw_and_points_near_the_floor_can_be_excluded() -> None:
     box = Boxes(np.array([[0, 0, 0, 4, 2, 2, np.pi / 2]], np.float32), ("Car",))
     assert np.allclose(box.corners()[0, 0], [-1, 2, -1], atol=1e-6)  # front left of a car that looks to the left
     points = np.array([[0, 1.9, 0], [1.9, 0, 0], [0, 0, -0.9]], np.float32)
@@ -53,7 +53,7 @@ def test_selecting_keeps_fields_together() -> None:
     assert (some.names, len(some.dont_care), some.occlusion.tolist()) == (("Car", "Cyclist"), 2, [-1, -1])
 
 
-def test_what_does_not_fit_together_is_refused() -> None:
+def test_mismatched_shapes_and_invalid_boxes_are_refused() -> None:
     scan = random_scan(presets()["town"], 10)
     with pytest.raises(DataError, match=r"points of shape \(10, 2\)"):
         Scan(scan.points[:, :2], scan.reflectance, scan.sensor)
@@ -68,7 +68,7 @@ def test_what_does_not_fit_together_is_refused() -> None:
 
 
 @pytest.mark.parametrize("taxonomy", TAXONOMIES, ids=lambda t: t.name)
-def test_every_class_of_a_dataset_has_its_place(taxonomy: Taxonomy) -> None:
+def test_every_class_of_a_dataset_is_decoded_and_unknown_ones_are_refused(taxonomy: Taxonomy) -> None:
     ids = np.array(sorted(taxonomy.to_train))
     train = taxonomy.decode(ids)
     assert train.dtype == np.uint8 and np.all((train < 19) | (train == IGNORE))
@@ -80,7 +80,7 @@ def test_every_class_of_a_dataset_has_its_place(taxonomy: Taxonomy) -> None:
         assert set(taxonomy.from_train) <= set(taxonomy.to_train)
 
 
-def test_semantic_kitti_maps_back_to_its_static_classes() -> None:
+def test_semantic_kitti_labels_are_encoded_as_static_classes() -> None:
     every = np.array([*range(19), IGNORE], np.uint8)
     assert np.array_equal(SEMANTIC_KITTI.decode(SEMANTIC_KITTI.encode(every)), every)
     assert SEMANTIC_KITTI.decode(np.array([252, 259, 60, 1])).tolist() == [0, 4, 8, IGNORE]
@@ -91,14 +91,14 @@ def test_semantic_kitti_maps_back_to_its_static_classes() -> None:
         NUSCENES.encode(every)
 
 
-def test_kitti360_loses_only_what_it_says() -> None:
+def test_kitti360_merges_only_motorcyclists_and_trunks() -> None:
     back = KITTI360.decode(KITTI360.encode(np.arange(19, dtype=np.uint8)))
     assert {NAMES[i] for i in range(19) if back[i] != i} == {"motorcyclist", "trunk"}
     assert COLOURS.shape == (19, 3) and len({tuple(c) for c in COLOURS}) == 19
 
 
 @pytest.mark.parametrize("kind", [DataError, ConfigError, FileError, LibraryError])
-def test_errors_say_what_was_given_expected_and_to_type_also_from_another_process(kind: type) -> None:
+def test_errors_state_input_expectation_and_hint_and_can_be_copied(kind: type) -> None:
     error = copy.copy(kind("a.bin is cut", "whole points", "Copy it again."))  # as pickling would rebuild it
     assert str(error) == "a.bin is cut; expected whole points. Copy it again."
     assert isinstance(error, LidarSynthError) and isinstance(error, ValueError | OSError)

@@ -1,4 +1,4 @@
-"""Sensors as data."""
+"""Sensors: presets, files, angles and validation."""
 
 import copy
 from pathlib import Path
@@ -13,13 +13,13 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
 DESIGN = {"hdl64e_kitti360", "hdl64e_kitti", "hdl32e_nuscenes", "os1_128", "town"}
 
 
-def test_the_presets_of_the_design_are_there() -> None:
+def test_all_required_presets_exist() -> None:
     assert set(presets()) >= DESIGN
     values = {k: v for k, v in presets()["town"].to_dict().items() if k not in ("name", "description")}
     assert values == {k: presets()["hdl64e_kitti360"].to_dict()[k] for k in values}
 
 
-def test_a_sensor_survives_yaml_a_copy_and_a_file(sensor: Sensor, tmp_path: Path) -> None:
+def test_a_sensor_is_unchanged_by_yaml_copies_and_files(sensor: Sensor, tmp_path: Path) -> None:
     assert Sensor.from_dict(yaml.safe_load(yaml.safe_dump(sensor.to_dict()))) == sensor
     assert copy.deepcopy(sensor) == sensor  # as pickling would rebuild it
     values = sensor.to_dict()
@@ -29,7 +29,7 @@ def test_a_sensor_survives_yaml_a_copy_and_a_file(sensor: Sensor, tmp_path: Path
 
 
 @pytest.mark.parametrize("rays", ["centre", "corner"])
-def test_rays_are_unit_vectors_that_follow_the_conventions(sensor: Sensor, rays: str) -> None:
+def test_rays_are_unit_vectors_in_the_documented_frame(sensor: Sensor, rays: str) -> None:
     for s in (sensor, sensor.by_beams()):
         rays_xyz = s.ray_directions(rays)  # type: ignore[arg-type]
         assert rays_xyz.shape == (*s.shape, 3)
@@ -48,7 +48,7 @@ def test_rows_lie_between_their_edges(sensor: Sensor) -> None:
         assert np.array_equal(s.row_elevations("corner"), s.edges[:-1])
 
 
-def test_lasers_point_where_the_table_says() -> None:
+def test_laser_elevations_are_the_beams_or_the_rows() -> None:
     assert np.allclose(np.degrees(presets()["town"].laser_elevations[[0, -1]]), [2.53, -23.62], atol=1e-5)
     linear = presets()["os1_128"]
     assert np.array_equal(linear.laser_elevations, linear.row_elevations())
@@ -75,12 +75,12 @@ GOOD = {"name": "x", "columns": 8, "range_min": 1.0, "range_max": 9.0, "rows": 4
         ({"beans": 4}, r"sensor keys \['beans'\]"),
     ],
 )
-def test_what_no_sensor_has_is_refused(change: dict[str, object], message: str) -> None:
+def test_invalid_sensors_are_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Sensor.from_dict({**GOOD, **change})
 
 
-def test_a_wrong_name_or_file_says_what_there_is(tmp_path: Path) -> None:
+def test_unknown_names_and_invalid_files_are_explained(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="hdl64e_kitti360.*or a .yaml file"):
         load_sensor("hdl65")
     with pytest.raises(FileError, match="cannot be read"):

@@ -1,4 +1,4 @@
-"""Scans of the town: the same whoever asks, true to their world, labels and boxes that fit the points."""
+"""Scans of the town: reproducible, consistent with the ray-cast world, with labels and boxes that fit the points."""
 
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -17,19 +17,19 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
 from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.town.boxes import boxes_of
 from lidar_synth.town.camera import CAMERA, pixel_rays
-from lidar_synth.town.cast import Stage, trace
+from lidar_synth.town.cast import Snapshot, trace
 from lidar_synth.town.ego import free_rays, optics
 from lidar_synth.town.materials import MATERIALS
 from lidar_synth.town.movers import ego_place
 from lidar_synth.town.prototype import Prototype
 from lidar_synth.town.returns import LEVELS
-from lidar_synth.town.scene import Placed
-from lidar_synth.town.shading import look
+from lidar_synth.town.scene import PlacedObject
+from lidar_synth.town.shading import camera_hits
 from lidar_synth.town.solid import Solid
 from lidar_synth.town.vehicles import vehicles
 
 INDICES = (4, 5, 47, 444)
-"""Scans of three stretches, two of them neighbours."""
+"""Scans of three stretches; the first two are neighbours."""
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def scans(town: Town) -> dict[int, Scan]:
 
 
 def fingerprint(index: int) -> list[bytes]:
-    """All of a scan as bytes, from a town of its own."""
+    """All arrays of a scan as bytes, from a new town."""
     return as_bytes(Town(seed=0, scans=500)[index])
 
 
@@ -63,7 +63,7 @@ def test_a_scan_is_the_same_in_any_order_and_process(scans: dict[int, Scan]) -> 
         assert elsewhere.result() == as_bytes(scans[444])
 
 
-def test_other_seeds_and_indices_are_other_scans(town: Town, scans: dict[int, Scan]) -> None:
+def test_different_seeds_and_indices_give_different_scans(town: Town, scans: dict[int, Scan]) -> None:
     assert as_bytes(scans[4])[0] != as_bytes(scans[5])[0]
     other = Town(seed=1, scans=5)
     assert as_bytes(other[4])[0] != as_bytes(scans[4])[0]
@@ -80,19 +80,19 @@ def test_a_town_is_an_indexable_source() -> None:
 
 
 @pytest.mark.parametrize("options", [{"seed": -1}, {"scans": -1}, {"interval": 0.0}, {"sensor": "hdl65"}])
-def test_bad_options_are_refused(options: dict[str, object]) -> None:
+def test_invalid_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         Town(**options)  # type: ignore[arg-type]
 
 
-def test_without_embreex_the_message_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_embreex_is_named_with_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     free_rays.cache_clear()
     with pytest.raises(LibraryError, match=r"needs embreex.*aarch64.*pip install embreex"):
         Town()
 
 
-def test_every_field_of_a_scan_is_there(scans: dict[int, Scan]) -> None:
+def test_a_scan_has_every_field(scans: dict[int, Scan]) -> None:
     for index, scan in scans.items():
         assert set(scan.fields()) == {"reflectance", "label", "raw_label", "instance", "ring"}
         assert scan.domain == SYNTHETIC and scan.id == f"town-0-{index:06d}"
@@ -101,7 +101,7 @@ def test_every_field_of_a_scan_is_there(scans: dict[int, Scan]) -> None:
         assert distance.min() >= scan.sensor.range_min - 1e-4 and distance.max() <= scan.sensor.range_max + 1e-4
 
 
-def test_labels_agree_with_each_other(scans: dict[int, Scan]) -> None:
+def test_label_raw_label_and_instance_agree(scans: dict[int, Scan]) -> None:
     for scan in scans.values():
         assert scan.raw_label is not None
         assert np.array_equal(scan.label, SEMANTIC_KITTI.decode(scan.raw_label & 0xFFFF))
@@ -113,14 +113,14 @@ def test_labels_agree_with_each_other(scans: dict[int, Scan]) -> None:
             assert len(np.unique(raw[scan.instance == number])) == 1
 
 
-def test_every_class_is_met(scans: dict[int, Scan]) -> None:
-    met = np.unique(np.concatenate([s.label for s in scans.values()]))
-    assert set(met) == set(range(len(NAMES))) | {IGNORE}
+def test_every_class_occurs(scans: dict[int, Scan]) -> None:
+    occurring = np.unique(np.concatenate([s.label for s in scans.values()]))
+    assert set(occurring) == set(range(len(NAMES))) | {IGNORE}
     raw = np.unique(np.concatenate([s.raw_label & 0xFFFF for s in scans.values()]))
     assert {10, 252, 30, 254, 60} <= set(raw.tolist())
 
 
-def test_classes_lie_where_they_belong(scans: dict[int, Scan]) -> None:
+def test_classes_are_at_plausible_heights(scans: dict[int, Scan]) -> None:
     for scan in scans.values():
         x, y, z = scan.points.T
         near = np.hypot(x, y) < 8
@@ -136,7 +136,7 @@ def test_classes_lie_where_they_belong(scans: dict[int, Scan]) -> None:
             assert np.percentile(height("building", near | True), 90) > -0.5
 
 
-def test_reflectance_is_stored_in_levels_and_tells_materials_apart(scans: dict[int, Scan]) -> None:
+def test_reflectance_is_quantised_and_differs_between_materials(scans: dict[int, Scan]) -> None:
     reflectance = np.concatenate([s.reflectance for s in scans.values()])
     assert np.array_equal(reflectance * LEVELS, np.round(reflectance * LEVELS))
     assert reflectance.min() == 0 and reflectance.max() < 1
@@ -147,8 +147,8 @@ def test_reflectance_is_stored_in_levels_and_tells_materials_apart(scans: dict[i
     assert MATERIALS["asphalt"].reflectance < MATERIALS["render"].reflectance < MATERIALS["plate"].reflectance
 
 
-def test_boxes_hold_the_points_of_their_instance(scans: dict[int, Scan]) -> None:
-    total = strange = 0
+def test_boxes_contain_the_points_of_their_instance(scans: dict[int, Scan]) -> None:
+    total = foreign = 0
     for scan in scans.values():
         boxes = scan.boxes
         assert boxes is not None and len(np.unique(boxes.instance)) == len(boxes)
@@ -158,22 +158,22 @@ def test_boxes_hold_the_points_of_their_instance(scans: dict[int, Scan]) -> None
             assert own.any() and wider.contain(scan.points[own])[i].all(), (scan.id, boxes.names[i])
         inside = boxes.contain(scan.points, above_floor=0.3)
         total += int(inside.sum())
-        strange += int((inside & (scan.instance != boxes.instance[:, None])).sum())
-    assert total > 1000 and strange < 0.02 * total
+        foreign += int((inside & (scan.instance != boxes.instance[:, None])).sum())
+    assert total > 1000 and foreign < 0.02 * total
 
 
-def test_box_names_fit_classes(scans: dict[int, Scan]) -> None:
-    of = {"Car": "car", "Van": "car", "Truck": "truck", "Pedestrian": "person", "Cyclist": "bicyclist",
+def test_box_names_match_the_classes_of_their_points(scans: dict[int, Scan]) -> None:
+    class_of = {"Car": "car", "Van": "car", "Truck": "truck", "Pedestrian": "person", "Cyclist": "bicyclist",
           "Person_sitting": "person", "Tram": "other-vehicle"}  # fmt: skip
     for scan in scans.values():
         assert scan.boxes is not None and scan.label is not None
         for name, number in zip(scan.boxes.names, scan.boxes.instance, strict=True):
             classes = np.unique(scan.label[scan.instance == number])
             assert len(classes) == 1
-            assert name not in of or NAMES[classes[0]] == of[name]
+            assert name not in class_of or NAMES[classes[0]] == class_of[name]
 
 
-def test_what_the_camera_sees_of_a_box(scans: dict[int, Scan]) -> None:
+def test_image_boxes_and_truncation_match_the_boxes(scans: dict[int, Scan]) -> None:
     seen = 0
     for scan in scans.values():
         boxes = scan.boxes
@@ -186,7 +186,7 @@ def test_what_the_camera_sees_of_a_box(scans: dict[int, Scan]) -> None:
             corners, depth = CAMERA.pixels(boxes[[i]].corners()[0])
             if depth.min() < 1:
                 continue
-            # The outline of what stands in the box lies within the box's own outline.
+            # The image box of the object lies within the image box of its 3-D box.
             low, high = corners.min(0) - 3, corners.max(0) + 3
             assert (boxes.image_box[i, :2] > low).all() and (boxes.image_box[i, 2:] < high).all()
         ahead = (boxes.values[:, 0] > 6) & (np.abs(boxes.values[:, 1]) < 0.8 * boxes.values[:, 0] - 4)
@@ -194,31 +194,31 @@ def test_what_the_camera_sees_of_a_box(scans: dict[int, Scan]) -> None:
     assert seen > 10
 
 
-def test_nothing_is_seen_through_walls_or_cars(town: Town, scans: dict[int, Scan]) -> None:
-    """What a ray returns from is the first thing on its way, but for glass, wire and leaves."""
-    seen_movers = 0
+def test_no_ray_passes_through_walls_or_cars(town: Town, scans: dict[int, Scan]) -> None:
+    """A ray returns from the first surface that it hits, except for glass, wire and leaves."""
+    mover_points = 0
     for index in INDICES:
         world, scan = town.world(index), scans[index]
-        stage, pose, _ = town.moment(index)
+        snapshot, pose, _ = town.moment(index)
         assert scan.ring is not None and scan.instance is not None
         start = np.zeros((len(scan), 3)) + np.array((0, 0, 1)) * optics(scan.sensor)[1][scan.ring][:, None]
-        way = scan.points - start
-        far = np.linalg.norm(way, axis=1)
+        offset = scan.points - start
+        measured = np.linalg.norm(offset, axis=1)
         origins = (start @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-        rays = ((way / far[:, None]) @ pose[:3, :3].T).astype(np.float32)
+        rays = ((offset / measured[:, None]) @ pose[:3, :3].T).astype(np.float32)
         solid = ~np.isin(np.array(list(MATERIALS))[world.surfaces.material], ["glass", "carglass", "leaf", "wire"])
         first, face, _ = Solid(world.triangles).first(origins, rays)
-        behind = (first < far - 0.25) & solid[world.faces[face]]
-        # At edges the ray worked out from a rounded point can differ from the one that was cast.
+        behind = (first < measured - 0.25) & solid[world.faces[face]]
+        # At edges, the ray computed from a rounded point can miss what the original ray hit.
         assert behind.mean() < 1e-3
-        for mover in stage.movers:
-            found, surface, _ = trace(mover, origins, rays)
-            assert ((found < far - 0.25) & solid[surface]).mean() < 1e-3
-            seen_movers += int((scan.instance == mover.instance).sum())
-    assert seen_movers > 100
+        for mover in snapshot.movers:
+            distance, surface, _ = trace(mover, origins, rays)
+            assert ((distance < measured - 0.25) & solid[surface]).mean() < 1e-3
+            mover_points += int((scan.instance == mover.instance).sum())
+    assert mover_points > 100
 
 
-def test_a_hidden_car_is_known_to_be_hidden(town: Town) -> None:
+def test_occlusion_and_truncation_of_hidden_cut_and_invisible_cars(town: Town) -> None:
     world = town.world(4)
     bare = replace(
         world, triangles=np.full((1, 3, 3), 900, np.float32) * np.eye(3, dtype=np.float32), faces=world.faces[:1]
@@ -226,24 +226,24 @@ def test_a_hidden_car_is_known_to_be_hidden(town: Town) -> None:
     lorry, car = vehicles()["box_lorry"], vehicles()["sedan"]
     pose = np.eye(4)
 
-    def stand(prototype: Prototype, x: float, y: float, number: int) -> Placed:
-        place = np.eye(4)
-        place[:3, 3] = x, y, -1.73
-        return Placed(prototype, place, number, np.zeros(10, np.int32))
+    def place(prototype: Prototype, x: float, y: float, number: int) -> PlacedObject:
+        object_pose = np.eye(4)
+        object_pose[:3, 3] = x, y, -1.73
+        return PlacedObject(prototype, object_pose, number, np.zeros(10, np.int32))
 
-    near, behind, beside = stand(lorry, 14, 0, 1), stand(car, 30, 0, 2), stand(car, 30, 9, 3)
-    boxes = boxes_of([near, behind, beside], pose, Stage(bare, [near, behind, beside]))
+    near, behind, beside = place(lorry, 14, 0, 1), place(car, 30, 0, 2), place(car, 30, 9, 3)
+    boxes = boxes_of([near, behind, beside], pose, Snapshot(bare, [near, behind, beside]))
     assert boxes.occlusion[[0, 2]].tolist() == [0, 0] and boxes.occlusion[1] >= 2
     assert boxes.truncation.tolist() == [0, 0, 0]
-    alone = boxes_of([behind], pose, Stage(bare, [behind]))
+    alone = boxes_of([behind], pose, Snapshot(bare, [behind]))
     assert alone.occlusion.tolist() == [0]
-    cut = boxes_of([stand(car, 4, 4.2, 4)], pose, Stage(bare, []))
+    cut = boxes_of([place(car, 4, 4.2, 4)], pose, Snapshot(bare, []))
     assert 0.1 < cut.truncation[0] < 0.9
-    away = boxes_of([stand(car, -20, 0, 5)], pose, Stage(bare, []))
+    away = boxes_of([place(car, -20, 0, 5)], pose, Snapshot(bare, []))
     assert away.truncation[0] == away.occlusion[0] == away.image_box[0, 0] == -1
 
 
-def test_neighbouring_scans_see_the_same_world(scans: dict[int, Scan]) -> None:
+def test_neighbouring_scans_overlap_when_accumulated_by_pose(scans: dict[int, Scan]) -> None:
     def cloud(index: int, pose: np.ndarray | None = None) -> np.ndarray:
         scan = scans[index]
         assert scan.pose is not None and scan.raw_label is not None
@@ -256,23 +256,26 @@ def test_neighbouring_scans_see_the_same_world(scans: dict[int, Scan]) -> None:
     assert first.pose is not None and second.pose is not None
     assert 1 < np.linalg.norm(second.pose[:3, 3] - first.pose[:3, 3]) < 8
     tree = cKDTree(cloud(4))
-    apart = tree.query(cloud(5), distance_upper_bound=3)[0]
-    near = np.isfinite(apart)
+    distance_to_first = tree.query(cloud(5), distance_upper_bound=3)[0]
+    near = np.isfinite(distance_to_first)
     assert near.mean() > 0.9
-    assert np.percentile(apart[near], 75) < 0.25
-    # The poses matter: without the way between them the same clouds lie apart.
-    unmoved = tree.query(cloud(5, first.pose), distance_upper_bound=3)[0]
+    assert np.percentile(distance_to_first[near], 75) < 0.25
+    # With the pose of the other scan the same clouds do not match, so the test depends on the poses.
+    without_motion = tree.query(cloud(5, first.pose), distance_upper_bound=3)[0]
     heights = [np.abs(q[:, 2]).mean() for q in (cloud(4), cloud(5))]
-    assert np.mean(np.minimum(unmoved, 3)) > np.mean(np.minimum(apart, 3)) and abs(heights[0] - heights[1]) < 1
+    assert (
+        np.mean(np.minimum(without_motion, 3)) > np.mean(np.minimum(distance_to_first, 3))
+        and abs(heights[0] - heights[1]) < 1
+    )
 
 
-def test_stretches_lie_apart(scans: dict[int, Scan]) -> None:
+def test_stretches_are_far_apart_in_the_world(scans: dict[int, Scan]) -> None:
     places = {i // STRETCH_FRAMES: s.pose[:3, 3] for i, s in scans.items() if s.pose is not None}
     assert len(places) == 3
     assert abs(places[2][0] - places[0][0]) > 1500
 
 
-def test_rings_are_written_as_the_sensor_does(scans: dict[int, Scan]) -> None:
+def test_points_are_in_ring_order(scans: dict[int, Scan]) -> None:
     for scan in scans.values():
         assert scan.ring is not None
         assert np.array_equal(ring_numbers(scan.points), scan.ring)
@@ -289,7 +292,7 @@ def test_points_lie_on_their_lasers_rays(scans: dict[int, Scan]) -> None:
     assert free_rays(sensor)[scan.ring, column.astype(int)].all()
 
 
-def test_the_beams_of_a_level_road_appear_at_the_sensors_table() -> None:
+def test_returns_from_a_level_road_have_the_elevations_of_the_beams() -> None:
     sensor = load_sensor("town")
     elevation, height = optics(sensor)
     down = sensor.laser_elevations < np.radians(-6)
@@ -298,13 +301,13 @@ def test_the_beams_of_a_level_road_appear_at_the_sensors_table() -> None:
     assert np.abs(np.degrees(seen - sensor.laser_elevations[down])).max() < 0.2
 
 
-def test_about_as_many_cells_are_filled_as_in_real_scans(scans: dict[int, Scan]) -> None:
+def test_range_images_are_about_as_full_as_those_of_real_scans(scans: dict[int, Scan]) -> None:
     filled = [int(project(s).mask.sum()) for s in scans.values()]
     assert all(38_000 < n < 53_000 for n in filled), filled
 
 
 @pytest.mark.parametrize("name", ["hdl32e_nuscenes", "os1_128"])
-def test_another_sensor_casts_its_own_rays(name: str) -> None:
+def test_the_town_can_be_scanned_with_another_preset(name: str) -> None:
     sensor = presets()[name]
     scan = Town(seed=0, sensor=sensor, scans=500)[4]
     assert scan.sensor == sensor and scan.ring is not None
@@ -314,14 +317,14 @@ def test_another_sensor_casts_its_own_rays(name: str) -> None:
     assert np.linalg.norm(scan.points, axis=1).max() > 70
 
 
-def test_a_users_sensor_works() -> None:
+def test_the_town_can_be_scanned_with_a_custom_sensor() -> None:
     sensor = Sensor("mine", 64, 2.0, 30.0, elevations=(5.0, 0.0, -5.0, -10.0, -20.0))
     scan = Town(seed=3, sensor=sensor, scans=1)[0]
     assert 0 < len(scan) <= 5 * 64 and scan.ring is not None and scan.ring.max() <= 4
 
 
-def test_camera_and_lidar_see_the_same_things(town: Town, scans: dict[int, Scan]) -> None:
-    stage, pose, _ = town.moment(4)
+def test_camera_and_lidar_see_the_same_classes(town: Town, scans: dict[int, Scan]) -> None:
+    snapshot, pose, _ = town.moment(4)
     surfaces = town.world(4).surfaces
     scan = scans[4]
     pixels, depth = CAMERA.pixels(scan.points)
@@ -329,25 +332,25 @@ def test_camera_and_lidar_see_the_same_things(town: Town, scans: dict[int, Scan]
     with np.errstate(invalid="ignore"):
         inside = (depth > 1) & (pixels >= 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     eye, rays = pixel_rays(pose, pixels[inside])
-    hits = look(stage, eye, rays, surfaces)
+    hits = camera_hits(snapshot, eye, rays, surfaces)
     seen = SEMANTIC_KITTI.decode(surfaces.raw)[hits.surface]
     assert inside.sum() > 5000
     assert (seen == scan.label[inside]).mean() > 0.9  # type: ignore[index]
-    # A picture turned by two degrees no longer fits: the test can tell.
+    # With rays shifted by about two degrees the agreement drops, so the test detects a wrong calibration.
     _, aside = pixel_rays(pose, pixels[inside] + (20, 10))
-    turned = SEMANTIC_KITTI.decode(surfaces.raw)[look(stage, eye, aside, surfaces).surface]
+    turned = SEMANTIC_KITTI.decode(surfaces.raw)[camera_hits(snapshot, eye, aside, surfaces).surface]
     assert (turned == scan.label[inside]).mean() < (seen == scan.label[inside]).mean() - 0.03  # type: ignore[index]
 
 
-def test_the_picture_shows_a_street(town: Town) -> None:
+def test_the_camera_image_shows_a_street_with_sky(town: Town) -> None:
     image = town.image(4)
     assert image.shape == (376, 1408, 3) and image.dtype == np.uint8
     assert np.array_equal(image, town.image(4))
     assert image.std() > 30
-    stage, pose, _ = town.moment(4)
+    snapshot, pose, _ = town.moment(4)
     grid = np.stack(np.meshgrid(np.arange(0, 1408, 8), np.arange(0, 376, 8)), -1).reshape(-1, 2)
     eye, rays = pixel_rays(pose, grid)
-    hits = look(stage, eye, rays, town.world(4).surfaces)
+    hits = camera_hits(snapshot, eye, rays, town.world(4).surfaces)
     colour = image[grid[:, 1], grid[:, 0]].astype(float)
     label = SEMANTIC_KITTI.decode(town.world(4).surfaces.raw)[hits.surface]
     assert colour[hits.surface < 0].mean() > colour[(label == TRAIN_ID["road"]) & (hits.surface >= 0)].mean() + 30
@@ -355,7 +358,7 @@ def test_the_picture_shows_a_street(town: Town) -> None:
     assert green > red
 
 
-def test_nobody_runs_into_the_ego_vehicle(town: Town) -> None:
+def test_no_mover_collides_with_the_ego_vehicle(town: Town) -> None:
     for index in INDICES:
         world = town.world(index)
         for time in town.interval * np.arange(STRETCH_FRAMES):
@@ -369,8 +372,8 @@ def test_nobody_runs_into_the_ego_vehicle(town: Town) -> None:
                 assert abs(at_s - s) > max(0.85, length) + along or abs(at_t - t) > max(0.85, width) + across
 
 
-def test_the_tree_of_triangles_is_the_same_each_time(town: Town) -> None:
-    """Embree may build in threads; what rays hit must not depend on it."""
+def test_ray_casting_is_deterministic(town: Town) -> None:
+    """Embree may build its tree in several threads; the hits must not depend on that."""
     triangles = town.world(4).triangles
     rng = np.random.default_rng(0)
     rays = rng.standard_normal((20_000, 3)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The town on disk: the datasets' layouts, read back by the package's readers; runs that go on where they stopped."""
+"""Export of the town: every layout is read back by the package's readers; an interrupted export resumes."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.mixing import MixedScans
 from lidar_synth.town import LAYOUTS, Town, export_town
-from lidar_synth.town.export import _parts
+from lidar_synth.town.export import _groups
 
 COUNT = 3
 
@@ -36,7 +36,7 @@ def written(request: pytest.FixtureRequest, town: Town, tmp_path_factory: pytest
     return request.param, root
 
 
-def test_points_come_back_bit_by_bit(written: tuple[str, Path], scans: list[Scan]) -> None:
+def test_points_are_read_back_bit_for_bit(written: tuple[str, Path], scans: list[Scan]) -> None:
     layout, root = written
     read = open_scans(root, split="train" if layout == "semantic_kitti" else None)
     assert len(read) == COUNT
@@ -45,7 +45,7 @@ def test_points_come_back_bit_by_bit(written: tuple[str, Path], scans: list[Scan
         assert np.array_equal(read[i].reflectance, scan.reflectance)
 
 
-def test_a_town_read_back_is_synthetic_everywhere(written: tuple[str, Path], tmp_path: Path) -> None:
+def test_scans_read_from_an_exported_town_are_synthetic(written: tuple[str, Path], tmp_path: Path) -> None:
     root = written[1]
     read = open_scans(root)
     assert [scan.domain for scan in read] == [SYNTHETIC] * COUNT and read[0].domain == SYNTHETIC
@@ -53,11 +53,11 @@ def test_a_town_read_back_is_synthetic_everywhere(written: tuple[str, Path], tmp
     assert open_scans(one)[0].domain == SYNTHETIC
     view(root, 0, 1, tmp_path / "page.html", None)
     assert '"domain": 1' in (tmp_path / "page.html").read_text().replace('"domain":1', '"domain": 1')
-    real = MixedScans(read, ratio=0)  # where it stands in for real scans, to a mixture it is
+    real = MixedScans(read, ratio=0)  # a mixture counts every scan of its real source as real
     assert real[0]["domain"] == REAL
 
 
-def test_labels_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:
+def test_labels_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> None:
     layout, root = written
     if layout == "kitti":
         pytest.skip("KITTI's object set has no label per point")
@@ -67,11 +67,11 @@ def test_labels_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:
             assert np.array_equal(read[i].raw_label, scan.raw_label)
             assert np.array_equal(read[i].label, scan.label)
         else:
-            # KITTI-360 has fewer classes: its riders and trunks are one with others.
+            # KITTI-360 has fewer classes: it merges motorcyclists and trunks with other classes.
             assert (read[i].label == scan.label).mean() > 0.97  # type: ignore[union-attr]
 
 
-def test_poses_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:
+def test_poses_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> None:
     layout, root = written
     if layout == "kitti":
         pytest.skip("KITTI's object set has no poses")
@@ -81,7 +81,7 @@ def test_poses_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:
         assert np.allclose(pose, scan.pose, atol=1e-5)
 
 
-def test_boxes_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:
+def test_boxes_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> None:
     layout, root = written
     if layout == "semantic_kitti":
         pytest.skip("SemanticKITTI has no boxes")
@@ -89,20 +89,20 @@ def test_boxes_come_back(written: tuple[str, Path], scans: list[Scan]) -> None:
     for i, scan in enumerate(scans):
         read, boxes = open_scans(root)[i].boxes, scan.boxes
         assert read is not None and boxes is not None
-        # label_2 lists what the camera sees; KITTI-360's reader leaves out what is centred beyond the sensor's range.
+        # label_2 lists only objects in the image; KITTI-360's reader drops boxes centred beyond the sensor's range.
         near = np.linalg.norm(boxes.values[:, :2], axis=1) < scan.sensor.range_max - 1
         expected = boxes[boxes.truncation >= 0] if layout == "kitti" else boxes[near]
         assert len(read) >= len(expected) > 0
         for value, name in zip(expected.values, expected.names, strict=True):
-            apart = np.linalg.norm(read.values[:, :3] - value[:3], axis=1)
-            match = int(apart.argmin())
-            assert apart[match] < 3 * tolerance
+            distance = np.linalg.norm(read.values[:, :3] - value[:3], axis=1)
+            match = int(distance.argmin())
+            assert distance[match] < 3 * tolerance
             assert np.allclose(read.values[match, 3:6], value[3:6], atol=tolerance)
             if layout == "kitti":
                 assert read.names[match] == name
 
 
-def test_a_kitti_label_tells_what_the_camera_sees(written: tuple[str, Path], scans: list[Scan]) -> None:
+def test_kitti_labels_have_occlusion_truncation_and_image_boxes(written: tuple[str, Path], scans: list[Scan]) -> None:
     layout, root = written
     if layout != "kitti":
         pytest.skip("only KITTI's object set")
@@ -117,24 +117,24 @@ def test_a_kitti_label_tells_what_the_camera_sees(written: tuple[str, Path], sca
         assert read.truncation[match] == pytest.approx(seen.truncation[i], abs=0.006)
 
 
-def test_the_calibration_comes_back(written: tuple[str, Path], town: Town, scans: list[Scan]) -> None:
+def test_the_calibration_is_read_back(written: tuple[str, Path], town: Town, scans: list[Scan]) -> None:
     _, root = written
     camera = open_scans(root).calibration(0)
     assert camera is not None
     expected, depth = town.calibration.pixels(scans[0].points)
-    found, _ = camera.pixels(scans[0].points)
+    actual, _ = camera.pixels(scans[0].points)
     ahead = depth > 1
-    assert np.allclose(found[ahead], expected[ahead], atol=0.01)
+    assert np.allclose(actual[ahead], expected[ahead], atol=0.01)
 
 
-def test_the_folder_says_what_it_holds(written: tuple[str, Path]) -> None:
+def test_the_folder_has_a_readme_and_its_settings(written: tuple[str, Path]) -> None:
     layout, root = written
     text = (root / "README.md").read_text()
     assert "synthetic" in text and "not KITTI-360" in text and layout in text
     assert json.loads((root / "town.json").read_text())["seed"] == 5
 
 
-def test_readers_of_each_layout_take_it(written: tuple[str, Path]) -> None:
+def test_splits_and_times_of_each_layout_are_written(written: tuple[str, Path]) -> None:
     layout, root = written
     if layout == "kitti360":
         assert len(KITTI360(root, split="r2flow/train")) == len(KITTI360(root, split="lidm/train")) == COUNT
@@ -144,14 +144,14 @@ def test_readers_of_each_layout_take_it(written: tuple[str, Path]) -> None:
         assert np.allclose(times, [0, 0.4, 0.8])
 
 
-def test_a_run_goes_on_where_it_stopped(tmp_path: Path, town: Town) -> None:
+def test_an_interrupted_export_resumes(tmp_path: Path, town: Town) -> None:
     assert export_town(town, tmp_path, "semantic_kitti", camera=False, progress=False) == (COUNT, 0)
     scan = tmp_path / "sequences" / "00" / "velodyne" / "000001.bin"
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     scan.unlink()
     assert export_town(town, tmp_path, "semantic_kitti", camera=False, progress=False) == (1, 2)
     after = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
-    # The poses of a whole folder are read and written again, with the rounding of a matrix product.
+    # All poses of a folder are read and written again, which rounds them.
     poses = tmp_path / "sequences" / "00" / "poses.txt"
     rows = [np.array(files.pop(poses).split(), float) for files in (before, after)]
     assert after == before and np.allclose(*rows)
@@ -159,7 +159,7 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path, town: Town) -> None:
     assert export_town(longer, tmp_path, "semantic_kitti", camera=False, progress=False) == (1, COUNT)
 
 
-def test_a_folder_with_another_town_is_refused(tmp_path: Path, town: Town) -> None:
+def test_a_folder_that_holds_another_town_is_refused(tmp_path: Path, town: Town) -> None:
     export_town(Town(seed=5, scans=0), tmp_path, "kitti", camera=False, progress=False)
     with pytest.raises(ConfigError, match=r"was filled with .*'seed': 5"):
         export_town(Town(seed=6, scans=1), tmp_path, "kitti", camera=False, progress=False)
@@ -168,19 +168,21 @@ def test_a_folder_with_another_town_is_refused(tmp_path: Path, town: Town) -> No
 @pytest.mark.parametrize(
     ("layout", "jobs", "sequence"), [("kitti-360", 1, None), ("kitti360", 0, None), ("kitti360", 1, 100)]
 )
-def test_wrong_calls_are_refused(tmp_path: Path, town: Town, layout: str, jobs: int, sequence: int | None) -> None:
+def test_invalid_arguments_are_refused(
+    tmp_path: Path, town: Town, layout: str, jobs: int, sequence: int | None
+) -> None:
     with pytest.raises(ConfigError):
         export_town(town, tmp_path / "out", layout, jobs=jobs, sequence=sequence)
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unwritable_target_is_named(tmp_path: Path, town: Town) -> None:
+def test_an_unwritable_folder_is_reported(tmp_path: Path, town: Town) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(FileError, match="cannot be written"):
         export_town(town, tmp_path / "file" / "out", "kitti360", camera=False, progress=False)
 
 
-def test_processes_write_the_same_files(tmp_path: Path, town: Town) -> None:
+def test_several_processes_write_the_same_files_as_one(tmp_path: Path, town: Town) -> None:
     for jobs in (1, 2):
         export_town(town, tmp_path / str(jobs), "kitti360", camera=False, jobs=jobs, progress=False)
     one, two = (
@@ -189,14 +191,16 @@ def test_processes_write_the_same_files(tmp_path: Path, town: Town) -> None:
     assert one == two
 
 
-def test_work_is_parted_by_stretch() -> None:
-    assert _parts(list(range(3)), 1) == [[0], [1], [2]]
-    assert _parts(list(range(45)), 2) == [list(range(20)), list(range(20, 40)), list(range(40, 45))]
-    assert _parts([3, 4, 5, 6], 2) == [[3, 4], [5, 6]]
-    assert _parts([19, 20], 1) == [[19], [20]]
+def test_work_is_grouped_by_stretch() -> None:
+    assert _groups(list(range(3)), 1) == [[0], [1], [2]]
+    assert _groups(list(range(45)), 2) == [list(range(20)), list(range(20, 40)), list(range(40, 45))]
+    assert _groups([3, 4, 5, 6], 2) == [[3, 4], [5, 6]]
+    assert _groups([19, 20], 1) == [[19], [20]]
 
 
-def test_the_command_writes_pictures_and_takes_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_camera_images_and_accepts_sensors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     command(tmp_path / "a", scans=1, seed=5, layout="kitti")
     assert "1 scans written, 0 were there already" in capsys.readouterr().out
     scan = KITTIObject(tmp_path / "a")[0]

@@ -1,4 +1,4 @@
-"""What the town is built of: meshes, ground, streets; each against what it has to be."""
+"""The parts of the town: meshes, ground, streets, movers, surfaces."""
 
 from itertools import pairwise
 
@@ -14,23 +14,23 @@ from lidar_synth.town.materials import MATERIALS, Finish, Surfaces
 from lidar_synth.town.meshes import Mesh, ball, boxes, loft, merge, prism, tube
 from lidar_synth.town.people import PHASES, cyclist, motorcyclist, sitter, walker
 from lidar_synth.town.plants import LEAF, SPECIES, VARIANTS, coarse_plant, plant
-from lidar_synth.town.returns import Noise, laser_gains, patches
+from lidar_synth.town.returns import Noise, cell_noise, laser_gains
 from lidar_synth.town.solid import Solid
 from lidar_synth.town.street import KINDS as STREETS
-from lidar_synth.town.street import LEFT, RIGHT, SHARES, draw_street
+from lidar_synth.town.street import LEFT, RIGHT, SHARES, sample_street
 from lidar_synth.town.vehicles import vehicles
-from lidar_synth.town.world import STRETCH_FRAMES, WORLD, build_world, generator
+from lidar_synth.town.world import STRETCH_FRAMES, WORLD, build_world, rng_for
 
 UP = np.array((0.0, 0.0, 1.0))
 
 
-def hits(mesh: Mesh, origins: np.ndarray, ways: np.ndarray) -> np.ndarray:
+def hits(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Distances to the mesh, inf where rays miss it."""
-    return Solid(mesh.triangles).first(origins.astype(np.float32), ways.astype(np.float32))[0]
+    return Solid(mesh.triangles).first(origins.astype(np.float32), directions.astype(np.float32))[0]
 
 
-def outside_in(count: int, seed: int = 0, radius: float = 50.0) -> tuple[np.ndarray, np.ndarray]:
-    """Rays from all sides to near the origin."""
+def rays_towards_origin(count: int, seed: int = 0, radius: float = 50.0) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of rays from all sides towards the origin."""
     rng = np.random.default_rng(seed)
     start = rng.standard_normal((count, 3))
     start *= radius / np.linalg.norm(start, axis=1, keepdims=True)
@@ -39,32 +39,32 @@ def outside_in(count: int, seed: int = 0, radius: float = 50.0) -> tuple[np.ndar
 
 @given(low=st.tuples(*[st.floats(-5, 5)] * 3), size=st.tuples(*[st.floats(0.1, 5)] * 3))
 @settings(max_examples=20)
-def test_a_box_is_hit_where_it_stands(low: tuple[float, ...], size: tuple[float, ...]) -> None:
+def test_rays_hit_the_faces_of_a_box(low: tuple[float, ...], size: tuple[float, ...]) -> None:
     a, b = np.array(low), np.array(low) + np.array(size)
     mesh = boxes([a], [b])
     assert len(mesh) == 12
     middle = (a + b) / 2
     for axis in range(3):
-        way = np.zeros(3)
-        way[axis] = 1.0
-        found = hits(mesh, np.array([middle - 20 * way]), np.array([way]))
-        assert np.isclose(found[0], 20 - size[axis] / 2, atol=1e-3)
+        direction = np.zeros(3)
+        direction[axis] = 1.0
+        distances = hits(mesh, np.array([middle - 20 * direction]), np.array([direction]))
+        assert np.isclose(distances[0], 20 - size[axis] / 2, atol=1e-3)
 
 
 @pytest.mark.parametrize("mesh", [boxes([(-1, -1, -1)], [(1, 1, 1)]), ball((0, 0, 0), 1.0, rings=8, sides=12),
                                   tube([(0, 0, -1), (0, 0, 1)], 1.0, 12)])  # fmt: skip
-def test_solids_are_closed(mesh: Mesh) -> None:
-    assert np.isfinite(hits(mesh, *outside_in(2000))).all()
+def test_closed_shapes_let_no_ray_through(mesh: Mesh) -> None:
+    assert np.isfinite(hits(mesh, *rays_towards_origin(2000))).all()
 
 
-def test_a_prism_is_open_below_only() -> None:
+def test_a_prism_is_open_at_the_bottom_only() -> None:
     mesh = prism([(-1, -1), (1, -1), (1, 1), (-1, 1)], 0.0, 1.0)
     down, up = (np.array([(0.3, 0.2, z)]) for z in (5, -5))
     assert hits(mesh, down, np.array([(0, 0, -1)]))[0] == pytest.approx(4)
     assert hits(mesh, up, np.array([(0, 0, 1)]))[0] == pytest.approx(6)
 
 
-def test_a_tube_has_its_radius() -> None:
+def test_a_tube_has_the_given_radius() -> None:
     mesh = tube([(0, 0, 0), (2, 0, 0), (4, 0, 0)], 0.5, 24)
     angle = np.linspace(0, 2 * np.pi, 50)
     out = np.stack([0 * angle, np.cos(angle), np.sin(angle)], 1)
@@ -73,7 +73,7 @@ def test_a_tube_has_its_radius() -> None:
 
 @given(yaw=st.floats(-3, 3), scale=st.floats(0.5, 2), x=st.floats(-10, 10))
 @settings(max_examples=20)
-def test_moving_is_a_similarity(yaw: float, scale: float, x: float) -> None:
+def test_moved_equals_scaling_and_a_rigid_motion(yaw: float, scale: float, x: float) -> None:
     mesh = vehicles()["sedan"].mesh
     moved = mesh.moved((x, 1, 2), yaw, scale)
     pose = np.eye(4)
@@ -83,14 +83,14 @@ def test_moving_is_a_similarity(yaw: float, scale: float, x: float) -> None:
     assert np.array_equal(moved.slot, mesh.slot)
 
 
-def test_the_outline_reaches_as_far_as_the_mesh() -> None:
+def test_the_outline_has_the_extent_of_the_mesh() -> None:
     for prototype in (vehicles()["estate"], walker(1), cyclist(0)):
         low, high = prototype.mesh.bounds
         assert np.abs(prototype.mesh.outline.min(0) - low).max() < 0.06
         assert np.abs(prototype.mesh.outline.max(0) - high).max() < 0.06
 
 
-def test_vehicles_have_a_silhouette() -> None:
+def test_vehicles_have_plausible_shapes() -> None:
     kinds = vehicles()
     for kind, prototype in kinds.items():
         low, high = prototype.mesh.bounds
@@ -104,14 +104,14 @@ def test_vehicles_have_a_silhouette() -> None:
         assert glass.any()
         heights = mesh.triangles[glass][..., 2]
         assert heights.min() > 0.3 * mesh.bounds[1][2]
-    # A bonnet and a boot are lower than a roof; a ray low across the middle passes between the wheels.
+    # Bonnet and boot are lower than the roof, and a low ray across the middle passes between the wheels.
     car = kinds["sedan"].mesh
     front, roof, boot = 5 - hits(car, np.array([(x, 0.0, 5.0) for x in (1.8, 0.0, -2.1)]), np.tile((0, 0, -1), (3, 1)))
     assert front < 1.0 < roof and boot < roof - 0.2
     assert np.isinf(hits(car, np.array([(0.0, -5.0, 0.1)]), np.array([(0, 1, 0)])))[0]
 
 
-def test_people_stand_on_the_ground() -> None:
+def test_people_touch_the_ground_and_have_plausible_heights() -> None:
     for prototype in [*(walker(p) for p in range(PHASES)), walker(0, True), cyclist(3), motorcyclist(), sitter()]:
         low, high = prototype.mesh.bounds
         assert -0.03 < low[2] < 0.09
@@ -121,22 +121,22 @@ def test_people_stand_on_the_ground() -> None:
 
 
 @pytest.mark.parametrize("species", sorted(SPECIES))
-def test_rays_get_into_a_plant(species: str) -> None:
+def test_rays_enter_the_crown_of_a_plant(species: str) -> None:
     for variant in range(VARIANTS):
         mesh = plant(species, variant)
         assert len(coarse_plant(species, variant)) < 0.7 * len(mesh)
         low, high = mesh.bounds
         middle = np.array((0, 0, 0.6 * high[2]))
-        start, ways = outside_in(3000, variant)
-        side = np.abs(ways[:, 2]) < 0.3
-        found = hits(mesh, start[side] + middle, ways[side])
-        depth = 50 - found[np.isfinite(found)]
-        # Some end outside, some deep inside; a smooth body would have them all at one depth.
+        start, directions = rays_towards_origin(3000, variant)
+        side = np.abs(directions[:, 2]) < 0.3
+        distances = hits(mesh, start[side] + middle, directions[side])
+        depth = 50 - distances[np.isfinite(distances)]
+        # Some rays end outside, some deep inside; with a smooth surface, all would end at the same depth.
         assert len(depth) > 0.2 * side.sum() and depth.std() > 0.015 * (high - low)[:2].mean()
     assert (plant(species, 0).slot == LEAF).mean() > 0.5
 
 
-def test_street_coordinates_keep_lengths_on_the_centre_line() -> None:
+def test_street_coordinates_preserve_lengths_along_the_centre_line() -> None:
     course = Course(-100, 200, 1 / 150, np.random.default_rng(1))
     s = np.linspace(-150, 250, 4001)
     points = course.points(s, 0.0)
@@ -148,7 +148,7 @@ def test_street_coordinates_keep_lengths_on_the_centre_line() -> None:
 
 
 @pytest.mark.parametrize("stretch", [0, 1, 6])
-def test_the_ground_lies_where_it_says(stretch: int) -> None:
+def test_the_mesh_of_the_ground_matches_its_height_and_kind(stretch: int) -> None:
     world = build_world(0, stretch, 0.4)
     ground = world.scene.ground
     rng = np.random.default_rng(0)
@@ -161,11 +161,11 @@ def test_the_ground_lies_where_it_says(stretch: int) -> None:
     keep = paved & ~corners
     mesh = ground.mesh(np.random.default_rng(0))
     points = ground.points(s[keep], t[keep])
-    # Anywhere above stands nothing of the ground, and the first ground below is the surface asked for.
-    found = hits(mesh, points + UP * 30, np.tile((0, 0, -1.0), (len(points), 1)))
+    # No ground lies above the points, and the first hit below is the expected surface.
+    distances = hits(mesh, points + UP * 30, np.tile((0, 0, -1.0), (len(points), 1)))
     assert keep.sum() > 500
-    assert np.abs(30 - found).max() < 0.16
-    assert np.percentile(np.abs(30 - found), 97) < 0.02
+    assert np.abs(30 - distances).max() < 0.16
+    assert np.percentile(np.abs(30 - distances), 97) < 0.02
     slot = mesh.slot[
         Solid(mesh.triangles).first(
             (points + UP * 30).astype(np.float32), np.tile(np.float32([0, 0, -1]), (len(points), 1))
@@ -179,11 +179,11 @@ def test_the_ground_has_no_holes() -> None:
     mesh = world.scene.ground.mesh(np.random.default_rng(0))
     rng = np.random.default_rng(0)
     points = world.scene.ground.points(rng.uniform(-80, 110, 20_000), rng.uniform(-80, 80, 20_000))
-    found = hits(mesh, points + UP * 50, np.tile((0, 0, -1.0), (len(points), 1)))
-    assert np.isinf(found).sum() <= 2
+    distances = hits(mesh, points + UP * 50, np.tile((0, 0, -1.0), (len(points), 1)))
+    assert np.isinf(distances).sum() <= 2
 
 
-def test_kerbs_stand_between_road_and_pavement() -> None:
+def test_a_kerb_closes_the_step_between_road_and_pavement() -> None:
     rng = np.random.default_rng(0)
     road, pavement = NAMES.index("road"), NAMES.index("sidewalk")
     rects = [(-50.0, 50.0, -20.0, 20.0, pavement), (-50.0, 50.0, -3.0, 3.0, road)]
@@ -197,40 +197,42 @@ def test_kerbs_stand_between_road_and_pavement() -> None:
 
 
 @pytest.mark.parametrize("kind", STREETS)
-def test_streets_of_a_kind_differ(kind: str) -> None:
-    drawn = [draw_street(kind, 7.6, np.random.default_rng(k)) for k in range(20)]
-    assert len({(s.edge, s.parking, len(s.crossings)) for s in drawn}) > 10
-    for street in drawn:
+def test_sampled_streets_of_a_kind_vary_and_are_valid(kind: str) -> None:
+    streets = [sample_street(kind, 7.6, np.random.default_rng(k)) for k in range(20)]
+    assert len({(s.edge, s.parking, len(s.crossings)) for s in streets}) > 10
+    for street in streets:
         assert street.kind == kind and street.length > 20
-        assert -street.edge[RIGHT] < street.lanes[0].t < 0 and street.lanes[0].way == 1
+        assert -street.edge[RIGHT] < street.lanes[0].t < 0 and street.lanes[0].direction == 1
         for lane in street.lanes:
-            assert -street.edge[RIGHT] < lane.t < street.edge[LEFT] and lane.way == (1 if lane.t < 0 else -1)
+            assert -street.edge[RIGHT] < lane.t < street.edge[LEFT] and lane.direction == (1 if lane.t < 0 else -1)
         assert street.ends[0] < -20 and street.ends[1] > street.length + 20
         if kind == "junction":
             assert any(c.sides == (RIGHT, LEFT) and 0 < c.s < street.length + 20 for c in street.crossings)
 
 
-def test_all_kinds_of_street_are_met() -> None:
-    assert {str(generator(WORLD, 0, k).choice(STREETS, p=SHARES)) for k in range(40)} == set(STREETS)
+def test_all_kinds_of_street_are_sampled() -> None:
+    assert {str(rng_for(WORLD, 0, k).choice(STREETS, p=SHARES)) for k in range(40)} == set(STREETS)
     assert sum(SHARES) == pytest.approx(1)
 
 
-def test_no_two_movers_meet() -> None:
+def test_movers_do_not_collide() -> None:
     world = max((build_world(0, k, 0.4) for k in (0, 7)), key=lambda w: len(w.movers))
     assert len(world.movers) > 15
     for time in 0.4 * np.arange(STRETCH_FRAMES):
-        spans = []
+        extents = []
         for mover in world.movers:
             s, t, yaw = mover.place(time)
             low, high = mover.shape(time).mesh.bounds
             half = mover.scale * (high - low)[:2] / 2
-            spans.append((s, t, *(half if abs(np.cos(yaw)) > 0.5 else half[::-1])))
-        s, t, half_s, half_t = np.array(spans).T
-        meet = (np.abs(s[:, None] - s) < half_s[:, None] + half_s) & (np.abs(t[:, None] - t) < half_t[:, None] + half_t)
-        assert not (meet & ~np.eye(len(s), dtype=bool)).any()
+            extents.append((s, t, *(half if abs(np.cos(yaw)) > 0.5 else half[::-1])))
+        s, t, half_s, half_t = np.array(extents).T
+        overlap = (np.abs(s[:, None] - s) < half_s[:, None] + half_s) & (
+            np.abs(t[:, None] - t) < half_t[:, None] + half_t
+        )
+        assert not (overlap & ~np.eye(len(s), dtype=bool)).any()
 
 
-def test_surfaces_become_columns() -> None:
+def test_surfaces_are_frozen_into_columns() -> None:
     surfaces = Surfaces()
     dark = surfaces.add(Finish("paint", (0.03, 0.03, 0.03)), 10, 7)
     white = surfaces.add(Finish("paint", (0.9, 0.9, 0.9)), 10, 8)
@@ -241,17 +243,17 @@ def test_surfaces_become_columns() -> None:
     assert table.reflectance[road] == np.float32(MATERIALS["asphalt"].reflectance)
 
 
-def test_patches_are_uniform_and_coarse() -> None:
+def test_cell_noise_is_uniform_and_constant_within_a_cell() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-50, 50, (50_000, 3)).astype(np.float32)
-    value = patches(points, 0.5)
+    value = cell_noise(points, 0.5)
     assert value.min() >= 0 and value.max() < 1
     assert np.abs(np.histogram(value, 10, (0, 1))[0] / 50_000 - 0.1).max() < 0.01
     centre = (np.floor(points / 0.5) + 0.5) * np.float32(0.5)
-    assert np.array_equal(value, patches(centre, 0.5))
+    assert np.array_equal(value, cell_noise(centre, 0.5))
 
 
-def test_gains_belong_to_the_sensor() -> None:
+def test_laser_gains_are_fixed_for_a_sensor() -> None:
     from lidar_synth.geometry.sensor import load_sensor
 
     sensor = load_sensor("town")
@@ -260,9 +262,9 @@ def test_gains_belong_to_the_sensor() -> None:
     assert 0.9 < gains.mean() < 1.2 and gains.std() > 0.05
 
 
-def test_merging_joins_arrays() -> None:
+def test_merging_concatenates_triangles_and_slots() -> None:
     parts = [boxes([(0, 0, 0)], [(1, 1, 1)], slot) for slot in (1, 2)]
-    whole = merge(parts)
-    assert len(whole) == 24 and whole.slot.tolist() == [1] * 12 + [2] * 12
+    merged = merge(parts)
+    assert len(merged) == 24 and merged.slot.tolist() == [1] * 12 + [2] * 12
     assert len(merge([])) == 0
     assert len(loft(np.zeros((3, 4, 3)), np.arange(6).reshape(2, 3))) == 12

@@ -1,4 +1,4 @@
-"""Pictures show what is in the scan, and a page carries it whole."""
+"""Pictures, rendered views and sheets show the content of a scan."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ from lidar_synth.viz.colour import EMPTY, UNLABELLED, VALUES
 from lidar_synth.viz.render import box_segments
 
 
-def at(*places: tuple[float, float, float], label: list[int] | None = None, **fields: Any) -> Scan:
+def few_points(*places: tuple[float, float, float], label: list[int] | None = None, **fields: Any) -> Scan:
     """A scan of a few points."""
     points = np.array(places, np.float32).reshape(-1, 3)
     labels = None if label is None else np.array(label, np.uint8)
@@ -41,10 +41,10 @@ def at(*places: tuple[float, float, float], label: list[int] | None = None, **fi
 
 
 def wall(x: float, label: int) -> Scan:
-    """A dense 2 m square that stands across the x axis."""
+    """A dense 2 m square perpendicular to the x axis."""
     y, z = np.meshgrid(np.linspace(-1, 1, 121), np.linspace(-1, 1, 121))
     places = np.stack([np.full(y.size, x), y.ravel(), z.ravel()], -1)
-    return at(*map(tuple, places), label=[label] * y.size)
+    return few_points(*map(tuple, places), label=[label] * y.size)
 
 
 def joined(first: Scan, second: Scan) -> Scan:
@@ -52,7 +52,7 @@ def joined(first: Scan, second: Scan) -> Scan:
     return replace(first, points=np.concatenate([first.points, second.points]), **both)
 
 
-def test_a_picture_shows_every_cell(sensor: Sensor) -> None:
+def test_a_picture_has_the_colour_of_every_cell(sensor: Sensor) -> None:
     image = project(random_scan(sensor))
     labels = picture(image, "label")
     assert labels.shape == (*sensor.shape, 3)
@@ -62,30 +62,30 @@ def test_a_picture_shows_every_cell(sensor: Sensor) -> None:
         cells = image.mask & (image.label == train)
         np.testing.assert_array_equal(labels[cells], np.broadcast_to(colour, labels[cells].shape))
     for channel in ("range", "reflectance"):
-        shown = picture(image, channel)
-        assert (shown[~image.mask] == EMPTY).all()
-        # What is empty stays apart from the darkest colour of a return.
-        assert np.abs(shown[image.mask].astype(int) - EMPTY).sum(-1).min() > 30
+        pixels = picture(image, channel)
+        assert (pixels[~image.mask] == EMPTY).all()
+        # The colour of an empty cell differs clearly from the darkest colour of a return.
+        assert np.abs(pixels[image.mask].astype(int) - EMPTY).sum(-1).min() > 30
 
 
-def test_colours_follow_the_values() -> None:
+def test_colours_increase_with_the_values() -> None:
     ranges = np.tile(np.linspace(1, 80, 64, dtype=np.float32), (16, 1))
     scale = scales([unproject(RangeImage(ranges, SMALL))])["range"]
-    shown = picture(RangeImage(ranges, SMALL), "range", scale)
-    np.testing.assert_array_equal(shown[0], scale.table[scale.index(ranges[0])])
+    pixels = picture(RangeImage(ranges, SMALL), "range", scale)
+    np.testing.assert_array_equal(pixels[0], scale.table[scale.index(ranges[0])])
     assert (np.diff(scale.index(ranges[0]).astype(int)) >= 0).all()
     assert scale.index(np.array([-5.0, 0.0, 20.0, 80.0, 500.0])).tolist() == [0, 0, 128, 255, 255]  # gamma 1/2
 
 
 @pytest.mark.parametrize("name", ["height", "range", "reflectance"])
-def test_lightness_runs_one_way_along_a_table(name: str) -> None:
+def test_lightness_is_monotonic_along_a_colour_table(name: str) -> None:
     table = scales([random_scan(SMALL)])[name].table.astype(float)
     lightness = (table / 255) ** 2.2 @ [0.2126, 0.7152, 0.0722]
     step = np.diff(lightness) * np.sign(lightness[-1] - lightness[0])
     assert (step > -0.005).all()
 
 
-def test_a_channel_that_is_not_there_is_an_error() -> None:
+def test_a_missing_or_unknown_channel_is_refused() -> None:
     image = project(replace(random_scan(SMALL), label=None))
     with pytest.raises(ConfigError, match="'label'.*one of range, reflectance"):
         picture(image, "label")
@@ -98,31 +98,31 @@ def test_a_channel_that_is_not_there_is_an_error() -> None:
 def test_the_near_point_hides_the_far_one(camera: Camera, order: int) -> None:
     near, far = wall(5, CAR), wall(15, ROAD)
     both = joined(near, far)[np.arange(len(near) + len(far))[::order]]
-    seen = render(both, "label", camera=camera, size=(200, 200), rings=False)[100, 100]
-    assert np.abs(seen.astype(int) - COLOURS[CAR]).max() < 12
+    pixels = render(both, "label", camera=camera, size=(200, 200), rings=False)[100, 100]
+    assert np.abs(pixels.astype(int) - COLOURS[CAR]).max() < 12
     alone = render(far, "label", camera=camera, size=(200, 200), rings=False)[100, 100]
     assert np.abs(alone.astype(int) - COLOURS[ROAD]).max() < 12
 
 
-def test_seen_from_the_other_side_the_order_turns() -> None:
+def test_from_the_other_side_the_far_point_hides_the_near_one() -> None:
     both = joined(wall(5, CAR), wall(15, ROAD))
-    seen = render(both, "label", camera=Camera((40, 0, 0)), size=(200, 200), rings=False)[100, 100]
-    assert np.abs(seen.astype(int) - COLOURS[ROAD]).max() < 12
+    pixels = render(both, "label", camera=Camera((40, 0, 0)), size=(200, 200), rings=False)[100, 100]
+    assert np.abs(pixels.astype(int) - COLOURS[ROAD]).max() < 12
 
 
 def test_from_above_ahead_is_up_and_left_is_left() -> None:
-    scan = at((20, 0, 0), (0, 10, 0), label=[CAR, ROAD])
-    seen = render(scan, "label", camera=bird(25), size=(500, 500), rings=False).astype(int)
-    assert (np.abs(seen[48:52, 248:252] - COLOURS[CAR]).max(-1) < 70).any()  # 20 m: 200 pixels up from the middle
-    assert (np.abs(seen[248:252, 148:152] - COLOURS[ROAD]).max(-1) < 70).any()  # 10 m to the left
+    scan = few_points((20, 0, 0), (0, 10, 0), label=[CAR, ROAD])
+    pixels = render(scan, "label", camera=bird(25), size=(500, 500), rings=False).astype(int)
+    assert (np.abs(pixels[48:52, 248:252] - COLOURS[CAR]).max(-1) < 70).any()  # 20 m: 200 pixels up from the middle
+    assert (np.abs(pixels[248:252, 148:152] - COLOURS[ROAD]).max(-1) < 70).any()  # 10 m to the left
     far = np.ones((500, 500), bool)
     far[40:60, 240:260] = far[240:260, 140:160] = False
-    assert (seen[far] == EMPTY).all()
+    assert (pixels[far] == EMPTY).all()
 
 
 @settings(max_examples=40)
 @given(st.floats(-180, 180), st.floats(-80, 80), st.floats(5, 100))
-def test_an_orbit_keeps_its_target_in_the_middle(azimuth: float, elevation: float, distance: float) -> None:
+def test_an_orbit_keeps_its_target_in_the_centre(azimuth: float, elevation: float, distance: float) -> None:
     camera = Orbit(azimuth, elevation, distance, target=(1.0, -2.0, 0.5)).camera()
     pixel, depth, per_metre = camera.look(np.array([(1.0, -2.0, 0.5), (1.0, -2.0, 1.5)]), (640, 480))
     np.testing.assert_allclose(pixel[0], (320, 240), atol=0.01)
@@ -132,36 +132,36 @@ def test_an_orbit_keeps_its_target_in_the_middle(azimuth: float, elevation: floa
     assert abs(pixel[1, 0] - 320) < 0.01
 
 
-def test_points_behind_the_camera_are_not_seen() -> None:
-    scan = at((-30, 0, 0), (-21, 0.2, 0), label=[CAR, CAR])
+def test_points_behind_the_camera_are_not_drawn() -> None:
+    scan = few_points((-30, 0, 0), (-21, 0.2, 0), label=[CAR, CAR])
     assert (render(scan, "label", camera=Camera((-20, 0, 0)), size=(64, 64), rings=False) == EMPTY).all()
 
 
-def test_an_edge_casts_shade_on_what_lies_behind_it() -> None:
-    """Eye-dome lighting: beside the outline of a near wall the far one is darker than in its own middle."""
+def test_eye_dome_lighting_darkens_the_background_of_an_edge() -> None:
+    """Eye-dome lighting: next to the outline of a near wall, the far wall is darker than elsewhere."""
     y, z = np.meshgrid(np.linspace(-6, 6, 200), np.linspace(-6, 6, 200))
-    back = at(*map(tuple, np.stack([np.full(y.size, 15.0), y.ravel(), z.ravel()], -1)), label=[ROAD] * y.size)
-    seen = render(joined(wall(5, CAR), back), "label", camera=Camera((-20, 0, 0)), size=(400, 400), rings=False)
-    row = seen[200].astype(int)
+    back = few_points(*map(tuple, np.stack([np.full(y.size, 15.0), y.ravel(), z.ravel()], -1)), label=[ROAD] * y.size)
+    pixels = render(joined(wall(5, CAR), back), "label", camera=Camera((-20, 0, 0)), size=(400, 400), rings=False)
+    row = pixels[200].astype(int)
     is_car = np.abs(row - COLOURS[CAR]).sum(-1) < 40
     beside = np.flatnonzero(is_car)[-1] + np.arange(1, 4)
     assert np.abs(row[beside[0] + 40] - COLOURS[ROAD]).max() < 12
     assert row[beside].sum(-1).min() < 0.9 * row[beside[0] + 40].sum()
 
 
-def test_boxes_are_drawn_on_their_edges_and_on_request() -> None:
+def test_boxes_are_drawn_along_their_edges_unless_switched_off() -> None:
     boxes = Boxes(np.array([(0, 0, 0, 8, 4, 2, 0)], np.float32), ("Car",))
-    scan = at((0, 0, -2), label=[ROAD], boxes=boxes)
-    shown = render(scan, "label", camera=bird(10), size=(200, 200), rings=False)
+    scan = few_points((0, 0, -2), label=[ROAD], boxes=boxes)
+    pixels = render(scan, "label", camera=bird(10), size=(200, 200), rings=False)
     for row, column in [(60, 100), (140, 90), (100, 80), (100, 120)]:  # front, back, left and right edge
-        assert shown[row - 2 : row + 3, column - 2 : column + 3].max() > 180
-    assert shown[80, 100].min() > 90, "the line to the front"
-    assert shown[120, 100].max() < 90, "none to the back"
+        assert pixels[row - 2 : row + 3, column - 2 : column + 3].max() > 180
+    assert pixels[80, 100].min() > 90, "the line to the front"
+    assert pixels[120, 100].max() < 90, "none to the back"
     without = render(scan, "label", camera=bird(10), size=(200, 200), rings=False, boxes=False)
     assert (without[60, 95:105] == EMPTY).all()
 
 
-def test_box_segments_join_the_corners() -> None:
+def test_box_segments_connect_the_corners() -> None:
     boxes = Boxes(np.array([(1, 2, 3, 4, 2, 1.5, 0.7), (9, 0, 0, 1, 1, 1, 0)], np.float32), ("Car", "Misc"))
     segments = box_segments(boxes)
     assert segments.shape == (26, 2, 3)
@@ -172,12 +172,12 @@ def test_box_segments_join_the_corners() -> None:
 
 
 @pytest.mark.parametrize("by", sorted(VALUES))
-def test_every_quantity_colours_points(by: str) -> None:
+def test_points_can_be_coloured_by_every_quantity(by: str) -> None:
     scan = random_scan(SMALL)
-    seen = render(scan, by, size=(160, 90))
-    assert seen.shape == (90, 160, 3)
-    assert seen.dtype == np.uint8
-    assert (seen != EMPTY).any(-1).mean() > 0.02
+    pixels = render(scan, by, size=(160, 90))
+    assert pixels.shape == (90, 160, 3)
+    assert pixels.dtype == np.uint8
+    assert (pixels != EMPTY).any(-1).mean() > 0.02
     with pytest.raises(ConfigError, match="one of height, range, reflectance, domain"):
         render(replace(scan, label=None), "label", size=(16, 9))
     with pytest.raises(ConfigError, match="colour by 'velocity'"):
@@ -190,8 +190,8 @@ def test_real_and_synthetic_differ_in_colour() -> None:
     assert np.abs(real[32, 32].astype(int) - synthetic[32, 32]).max() > 100
 
 
-def test_a_scan_without_points_can_be_seen() -> None:
-    empty = at(label=[])
+def test_an_empty_scan_can_be_shown() -> None:
+    empty = few_points(label=[])
     assert (render(empty, "height", size=(32, 18), rings=False) == EMPTY).all()
     assert page_data(html_page([empty]))["scans"][0]["count"] == 0
     sheet(empty)
@@ -202,7 +202,7 @@ def rgb(figure: Any) -> np.ndarray:
     return np.asarray(figure.canvas.buffer_rgba())[..., :3]
 
 
-def test_a_sheet_names_its_scan_and_its_classes() -> None:
+def test_a_sheet_shows_its_scan_its_views_and_its_classes() -> None:
     scan = replace(random_scan(SMALL), boxes=Boxes(np.array([(5, 0, 0, 4, 2, 1.5, 0)], np.float32), ("Car",)))
     assert scan.label is not None
     figure = sheet(scan)
@@ -215,9 +215,9 @@ def test_a_sheet_names_its_scan_and_its_classes() -> None:
     above = next(axes for axes in figure.axes if "from above" in axes.get_title(loc="left"))
     assert above.get_xlim() == (50, -50)
     assert above.get_ylim() == (-50, 50)
-    shown = rgb(figure)
+    pixels = rgb(figure)
     for train in np.unique(scan.label[scan.label < IGNORE]):
-        assert (shown == COLOURS[train]).all(-1).any(), NAMES[train]
+        assert (pixels == COLOURS[train]).all(-1).any(), NAMES[train]
 
 
 def test_a_sheet_without_labels_has_no_legend_and_no_label_image() -> None:
@@ -233,7 +233,7 @@ def test_a_sheet_of_a_range_image_shows_its_cells() -> None:
     np.testing.assert_array_equal(axes.images[0].get_array(), picture(image, "label"))
 
 
-def test_many_scans_on_one_sheet() -> None:
+def test_a_contact_sheet_shows_every_scan() -> None:
     scans = [replace(random_scan(SMALL, seed=i), domain=i % 2) for i in range(5)]
     figure = contact_sheet(scans, title="five")
     captions = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
@@ -241,18 +241,18 @@ def test_many_scans_on_one_sheet() -> None:
     assert "random-3" in captions[3]
     assert "synthetic" in captions[3]
     assert figure.texts[0].get_text() == "five"
-    shown = [axes.images[0].get_array() for axes in figure.axes if axes.images]
-    for scan, distance, label in zip(scans, shown[1::3], shown[2::3], strict=True):
+    pixels = [axes.images[0].get_array() for axes in figure.axes if axes.images]
+    for scan, distance, label in zip(scans, pixels[1::3], pixels[2::3], strict=True):
         image = project(scan, channels=["label"])
         np.testing.assert_array_equal(label, picture(image, "label"))
         np.testing.assert_array_equal((distance == EMPTY).all(-1), ~image.mask)
     bare = contact_sheet([replace(scan, label=None) for scan in scans])
-    assert sum(bool(axes.images) for axes in bare.axes) == 10, "without labels nothing stands for them"
+    assert sum(bool(axes.images) for axes in bare.axes) == 10, "without labels there is no label image"
     with pytest.raises(ConfigError, match="no scans"):
         contact_sheet([])
 
 
-def test_files_are_written_whole(tmp_path: Path) -> None:
+def test_pictures_and_pages_are_written_to_files(tmp_path: Path) -> None:
     scans = [random_scan(SMALL, seed=i) for i in range(2)]
     write_view(tmp_path / "one.png", scans[:1])
     write_view(tmp_path / "two.png", scans)
@@ -262,7 +262,7 @@ def test_files_are_written_whole(tmp_path: Path) -> None:
     assert "<title>Two</title>" in (tmp_path / "two.html").read_text(encoding="utf-8")
 
 
-def test_what_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+def test_invalid_paths_and_empty_lists_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"out\.jpg; expected a file that ends in \.png or \.html"):
         write_view(tmp_path / "out.jpg", [random_scan(SMALL)])
     with pytest.raises(ConfigError, match="no scans"):

@@ -1,4 +1,4 @@
-"""The page: everything in one file, as the pictures have it."""
+"""The HTML page: self-contained, with the same points, range images and colours as the pictures."""
 
 import base64
 import json
@@ -41,7 +41,7 @@ def page(scans: list[Scan]) -> str:
     return html_page(scans, title="A <title> & more", notes="First.\n\nSecond & <last>. @data@")
 
 
-def test_the_points_come_back_from_the_page(page: str, scans: list[Scan]) -> None:
+def test_the_page_contains_all_points(page: str, scans: list[Scan]) -> None:
     for scan, packed in zip(scans, page_data(page)["scans"], strict=True):
         points = np.frombuffer(base64.b64decode(packed["points"]), POINT)
         assert len(points) == len(scan) == packed["count"]
@@ -59,7 +59,7 @@ def test_a_packed_point_is_eight_bytes_without_gaps() -> None:
     assert {name: place for name, (_, place) in POINT.fields.items()} == {"cell": 0, "reflectance": 6, "label": 7}
 
 
-def test_the_page_says_what_each_scan_is(page: str, scans: list[Scan]) -> None:
+def test_the_page_contains_the_facts_of_each_scan(page: str, scans: list[Scan]) -> None:
     first, second = page_data(page)["scans"]
     assert (first["id"], second["id"]) == ("random-0", "</script>&<b>")
     assert (first["domain"], second["domain"]) == (REAL, SYNTHETIC)
@@ -74,7 +74,7 @@ def test_the_page_says_what_each_scan_is(page: str, scans: list[Scan]) -> None:
     assert second["boxes"] == ""
 
 
-def test_the_page_carries_the_range_images(page: str, scans: list[Scan]) -> None:
+def test_the_page_contains_the_range_images(page: str, scans: list[Scan]) -> None:
     colours = scales(scans)
     for scan, packed in zip(scans, page_data(page)["scans"], strict=True):
         image = project(scan)
@@ -85,7 +85,7 @@ def test_the_page_carries_the_range_images(page: str, scans: list[Scan]) -> None
         assert pixels(packed["still"]).shape == (540, 960, 3)
 
 
-def test_the_page_colours_as_the_pictures_do(page: str, scans: list[Scan]) -> None:
+def test_the_page_uses_the_colour_tables_of_the_pictures(page: str, scans: list[Scan]) -> None:
     data, colours = page_data(page), scales(scans)
     table = np.frombuffer(base64.b64decode(data["table"]), np.uint8).reshape(len(colours), 256, 3)
     assert list(data["scales"]) == list(VALUES) == list(colours)
@@ -96,19 +96,19 @@ def test_the_page_colours_as_the_pictures_do(page: str, scans: list[Scan]) -> No
     np.testing.assert_array_equal(table[data["scales"]["label"]["row"], :19], COLOURS)
 
 
-def test_the_page_needs_nothing_from_outside(page: str) -> None:
+def test_the_page_loads_nothing_from_outside(page: str) -> None:
     markup = page.replace(json.dumps(page_data(page)), "")
     assert not re.search(r"https?:|//cdn|@import|import\s*\(|\bfetch\b|XMLHttpRequest|<link|src=[\"'](?!data:)", markup)
     assert not re.search(r"@(title|notes|draw|script)@", page)
 
 
-def test_text_of_the_user_is_text_on_the_page(page: str) -> None:
+def test_user_text_is_escaped_on_the_page(page: str) -> None:
     assert "<title>A &lt;title&gt; &amp; more</title>" in page
     assert "<p>First.</p><p>Second &amp; &lt;last&gt;. @data@</p>" in page
     assert page.count("</script>") == 3, "an id cannot end the data"
 
 
-def test_a_camera_image_stands_on_the_page_where_there_is_one(tmp_path: Path) -> None:
+def test_an_existing_camera_image_is_shown_on_the_page(tmp_path: Path) -> None:
     Image.new("RGB", (1408, 376), (10, 200, 30)).save(tmp_path / "camera.png")
     with_image = replace(random_scan(SMALL), image_path=tmp_path / "camera.png")
     [scan] = page_data(html_page([with_image]))["scans"]
@@ -119,14 +119,14 @@ def test_a_camera_image_stands_on_the_page_where_there_is_one(tmp_path: Path) ->
     assert "camera" not in [p["title"] for p in page_data(html_page([lost]))["scans"][0]["pictures"]]
 
 
-def test_a_full_scan_is_small_enough_to_send() -> None:
+def test_a_page_with_a_full_scan_is_below_2_4_megabytes() -> None:
     """120,000 points in 8 bytes each and base64; noise is the worst case for its pictures."""
     page = html_page([random_scan(load_sensor("hdl64e_kitti360"), 120_000)])
     assert len(page_data(page)["scans"][0]["points"]) == 120_000 * 8 * 4 / 3
     assert len(page) < 2.4e6
 
 
-def test_the_page_has_every_element_that_its_script_asks_for() -> None:
+def test_the_page_has_every_element_that_its_script_uses() -> None:
     folder = files("lidar_synth.viz")
     asked = set(re.findall(r'\$\("(\w+)"\)', folder.joinpath("page.js").read_text()))
     there = set(re.findall(r'id="(\w+)"', folder.joinpath("page.html").read_text()))

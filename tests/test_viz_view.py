@@ -30,7 +30,7 @@ View = Callable[..., Result]
 
 @pytest.fixture
 def view(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> View:
-    """Runs ``lidar-synth view`` on a folder with three scans, in an empty folder and without a screen."""
+    """Runs ``lidar-synth view`` on a folder of three scans, from an empty working directory and without a screen."""
     data = tmp_path / "data"
     data.mkdir()
     for i in range(3):
@@ -59,13 +59,13 @@ def test_view_writes_a_page_where_there_is_no_screen(view: View) -> None:
     (["--index", "-1"], ["000002"]), (["--index", "-3", "--count", "2"], ["000000", "000001"]),
     (["--count", "9"], ["000000", "000001", "000002"]),
 ])  # fmt: skip
-def test_view_takes_the_scans_that_are_asked_for(view: View, args: list[str], ids: list[str]) -> None:
+def test_view_shows_the_selected_scans(view: View, args: list[str], ids: list[str]) -> None:
     assert view(*args, "--out", "out.html").exit_code == 0
     shown = page_data(Path("out.html").read_text(encoding="utf-8"))["scans"]
     assert [scan["id"][-6:] for scan in shown] == ids
 
 
-def test_view_takes_a_sensor_and_writes_a_sheet(view: View) -> None:
+def test_view_accepts_a_sensor_and_writes_a_sheet(view: View) -> None:
     assert view("--sensor", "os1_128", "--out", "one.html").exit_code == 0
     [scan] = page_data(Path("one.html").read_text(encoding="utf-8"))["scans"]
     assert scan["sensor"] == "os1_128"
@@ -80,7 +80,7 @@ def test_view_takes_a_sensor_and_writes_a_sheet(view: View) -> None:
     (["--out", "scan.jpg"], r"scan\.jpg; expected a file that ends in \.png or \.html"),
     (["--sensor", "velodyne"], r"sensor 'velodyne'; expected one of"),
 ])  # fmt: skip
-def test_a_wrong_call_says_what_is_right(view: View, args: list[str], message: str) -> None:
+def test_invalid_arguments_are_explained(view: View, args: list[str], message: str) -> None:
     result = view(*args)
     assert isinstance(result.exception, ConfigError)
     assert re.search(message, str(result.exception))
@@ -88,8 +88,8 @@ def test_a_wrong_call_says_what_is_right(view: View, args: list[str], message: s
 
 
 @pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="a screen is always there")
-def test_no_window_where_no_display_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A DISPLAY that leads nowhere is no screen: open3d would wait there for ever."""
+def test_there_is_no_window_if_no_display_server_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A DISPLAY without a server is not a screen: open3d would wait forever."""
     monkeypatch.setenv("DISPLAY", ":4242")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
@@ -97,13 +97,13 @@ def test_no_window_where_no_display_answers(monkeypatch: pytest.MonkeyPatch) -> 
     assert not window.show([random_scan(SMALL)])
 
 
-def test_no_window_without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_is_no_window_without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(window, "has_screen", lambda: True)
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert not window.show([random_scan(SMALL)])
 
 
-def test_what_the_window_draws() -> None:
+def test_the_window_draws_points_and_boxes() -> None:
     try:
         window.import_open3d()
     except LibraryError as error:

@@ -1,4 +1,4 @@
-"""Worlds of boxes on a plane, cast ray by ray, so that what a sensor sees of them is known exactly."""
+"""Worlds of boxes on a plane, ray-cast analytically, so that the exact scan is known."""
 
 from collections.abc import Sequence
 
@@ -16,17 +16,17 @@ CAR, WALL, ROAD = TRAIN_ID["car"], TRAIN_ID["building"], TRAIN_ID["road"]
 
 
 def car(x: float, y: float, yaw: float = 0.0, ground: float = -HEIGHT) -> NDArray[np.float32]:
-    """(7,) a car on the ground."""
+    """(7,) the box of a car on the ground."""
     return np.array([x, y, ground + 0.8, 4.2, 1.8, 1.6, yaw], np.float32)
 
 
 def wall(x: float, y: float, yaw: float = 0.0, length: float = 10.0, height: float = 4.0) -> NDArray[np.float32]:
-    """(7,) a thin wall that stands in the ground."""
+    """(7,) the box of a thin wall that reaches 0.1 m into the ground."""
     return np.array([x, y, height / 2 - HEIGHT - 0.1, length, 0.3, height, yaw], np.float32)
 
 
 def distances(box: NDArray[np.float32], rays: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(...) metres along unit rays (..., 3) from the origin to a box; inf where they miss it."""
+    """(...) distances in metres along unit rays (..., 3) from the origin to a box; inf where they miss it."""
     c, s = np.cos(float(box[6])), np.sin(float(box[6]))
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     local, eye = rays.astype(np.float64) @ turn.T, -turn @ box[:3].astype(np.float64)
@@ -44,7 +44,7 @@ def cast(
     sensor: Sensor = SENSOR,
     id: str = "world",
 ) -> Scan:
-    """The scan of a world: road, walls and cars with boxes, labels and instances 1, 2, ..."""
+    """The scan of a world of road, walls and cars; cars have boxes and instances 1, 2, ..."""
     rays = sensor.ray_directions()
     with np.errstate(divide="ignore"):
         road = np.where(rays[..., 2] < 0, ground / rays[..., 2].astype(np.float64), np.inf)

@@ -12,9 +12,9 @@ from PIL import Image
 from tqdm import tqdm
 
 from lidar_synth.town import STRETCH_FRAMES, Town
-from lidar_synth.town.shading import develop, draw_light, shade
+from lidar_synth.town.shading import sample_light, shade, tone_map
 from lidar_synth.town.street import KINDS
-from lidar_synth.town.world import LIGHT, generator
+from lidar_synth.town.world import LIGHT, rng_for
 from lidar_synth.viz import write_view
 
 SIZE = (510, 330)
@@ -33,7 +33,7 @@ def stretches(town: Town) -> list[int]:
 
 def from_above(town: Town, index: int) -> np.ndarray:
     """(H, W, 3) uint8: a stretch seen from behind the ego vehicle, 22 m up."""
-    stage, pose, _ = town.moment(index)
+    snapshot, pose, _ = town.moment(index)
     back, side, up = pose[:3, 0], pose[:3, 1], np.array((0.0, 0.0, 1.0))
     eye = pose[:3, 3] - 22 * back - 11 * side + 20 * up
     ahead = pose[:3, 3] + 20 * back - eye
@@ -45,10 +45,10 @@ def from_above(town: Town, index: int) -> np.ndarray:
     x, y = np.meshgrid((np.arange(2 * width) + 0.5) / width - 1, (np.arange(2 * height) + 0.5) / width - height / width)
     rays = ahead + 0.62 * (x[..., None] * right - y[..., None] * np.cross(right, ahead))
     rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
-    light = draw_light(generator(LIGHT, town.seed, index // STRETCH_FRAMES))
-    image, _ = shade(stage, eye.astype(np.float32), rays, town.world(index).surfaces, light)
+    light = sample_light(rng_for(LIGHT, town.seed, index // STRETCH_FRAMES))
+    image, _ = shade(snapshot, eye.astype(np.float32), rays, town.world(index).surfaces, light)
     linear = np.minimum(image, 1.2).reshape(height, 2, width, 2, 3).mean((1, 3))
-    return develop(linear * float(0.23 / np.median(linear.mean(-1))))
+    return tone_map(linear * float(0.23 / np.median(linear.mean(-1))))
 
 
 def save(path: Path, pixels: np.ndarray, width: int, colours: int) -> None:

@@ -1,1 +1,1 @@
-"""Scans, sensors and range images: everything that knows angles and metres, and nothing of networks."""
+"""Scans, sensors, range images and the projections between them; no neural networks."""

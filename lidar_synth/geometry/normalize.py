@@ -18,7 +18,7 @@ from lidar_synth.geometry.sensor import Sensor
 
 LABEL_BITS = 5
 NO_LABEL = len(NAMES)
-"""Code of a cell without a label, after the 19 classes."""
+"""Code of an unlabelled cell; codes 0..18 are the classes."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Normalisation:
         return float(np.log2(self.range_max + self.offset)) if self.kind == "log" else self.range_max
 
     def inside(self, distance: torch.Tensor) -> torch.Tensor:
-        """Whether each range (any shape, metres) is a return, which is to say inside the limits."""
+        """Whether each range (any shape, metres) is a return, that is, inside the limits."""
         return (distance > self.range_min) & (distance < self.range_max)
 
     def encode(self, distance: torch.Tensor) -> torch.Tensor:
@@ -147,26 +147,26 @@ def decode_labels(bits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     codes = torch.arange(NO_LABEL + 1, device=bits.device, dtype=torch.uint8)
     codes = torch.where(codes == NO_LABEL, IGNORE, codes)
     corners = encode_labels(codes[None, None].to(torch.uint8))[0, :, 0].to(bits.dtype)  # (5, 20)
-    # |bits - corner|^2 without its constant part: the nearest corner is the one with the largest product.
+    # All codes have the same norm, so the nearest one has the largest dot product with the bits.
     nearest = torch.einsum("bchw,ck->bkhw", bits, corners).argmax(1)
     gap = (bits - corners[:, nearest].movedim(0, 1)).abs().amax(1)
     return codes[nearest].to(torch.uint8), (1 - gap).clamp(0, 1).float()
 
 
 CHANNELS = {"range": 1, "reflectance": 1, "label": LABEL_BITS}
-"""What a network's tensor can hold: {channel of a range image: channels of the tensor}."""
+"""The channels that a network's tensor can contain: {name of a range image's channel: number of tensor channels}."""
 
 
 @dataclass(frozen=True)
 class TensorFormat:
-    """Which channels of a range image stand, one after the other, in a network's tensor, and in which scale.
+    """The layout of a network's tensor: the channels of a range image that it contains, and the range normalisation.
 
     Args:
-        channels: names of ``CHANNELS``, in the tensor's order; "range" is one of them.
-        normalisation: of the range.
+        channels: names of ``CHANNELS``, in the tensor's order; "range" must be one of them.
+        normalisation: the normalisation of the range.
 
     Raises:
-        ConfigError: on an unknown or repeated channel, or where "range" is missing.
+        ConfigError: on an unknown or repeated channel, or if "range" is missing.
     """
 
     channels: tuple[str, ...]
@@ -180,22 +180,22 @@ class TensorFormat:
 
     @property
     def size(self) -> int:
-        """C, channels of the tensor."""
+        """C, the number of channels of the tensor."""
         return sum(CHANNELS[name] for name in self.channels)
 
     def encode(self, fields: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Fields of range images to a tensor.
+        """Encode the fields of range images as a tensor.
 
         Args:
             fields: (B, H, W) each: "range" float32 metres, 0 = no return; "reflectance" float32 in [0, 1];
-                "label" uint8 train ids, 255 = ignore; more than ``channels`` do no harm.
+                "label" uint8 train ids, 255 = ignore; further fields are ignored.
 
         Returns:
             (B, C, H, W) float32 in [-1, 1].
 
         Raises:
-            ConfigError: where a channel is missing.
-            DataError: on a label that is no train id.
+            ConfigError: if a channel is missing.
+            DataError: on a label that is not a train id.
         """
         if missing := [name for name in self.channels if name not in fields]:
             raise ConfigError(f"range images without {missing}", f"all of {self.channels}")
@@ -207,16 +207,17 @@ class TensorFormat:
         return torch.cat([encoders[name](fields[name]) for name in self.channels], 1)
 
     def decode(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
-        """A tensor to the fields of range images; without a return, a cell has no reflectance, label or confidence.
+        """Decode a tensor to the fields of range images.
 
         Args:
-            x: (B, C, H, W) floating.
+            x: (B, C, H, W) floating point.
 
         Returns:
-            (B, H, W) each, as for ``encode``; with "label" also "confidence" float32 in [0, 1].
+            (B, H, W) each, as for ``encode``; with "label" also "confidence" float32 in [0, 1]. A cell without a
+            return has reflectance 0, label 255 (ignore) and confidence 0.
 
         Raises:
-            DataError: on another number of channels, NaN or infinity.
+            DataError: on a wrong number of channels, NaN or infinity.
         """
         if x.ndim != 4 or x.shape[1] != self.size:
             raise DataError(f"a tensor of shape {tuple(x.shape)}", f"(B, {self.size}, H, W) for {self.channels}")
@@ -236,14 +237,14 @@ class TensorFormat:
         return fields
 
     def from_images(self, images: Sequence[RangeImage]) -> torch.Tensor:
-        """(B, C, H, W) of B range images of one shape; see ``encode``."""
+        """Encode B range images of one shape as a tensor (B, C, H, W); see ``encode``."""
         values: list[dict[str, Any]] = [{**image.channels, "range": image.range} for image in images]
         if missing := [name for name in self.channels if any(name not in v for v in values)]:
             raise ConfigError(f"range images without {missing}", f"all of {self.channels}")
         return self.encode({n: torch.from_numpy(np.stack([v[n] for v in values])) for n in self.channels})
 
     def to_images(self, x: torch.Tensor, sensor: Sensor) -> list[RangeImage]:
-        """B range images of a tensor (B, C, H, W) on the sensor's grid; see ``decode``."""
+        """Decode a tensor (B, C, H, W) to B range images on the sensor's grid; see ``decode``."""
         fields = {name: values.cpu().numpy() for name, values in self.decode(x).items()}
         distance = fields.pop("range")
         return [RangeImage(d, sensor, {n: v[i] for n, v in fields.items()}) for i, d in enumerate(distance)]

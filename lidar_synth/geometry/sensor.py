@@ -19,8 +19,8 @@ from lidar_synth.errors import ConfigError, shorten
 from lidar_synth.files.parsing import parse_yaml, read_yaml
 
 Rays = Literal["centre", "corner"]
-"""Where in its cell a ray points: the centre (a point returns to its own cell) or, as the public code of
-R2Flow and LiDM has it, the upper left corner."""
+"""The point of a cell through which its ray passes: the centre (so that unprojected points project back to the same
+cell) or the upper left corner, as in the public code of R2Flow and LiDM."""
 
 MOST_CELLS = 1 << 22
 """Rows times columns of a sensor; the largest that are sold have 2^19."""
@@ -99,23 +99,23 @@ class Sensor:
                               "0 <= range_min < range_max, metres")  # fmt: skip
 
     def _check_types(self) -> None:
-        """Refuse what is no text, no whole number or no finite number; lists become tuples of float."""
+        """Check that values are texts, integers or finite numbers; convert lists to tuples of float."""
         for key in ("name", "description"):
             if not isinstance(getattr(self, key), str):
                 raise self._error(f"{key} = {getattr(self, key)!r}", "text")
         if not self.name:
             raise self._error("an empty name", "text, which files of its scans tell")
         for key in ("columns", "range_min", "range_max", "rows", "fov_up", "fov_down"):
-            value, whole = getattr(self, key), key in ("columns", "rows")
-            fits = _is_whole(value) if whole else _is_finite(value)
-            if not fits and not (value is None and key in _OPTIONAL):
-                raise self._error(f"{key} = {value!r}", "a whole number" if whole else "a finite number")
+            value, integer = getattr(self, key), key in ("columns", "rows")
+            valid = _is_integer(value) if integer else _is_finite(value)
+            if not valid and not (value is None and key in _OPTIONAL):
+                raise self._error(f"{key} = {value!r}", "a whole number" if integer else "a finite number")
         for key in ("elevations", "beams", "heights"):
             table = getattr(self, key)
             if table is None:
                 continue
-            known = isinstance(table, list | tuple) or (isinstance(table, np.ndarray) and table.ndim == 1)
-            if not known or not len(table) or not all(map(_is_finite, table)):
+            is_list = isinstance(table, list | tuple) or (isinstance(table, np.ndarray) and table.ndim == 1)
+            if not is_list or not len(table) or not all(map(_is_finite, table)):
                 raise self._error(f"{key} = {table!r}", "a list of finite numbers")
             object.__setattr__(self, key, tuple(float(value) for value in table))
 
@@ -220,16 +220,16 @@ def _ray_directions(sensor: Sensor, rays: Rays) -> NDArray[np.float32]:
 
 
 def _is_finite(value: object) -> bool:
-    known = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    return bool(known and -1e300 < value < 1e300)  # type: ignore[operator]  # no isfinite: an int may have no float
+    is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    return bool(is_number and -1e300 < value < 1e300)  # type: ignore[operator]  # isfinite fails on very large integers
 
 
-def _is_whole(value: object) -> bool:
+def _is_integer(value: object) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def _entries(values: Any, where: str) -> dict[Any, dict[str, Any]]:
-    """The sensors of a YAML file by name."""
+    """The entries of a YAML file: {name of a sensor: its values}."""
     if not isinstance(values, dict) or not all(isinstance(v, dict) for v in values.values()):
         raise ConfigError(f"{where} holds {type(values).__name__}", "a mapping from a sensor's name to its values")
     return values

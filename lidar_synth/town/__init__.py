@@ -1,4 +1,4 @@
-"""The embedded world: procedural streets, cast with the sensor's rays (no download, no network)."""
+"""The procedural town: synthetic streets, ray-cast with a sensor's beams (no download, no neural network)."""
 
 from lidar_synth.town.export import LAYOUTS, export_town
 from lidar_synth.town.town import Town

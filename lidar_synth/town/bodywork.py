@@ -1,7 +1,7 @@
-"""What vehicles are made of: a skin through cross-sections, wheels, lights and plates, and their finishes.
+"""Parts of vehicles: body shells, wheels, lights and number plates, and their finishes.
 
-A body is a loft: cross-sections from the front bumper to the tail, each given by its height and width at
-sill, belt line and roof; a glasshouse is the part above the belt line whose panels are glass.
+A body is lofted through cross-sections from the front bumper to the tail. Each cross-section is given by its height
+and width at sill, belt line and roof; windows are glass panels above the belt line.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lidar_synth.town.materials import RGB, Finish
 from lidar_synth.town.meshes import Mesh, disc, loft, merge, quads, tube
 
-PAINT, GLASS, TYRE, TRIM, PLATE, HEAD, TAIL, INSIDE, RIM, SECOND = range(10)
+PAINT, GLASS, TYRE, TRIM, PLATE, HEAD, TAIL, INTERIOR, RIM, SECONDARY = range(10)
 
 
 FINISHES = (
@@ -27,18 +27,18 @@ PAINTS: tuple[RGB, ...] = (
     (0.07, 0.10, 0.25), (0.10, 0.18, 0.40), (0.48, 0.05, 0.05), (0.62, 0.09, 0.07), (0.09, 0.20, 0.13),
     (0.55, 0.50, 0.40), (0.70, 0.62, 0.20), (0.25, 0.17, 0.12),
 )  # fmt: skip
-"""Colours on the road, about as often as they are met."""
+"""Colours of vehicles; common ones appear in several shades."""
 
 
 class Station(NamedTuple):
     """One cross-section of a body.
 
     Args:
-        at: where, share of the length from the front.
-        sill, belt, top: metres above the ground.
-        width: at the belt line, share of the vehicle's.
-        roof: width at the top, share of the vehicle's.
-        side, above: slots of the panels from here to the next one, beside and above the belt line.
+        at: position along the body, 0 = front, 1 = rear.
+        sill, belt, top: heights of the sill, the belt line and the roof, metres above the ground.
+        width: width at the belt line as a share of the vehicle's width.
+        roof: width at the top as a share of the vehicle's width.
+        side, above: slots of the side windows and of the panels above them, from this cross-section to the next.
     """
 
     at: float
@@ -52,9 +52,12 @@ class Station(NamedTuple):
 
 
 def shell(stations: list[Station], length: float, width: float, lit: bool = False) -> Mesh:
-    """The skin through the stations; ``side`` and ``above`` are the panels from a station to the next.
+    """The closed surface of a body through its cross-sections.
 
-    ``lit`` makes the facets at the four corners of the body its lights.
+    Args:
+        stations: the cross-sections, front to rear.
+        length, width: metres.
+        lit: whether the facets at the four corners of the body are its lights.
     """
     sections = []
     for s in stations:
@@ -73,13 +76,13 @@ def shell(stations: list[Station], length: float, width: float, lit: bool = Fals
 
 
 def _end(section: NDArray[np.float64]) -> Mesh:
-    """The flat front or back: strips between the two halves of a section."""
+    """The flat front or rear of a body: quadrilaterals between the left and right half of a cross-section."""
     right, left = section[:5], section[::-1][:5]
     return quads(np.stack([right[:-1], right[1:], left[1:], left[:-1]], 1), np.array([TRIM, PAINT, PAINT, PAINT]))
 
 
 def wheels(axles: list[float], radius: float, width: float, arch: bool = True) -> Mesh:
-    """Pairs of wheels at each x of ``axles``, in dark arches where the body comes down over them."""
+    """A pair of wheels at each x of ``axles`` (metres), with dark wheel arches if ``arch`` is set."""
     parts = []
     for x in axles:
         for side in (-1, 1):
@@ -96,7 +99,15 @@ def wheels(axles: list[float], radius: float, width: float, arch: bool = True) -
 
 
 def face(x: float, low: float, high: float, width: float, slots: tuple[int, int], plate: float) -> Mesh:
-    """Lights left and right and the number plate on a flat front or back."""
+    """Two lights and a number plate on the flat front or rear of a body.
+
+    Args:
+        x: metres, where along the vehicle.
+        low, high: metres, lower and upper edge of the lights.
+        width: metres, of the vehicle.
+        slots: of the lights and of the number plate.
+        plate: metres, lower edge of the number plate.
+    """
     lights = [[(x, s * 0.46 * width, low), (x, s * 0.30 * width, low), (x, s * 0.30 * width, high),
                (x, s * 0.46 * width, high)] for s in (-1, 1)]  # fmt: skip
     plates = [[(x, -0.26, plate), (x, 0.26, plate), (x, 0.26, plate + 0.11), (x, -0.26, plate + 0.11)]]

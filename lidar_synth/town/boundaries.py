@@ -1,28 +1,30 @@
-"""What bounds a lot towards a street, in pieces that follow the street's bends."""
+"""Boundaries of lots (hedges, walls, fences), in pieces that follow the bends of the street."""
 
 from itertools import pairwise
 
 import numpy as np
 
-from lidar_synth.town.fences import bar_fence, hedged, low_wall, wire_fence
-from lidar_synth.town.furniture import Thing
+from lidar_synth.town.fences import bar_fence, clipped_hedge, low_wall, wire_fence
+from lidar_synth.town.furniture import StaticObject
 from lidar_synth.town.materials import Finish
 from lidar_synth.town.scene import Scene
 
 KINDS = ("hedge", "hedge", "wall", "bars", "boards", "wire", "wallhedge", "wallhedge", "wallbars", "none")
-"""Boundaries, about as often as they are met."""
+"""Kinds of boundary; a kind that is listed twice is twice as frequent."""
 
 
-def bound(scene: Scene, kind: str, ends: tuple[float, float], at: float, along: bool, rng: np.random.Generator) -> None:
+def put_boundary(
+    scene: Scene, kind: str, ends: tuple[float, float], at: float, along: bool, rng: np.random.Generator
+) -> None:
     """Put a boundary into the scene.
 
     Args:
-        scene: where.
+        scene: the scene to add it to.
         kind: one of ``KINDS``.
-        ends: metres, the coordinate along the boundary at which it starts and ends.
-        at: metres, the other coordinate.
-        along: True if it runs along s, False along t.
-        rng: draws its height, material and leaves.
+        ends: metres, start and end along its running coordinate.
+        at: metres, its position in the other coordinate.
+        along: True if it runs along s, False if it runs along t.
+        rng: samples its height, material and leaves.
     """
     if kind == "none" or ends[1] - ends[0] < 0.8:
         return
@@ -31,21 +33,21 @@ def bound(scene: Scene, kind: str, ends: tuple[float, float], at: float, along: 
     stone = Finish(str(rng.choice(["stone", "concrete", "brick"]))) if built else Finish("render", (0.8, 0.78, 0.72))
     pieces = np.linspace(*ends, max(1, int(np.ceil((ends[1] - ends[0]) / 7))) + 1)
     for a, b in pairwise(pieces):
-        for thing, aside, lift in _piece(kind, b - a, height, stone, shade, rng):
+        for item, aside, lift in _piece(kind, b - a, height, stone, shade, rng):
             if along:
-                scene.put(thing, a, at + aside, 0.0, lift)
+                scene.put(item, a, at + aside, 0.0, lift)
             else:
-                scene.put(thing, at - aside, a, np.pi / 2, lift)
+                scene.put(item, at - aside, a, np.pi / 2, lift)
 
 
 def _piece(
     kind: str, length: float, height: float, stone: Finish, shade: float, rng: np.random.Generator
-) -> list[tuple[Thing, float, float]]:
-    """What one piece is made of: (thing, metres to its left, metres above the ground)."""
+) -> list[tuple[StaticObject, float, float]]:
+    """The objects that make up one piece: (object, metres to its left, metres above the ground)."""
     iron = (shade, shade, 1.1 * shade)
     match kind:
         case "hedge":
-            return [(hedged(length, rng), 0.0, 0.0)]
+            return [(clipped_hedge(length, rng), 0.0, 0.0)]
         case "wall":
             return [(low_wall(length, height, stone), 0.0, 0.0)]
         case "bars":
@@ -56,5 +58,5 @@ def _piece(
             return [(wire_fence(length, height), 0.0, 0.0)]
         case "wallhedge":
             behind = 0.4 if shade > 0.3 else 0.0
-            return [(low_wall(length, 0.4, stone), 0.0, 0.0), (hedged(length, rng), behind, 0.35)]
+            return [(low_wall(length, 0.4, stone), 0.0, 0.0), (clipped_hedge(length, rng), behind, 0.35)]
     return [(low_wall(length, 0.45, stone), 0.0, 0.0), (bar_fence(length, 0.7, 0.13, iron, False), 0.0, 0.5)]

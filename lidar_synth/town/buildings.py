@@ -1,4 +1,4 @@
-"""Houses, rows, blocks and halls: four walls, a roof, rooms behind the windows, balconies; and garages."""
+"""Meshes of buildings (four walls, a roof, rooms behind the windows, balconies) and of garages."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from lidar_synth.town.meshes import Mesh, boxes, merge, quads, tube
 
 
 def _balconies(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
-    """Slabs along parts of the front with railings of bars or panels."""
+    """Balconies along parts of the front: slabs with railings of bars or of solid panels."""
     parts = []
     x = rng.uniform(0.5, 1.5)
     solid = rng.random() < 0.5
@@ -43,12 +43,13 @@ def _balconies(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
 
 
 def _roof(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
+    """The roof with chimney and skylights, or a flat roof."""
     w, d, z, over = plan.width, plan.depth, plan.eaves, 0.45
     if plan.roof == "flat":
         edge = boxes([(-0.1, -0.1, z - 0.2)], [(w + 0.1, d + 0.1, z + 0.25)], SLAB)
         return merge([edge, boxes([(0.3 * w, 0.3 * d, z)], [(0.3 * w + 1.6, 0.3 * d + 1.6, z + 1.4)], SLAB)])
     cross = plan.roof == "cross"
-    # Drawn with the ridge along x; a cross gable is the same roof with its axes swapped.
+    # Built with the ridge along x; a cross gable is the same roof with x and y swapped.
     along, deep = (d, w) if cross else (w, d)
     top = z + rng.uniform(0.32, 0.5) * deep
     low = z - 2 * over * (top - z) / deep
@@ -70,6 +71,7 @@ def _roof(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
 
 
 def _skylights(slope: list[tuple[float, float, float]], count: int, rng: np.random.Generator) -> Mesh:
+    """``count`` windows at random positions on a slope, given by its corners."""
     a, b, c, d = np.array(slope, float)
     up = np.cross(b - a, d - a)
     up = 0.04 * up / np.linalg.norm(up)
@@ -82,7 +84,7 @@ def _skylights(slope: list[tuple[float, float, float]], count: int, rng: np.rand
 
 
 def building(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
-    """A building of the given measures; see ``finishes`` for its slots."""
+    """The mesh of a building; the slots are those of ``facades.finishes``."""
     w, d = plan.width, plan.depth
     axes = np.eye(3)
     sides: list[tuple[float, Frame]] = [

@@ -1,7 +1,7 @@
-"""The camera beside the sensor: KITTI-360's image_00 in its geometry, and which ray each pixel looks along.
+"""The town's camera: its calibration and the rays of its pixels.
 
-The town's camera stands 0.8 m before the LiDAR and 0.3 m to its left, looks straight ahead and five degrees down;
-focal length, principal point and size are those of KITTI-360's rectified image_00.
+The camera is mounted 0.8 m in front of the LiDAR and 0.3 m to its left; it points straight ahead and five degrees
+down. Focal length, principal point and image size are those of KITTI-360's rectified image_00.
 """
 
 import numpy as np
@@ -15,6 +15,7 @@ _PLACE = (0.80, 0.30, -0.18)
 
 
 def _calibration() -> Calibration:
+    """The calibration from the position, pitch and intrinsics of the camera."""
     c, s = np.cos(_PITCH), np.sin(_PITCH)
     level = np.eye(4)
     level[:3, 3] = np.negative(_PLACE)
@@ -24,18 +25,18 @@ def _calibration() -> Calibration:
 
 
 CAMERA = _calibration()
-"""The town's camera."""
+"""The calibration of the town's camera."""
 
 
 def pixel_rays(pose: Pose, pixels: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where the camera is and along which rays its pixels look, in the world.
+    """The position of the camera and the directions of its pixels in the world frame.
 
     Args:
         pose: (4, 4) sensor to world.
-        pixels: (N, 2) column and row; whole numbers are the middles of pixels.
+        pixels: (N, 2) column and row; integers are pixel centres.
 
     Returns:
-        (3,) the camera's place in metres, and (N, 3) unit vectors.
+        (3,) position of the camera in metres, and (N, 3) unit vectors.
     """
     camera = (pose @ CAMERA.sensor_from_camera).astype(np.float32)
     (fx, _, cx, _), (_, fy, cy, _), _ = CAMERA.projection.astype(np.float32)
@@ -45,7 +46,7 @@ def pixel_rays(pose: Pose, pixels: NDArray[np.floating]) -> tuple[NDArray[np.flo
 
 
 def all_pixels() -> NDArray[np.float32]:
-    """(H W, 2) column and row of every pixel, row by row."""
+    """(H * W, 2) column and row of every pixel, row by row."""
     assert CAMERA.image_size is not None
     width, height = CAMERA.image_size
     grid = np.meshgrid(np.arange(width), np.arange(height))

@@ -1,6 +1,6 @@
-"""Where street coordinates lie in the world: a bent centre line, and the hills that it runs over.
+"""From street coordinates to the world: a curved centre line and the hills under it.
 
-Street coordinates are (s, t): metres along the centre line and to its left.
+Street coordinates are (s, t): metres along the centre line, and metres to its left.
 """
 
 import numpy as np
@@ -10,12 +10,12 @@ Array = NDArray[np.float64]
 
 
 class Course:
-    """The bent centre line: where street coordinates lie in the world.
+    """The curved centre line of a street, which maps street coordinates to the world.
 
     Args:
-        start, end: metres along the street that bend; beyond, it runs straight.
+        start, end: metres, the interval of s that is curved; beyond it the street is straight.
         bend: largest curvature, 1/m.
-        rng: draws the bends.
+        rng: samples the curvature.
     """
 
     def __init__(self, start: float, end: float, bend: float, rng: np.random.Generator) -> None:
@@ -28,11 +28,11 @@ class Course:
         self._xy = np.cumsum(np.stack([np.cos(self._yaw), np.sin(self._yaw)]), 1)
 
     def heading(self, s: ArrayLike) -> Array:
-        """Radians, counter-clockwise from the world's +x, of the centre line at s."""
+        """Heading of the centre line at s, radians counter-clockwise from the world's +x."""
         return np.asarray(np.interp(np.asarray(s, float), self._s, self._yaw))
 
     def points(self, s: ArrayLike, t: ArrayLike) -> Array:
-        """(..., 2) world x, y of street coordinates, metres."""
+        """(..., 2) x and y in the world of street coordinates, metres."""
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
         yaw = self.heading(s)
         beyond = s - np.clip(s, self._s[0], self._s[-1])
@@ -42,11 +42,11 @@ class Course:
 
 
 class Relief:
-    """Gentle hills, a slope across the street, and high ground far off.
+    """The heights of the terrain: gentle hills, banks beside the street, and high ground far away.
 
     Args:
         grade: standard deviation of the slopes, e.g. 0.012.
-        rng: draws them.
+        rng: samples hills, banks and slopes.
     """
 
     def __init__(self, grade: float, rng: np.random.Generator) -> None:

@@ -1,4 +1,4 @@
-"""A bicycle and a motorcycle, without their riders."""
+"""Meshes of a bicycle and a motorcycle without riders."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ from lidar_synth.town.meshes import Mesh, boxes, disc, loft, merge, quads, tube,
 
 
 def _ring(x: float, radius: float, thick: float, slot: int) -> Mesh:
-    """An upright wheel's rim on the ground at x."""
+    """The tyre of an upright wheel that touches the ground at x."""
     angle = np.linspace(0, 2 * np.pi, 15)[:-1]
     hub = np.stack([x + radius * np.cos(angle), 0 * angle, radius + radius * np.sin(angle)], -1)
     out = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
@@ -39,7 +39,7 @@ def bicycle_mesh() -> Mesh:
 
 @cache
 def motorcycle_mesh() -> Mesh:
-    """A motorcycle, or by its fairing half a scooter."""
+    """A motorcycle with a fairing."""
     wheels = [tube([(x, -0.07, 0.31), (x, 0.07, 0.31)], 0.31, 12, TYRE) for x in (-0.72, 0.72)]
     rims = [tube([(x, -0.08, 0.31), (x, 0.08, 0.31)], 0.19, 10, RIM) for x in (-0.72, 0.72)]
     bars: list[tuple[list[tuple[float, float, float]], float]] = [

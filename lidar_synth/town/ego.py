@@ -1,8 +1,8 @@
-"""The recording vehicle: the camera and LiDAR on its roof, and what its own body hides from the LiDAR.
+"""The ego vehicle: where the LiDAR is mounted on it, and which rays its own body blocks.
 
-An estate car with a roof rack; the LiDAR stands on the rack, 1.73 m above the road, between two upright camera
-mounts a hand's breadth from it. A laser that meets any of this is blind there, in every scan. The lasers of an
-HDL-64E leave its drum by turns on the left and right of its axis, so that a near mount hides two places.
+The vehicle is an estate car with a roof rack. The LiDAR is mounted on the rack, 1.73 m above the road, between two
+upright camera mounts. Rays that hit the vehicle or its mounts return nothing in any scan. The lasers of an HDL-64E
+alternate between the left and the right side of its axis, so a nearby mount casts two blind spots.
 """
 
 from functools import lru_cache
@@ -15,13 +15,13 @@ from lidar_synth.town.meshes import Mesh, boxes, fan, merge, tube
 from lidar_synth.town.solid import Solid
 
 HEIGHT = 1.73
-"""Metres of the sensor's origin above the road."""
-_ASIDE = 0.026
-"""Metres from the drum's axis to the lasers on either side of it."""
+"""Height of the sensor's origin above the road, metres."""
+_LASER_OFFSET = 0.026
+"""Lateral offset of the lasers from the sensor's axis, metres."""
 
 
 def body() -> Mesh:
-    """What stands around the LiDAR, in the sensor's frame, metres."""
+    """The parts of the vehicle around the LiDAR, in the sensor frame, metres."""
     angle = np.linspace(-0.64, 0.64, 11)
     reach = 0.80 - 0.18 * (angle / 0.64) ** 2
     front = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.full(11, -0.21)], -1)
@@ -36,29 +36,31 @@ def body() -> Mesh:
 
 
 def optics(sensor: Sensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where a sensor's lasers point and how far above its origin they start.
+    """The elevations of a sensor's lasers and the heights above its origin at which they start.
+
+    A sensor's ``beams`` are the elevations of the returns from a street as seen from the sensor's origin; a laser that
+    starts above the origin points further down than its beam.
 
     Returns:
-        (H,) elevations in radians and (H,) heights in metres. A sensor's beams are the elevations at which
-        returns from a street appear, seen from the origin: a laser that starts above it points further down.
+        (H,) elevations in radians and (H,) heights in metres.
     """
-    seen = sensor.laser_elevations.astype(float)
+    beams = sensor.laser_elevations.astype(float)
     if sensor.heights is None:
-        return seen, np.zeros(len(seen))
+        return beams, np.zeros(len(beams))
     heights = np.asarray(sensor.heights)
-    # Most returns of a beam come from the level road; things that stand on it make the usual distance shorter.
-    usual = np.minimum(1 / (np.maximum(np.sin(-seen), 1e-3) / HEIGHT + 1 / 110), 20.0)
-    return seen - heights / usual, heights
+    # Most returns of a beam come from the level road; objects on the road shorten the typical distance.
+    typical = np.minimum(1 / (np.maximum(np.sin(-beams), 1e-3) / HEIGHT + 1 / 110), 20.0)
+    return beams - heights / typical, heights
 
 
 @lru_cache(maxsize=8)
 def free_rays(sensor: Sensor) -> NDArray[np.bool_]:
-    """(H, W) which rays of a sensor its own vehicle leaves free; read-only."""
+    """(H, W) which rays of a sensor the ego vehicle does not block; read-only."""
     elevation, height = optics(sensor)
     azimuth = sensor.column_azimuths().astype(float)
     e, a = np.meshgrid(elevation, azimuth, indexing="ij")
     rays = np.stack([np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)], -1)
-    side = np.where(np.arange(len(elevation)) % 2, _ASIDE, -_ASIDE)[:, None]
+    side = np.where(np.arange(len(elevation)) % 2, _LASER_OFFSET, -_LASER_OFFSET)[:, None]
     start = np.stack([side * np.sin(a), side * np.cos(a), np.broadcast_to(height[:, None], a.shape)], -1)
     distance, _, _ = Solid(body().triangles).first(
         start.reshape(-1, 3).astype(np.float32), rays.reshape(-1, 3).astype(np.float32)

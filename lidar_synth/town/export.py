@@ -1,6 +1,6 @@
-"""The town as a dataset on disk: KITTI-360's, SemanticKITTI's or KITTI's own folders, in parallel, resumable.
+"""Export of the town to a dataset on disk, in the layout of KITTI-360, SemanticKITTI or KITTI; parallel, resumable.
 
-The unit of work is a stretch of road, or a part of one, because its world has to be built once per process.
+The unit of work is a stretch of road or a part of one, because each process has to build the world of a stretch.
 """
 
 from functools import partial
@@ -24,10 +24,10 @@ LAYOUTS: dict[str, type[Writer]] = {
     "semantic_kitti": SemanticKITTIWriter,
     "kitti": KITTIObjectWriter,
 }
-"""Writer by the name of a layout."""
+"""The writer of each layout by name."""
 
 SEQUENCES = {"kitti360": 4, "semantic_kitti": 0}
-"""Where scans go by default: a drive or sequence that every split trains on."""
+"""The default drive or sequence of a layout: one that every split uses for training."""
 
 SETTINGS = TOWN
 _README = """# Synthetic street scans
@@ -39,7 +39,7 @@ the same readers and trainers take them.
 - layout: {layout}; sensor: {sensor}; seed: {seed}; {interval} s between neighbouring scans
 - {frames} neighbouring scans share a stretch of road; instance numbers count within a stretch, and stretches lie
   1 km apart in the poses
-- `{settings}` holds the settings; `lidar-synth town` with the same ones goes on where it stopped
+- `{settings}` holds the settings; `lidar-synth town` with the same settings resumes an interrupted run
 """
 
 
@@ -53,37 +53,38 @@ def export_town(
     jobs: int = 1,
     progress: bool = True,
 ) -> tuple[int, int]:
-    """Write a town's scans; rerun to go on where it stopped.
+    """Write the scans of a town to a dataset folder; a second call resumes an interrupted run.
 
     Args:
-        town: whose scans.
-        out: folder to write to.
+        town: the town to export.
+        out: the folder to write to.
         layout: one of ``LAYOUTS``.
-        sequence: number of the drive or sequence that takes the scans (``SEQUENCES`` by default).
-        camera: whether each scan's picture is rendered and written.
-        jobs: worker processes.
-        progress: show a bar.
+        sequence: number of the drive or sequence to write, 0 to 99; ``SEQUENCES`` by default.
+        camera: whether to render and write the camera image of each scan.
+        jobs: number of worker processes, at least 1.
+        progress: whether to show a progress bar.
 
     Returns:
-        How many scans were written now and how many were there already.
+        The number of scans written by this call, and the number of scans that already existed.
 
     Raises:
-        ConfigError: on an unknown layout, no job, or a folder that holds another town.
-        FileError: where the output cannot be written.
+        ConfigError: on an unknown layout, a sequence or number of jobs out of range, or a folder that holds another
+            town.
+        FileError: if the output cannot be written.
     """
     if layout not in LAYOUTS or jobs < 1:
         raise ConfigError(f"layout {layout!r}, {jobs} jobs", f"one of {', '.join(LAYOUTS)}, and at least 1 job")
     number = SEQUENCES.get(layout, 0) if sequence is None else sequence
     if not 0 <= number < 100:
         raise ConfigError(f"sequence {number}", "0 to 99")
-    _claim(Path(out), town, layout, number, camera)
+    _claim_folder(Path(out), town, layout, number, camera)
     writer = LAYOUTS[layout](out, calibration=town.calibration)
     names = [f"{number:02d}/{i:06d}" if layout in SEQUENCES else None for i in range(len(town))]
     missing = [i for i, name in enumerate(names) if not writer.complete(i, name)]
-    work = partial(_write_some, town, writer, names, camera)
+    work = partial(_write_group, town, writer, names, camera)
     with (
         tqdm(total=len(missing), unit="scan", disable=not progress) as bar,
-        in_processes(work, _parts(missing, jobs), jobs) as done,
+        in_processes(work, _groups(missing, jobs), jobs) as done,
     ):
         for count in done:
             bar.update(count)
@@ -94,29 +95,33 @@ def export_town(
     return len(missing), len(town) - len(missing)
 
 
-def _claim(out: Path, town: Town, layout: str, sequence: int, camera: bool) -> None:
-    """Say in the folder what it holds; refuse one that holds something else."""
-    facts = {"layout": layout, "sequence": sequence, "seed": town.seed, "interval": town.interval, "camera": camera}
-    claim(out / SETTINGS, facts | {"sensor": town.sensor.to_dict()})
+def _claim_folder(out: Path, town: Town, layout: str, sequence: int, camera: bool) -> None:
+    """Write the settings and a README into the folder.
+
+    Raises:
+        ConfigError: if the folder was written with other settings.
+    """
+    settings = {"layout": layout, "sequence": sequence, "seed": town.seed, "interval": town.interval, "camera": camera}
+    claim(out / SETTINGS, settings | {"sensor": town.sensor.to_dict()})
     if not (out / "README.md").exists():
-        text = _README.format(**facts, sensor=town.sensor.name, frames=STRETCH_FRAMES, settings=SETTINGS)
+        text = _README.format(**settings, sensor=town.sensor.name, frames=STRETCH_FRAMES, settings=SETTINGS)
         write_file(out / "README.md", text.encode())
 
 
-def _parts(indices: list[int], jobs: int) -> list[list[int]]:
-    """The indices in pieces of a stretch, small enough that every job has some; one by one for one process, which
-    keeps its stretch."""
-    most = 1 if jobs == 1 else max(1, min(STRETCH_FRAMES, -(-len(indices) // jobs)))
+def _groups(indices: list[int], jobs: int) -> list[list[int]]:
+    """The indices in groups that do not cross stretches, small enough that every process gets some; one index per
+    group with one process, which keeps its stretch in memory anyway."""
+    limit = 1 if jobs == 1 else max(1, min(STRETCH_FRAMES, -(-len(indices) // jobs)))
     parts: list[list[int]] = []
     for i in indices:
-        if parts and len(parts[-1]) < most and parts[-1][-1] // STRETCH_FRAMES == i // STRETCH_FRAMES:
+        if parts and len(parts[-1]) < limit and parts[-1][-1] // STRETCH_FRAMES == i // STRETCH_FRAMES:
             parts[-1].append(i)
         else:
             parts.append([i])
     return parts
 
 
-def _write_some(town: Town, writer: Writer, names: list[str | None], camera: bool, indices: list[int]) -> int:
+def _write_group(town: Town, writer: Writer, names: list[str | None], camera: bool, indices: list[int]) -> int:
     for i in indices:
         writer.write(town[i], i, name=names[i], image=town.image(i) if camera else None)
     return len(indices)

@@ -1,7 +1,7 @@
-"""Walls with what is in them: recessed windows with frames, blinds and curtains, doors with steps.
+"""Walls of buildings: recessed windows with frames, blinds and curtains, and doors with steps.
 
-A building's own frame: x along its front, y into the depth, the front wall at y = 0, the ground at z = 0.
-Behind the glass are curtains, half-shut blinds or a room, so that a ray that gets in ends where it would.
+A building's own frame has x along its front and y into the building; the front wall is at y = 0, the ground at z = 0.
+Behind the glass are curtains, half-closed blinds or a room, so that rays through a window hit something realistic.
 """
 
 from dataclasses import dataclass
@@ -26,22 +26,22 @@ DOORS: tuple[RGB, ...] = (
 
 Array = NDArray[np.float64]
 Frame = tuple[Array, Array, Array]
-"""A wall: its lower left corner, the way along it, the way into the building."""
+"""The frame of a wall: its lower left corner, and unit vectors along the wall and into the building."""
 
 
 @dataclass(frozen=True)
 class BuildingPlan:
-    """A building's measures.
+    """The dimensions and the style of a building.
 
     Args:
         width, depth: metres.
-        floors: storeys under the eaves.
+        floors: number of storeys under the eaves.
         storey: metres from floor to floor.
         plinth: metres, height of the ground floor above the ground.
         roof: ``gable`` (ridge along the front), ``cross`` (gable to the front), ``hip`` or ``flat``.
-        balconies: whether the front has them.
+        balconies: whether the front has balconies.
         shop: whether the ground floor is mostly glass.
-        detail: False for a building that is only seen from afar: windows flat on the wall.
+        detail: False for a building that is only seen from afar; its windows are flat on the wall.
     """
 
     width: float
@@ -61,7 +61,7 @@ class BuildingPlan:
 
 
 def finishes(rng: np.random.Generator) -> tuple[Finish, ...]:
-    """A building's finishes by slot."""
+    """Sampled finishes of a building, one per slot."""
     wall = Finish("brick") if rng.random() < 0.10 else Finish("render", WALLS[rng.integers(len(WALLS))])
     return (
         wall, Finish("glass"), Finish("plastic", (0.86, 0.86, 0.84)), Finish("tile", ROOFS[rng.integers(len(ROOFS))]),
@@ -71,7 +71,7 @@ def finishes(rng: np.random.Generator) -> tuple[Finish, ...]:
 
 
 def panels(rect: Array, deep: float, frame: Frame) -> Array:
-    """(n, 4, 3) upright rectangles (n, 4: u0, u1, z0, z1) of a wall, ``deep`` metres behind its plane."""
+    """(n, 4, 3) corners of rectangles (n, 4: u0, u1, z0, z1) parallel to a wall, ``deep`` metres behind it."""
     origin, along, inward = frame
     base = origin + deep * inward
     corners = np.empty((len(rect), 4, 3))
@@ -82,7 +82,7 @@ def panels(rect: Array, deep: float, frame: Frame) -> Array:
 
 
 def reveals(rect: Array, deep: float, frame: Frame) -> Array:
-    """(4 n, 4, 3) the sides of recesses."""
+    """(4 n, 4, 3) corners of the sides of rectangular recesses, ``deep`` metres deep."""
     front, back = panels(rect, 0.0, frame), panels(rect, deep, frame)
     sides = [
         np.stack([front[:, i], front[:, j], back[:, j], back[:, i]], 1) for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))
@@ -91,7 +91,7 @@ def reveals(rect: Array, deep: float, frame: Frame) -> Array:
 
 
 def wall_around(width: float, low: float, high: float, holes: Array, frame: Frame) -> Mesh:
-    """A wall around rectangular holes, cut along their edges."""
+    """A wall with rectangular holes (n, 4: u0, u1, z0, z1), as a grid of rectangles between the holes' edges."""
     u = np.unique(np.r_[0.0, width, holes[:, :2].ravel()])
     z = np.unique(np.r_[low, high, holes[:, 2:].ravel()])
     cells = np.stack([*np.meshgrid(u[:-1], z[:-1]), *np.meshgrid(u[1:], z[1:])], -1).reshape(-1, 4)[:, [0, 2, 1, 3]]
@@ -102,7 +102,7 @@ def wall_around(width: float, low: float, high: float, holes: Array, frame: Fram
 
 
 def _window(rect: Array, frame: Frame, rng: np.random.Generator) -> Mesh:
-    """Glass set back in its reveal, with frame, sill, and a curtain or blind behind or before it."""
+    """Recessed windows: glass, frames and sills, with a blind in front of the glass or a curtain behind it."""
     count = len(rect)
     recess = 0.13
     u0, u1, z0, z1 = rect.T
@@ -128,7 +128,7 @@ def _window(rect: Array, frame: Frame, rng: np.random.Generator) -> Mesh:
 
 
 def _openings(plan: BuildingPlan, width: float, front: bool, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Rectangles (n, 4: u0, u1, z0, z1) of a facade's windows and doors."""
+    """Sampled rectangles (n, 4: u0, u1, z0, z1) of the windows and of the doors of a facade."""
     count = max(1, int(width / rng.uniform(2.3, 3.3)))
     pitch = width / count
     half = min(rng.uniform(0.5, 0.85), 0.36 * pitch)
@@ -152,7 +152,7 @@ def _openings(plan: BuildingPlan, width: float, front: bool, rng: np.random.Gene
 
 
 def facade(plan: BuildingPlan, width: float, frame: Frame, side: int, rng: np.random.Generator) -> Mesh:
-    """One wall; side 0 is the front, 3 the back."""
+    """The mesh of one wall with its windows and doors; side 0 is the front, 3 the back."""
     windows, doors = _openings(plan, width, side == 0, rng)
     if not plan.detail or side == 3:
         wall = quads(panels(np.array([[0.0, width, -1.0, plan.eaves]]), 0.0, frame), WALL)

@@ -1,8 +1,8 @@
-"""The ground: a street drawn straight, as rectangles in street coordinates, then bent and laid over hills.
+"""The ground: rectangles in street coordinates, then bent along the centre line and laid over the hills.
 
 In street coordinates every kerb, bay and driveway is a rectangle, so the ground is a grid of cells whose
-lines are the rectangles' edges; a course then bends it and a relief lifts it. Where neighbouring cells
-differ in height stands a kerb.
+lines are the rectangles' edges. The course bends this grid, and the relief lifts it. A vertical face (a kerb) closes
+the gap where neighbouring cells differ in height.
 """
 
 from itertools import pairwise
@@ -19,31 +19,31 @@ Rect = tuple[float, float, float, float, int]
 Array = NDArray[np.float64]
 
 
-class Kind(NamedTuple):
-    """One kind of ground: its finish, SemanticKITTI's class, and metres above the carriageway."""
+class GroundKind(NamedTuple):
+    """One kind of ground: its finish, SemanticKITTI's class id, and its height above the carriageway, metres."""
 
     finish: Finish
     raw: int
     lift: float
 
 
-KINDS: dict[str, Kind] = {
-    "grass": Kind(Finish("grass"), 72, 0.10),
-    "soil": Kind(Finish("soil"), 72, 0.09),
-    "field": Kind(Finish("soil", (0.52, 0.46, 0.27)), 72, 0.05),
-    "yard": Kind(Finish("gravel"), 49, 0.08),
-    "road": Kind(Finish("asphalt"), 40, 0.0),
-    "old_road": Kind(Finish("asphalt", (0.33, 0.32, 0.31)), 40, 0.0),
-    "marking": Kind(Finish("marking"), 60, 0.0),
-    "parking": Kind(Finish("paving", (0.40, 0.38, 0.37)), 44, 0.015),
-    "driveway": Kind(Finish("paving", (0.55, 0.50, 0.46)), 44, 0.11),
-    "sidewalk": Kind(Finish("paving"), 48, 0.12),
-    "cycleway": Kind(Finish("asphalt", (0.45, 0.27, 0.24)), 48, 0.12),
-    "kerb": Kind(Finish("kerbstone"), 48, 0.12),
-    "plaza": Kind(Finish("cobble"), 49, 0.12),
-    "rails": Kind(Finish("gravel", (0.38, 0.35, 0.33)), 49, 0.03),
+KINDS: dict[str, GroundKind] = {
+    "grass": GroundKind(Finish("grass"), 72, 0.10),
+    "soil": GroundKind(Finish("soil"), 72, 0.09),
+    "field": GroundKind(Finish("soil", (0.52, 0.46, 0.27)), 72, 0.05),
+    "yard": GroundKind(Finish("gravel"), 49, 0.08),
+    "road": GroundKind(Finish("asphalt"), 40, 0.0),
+    "old_road": GroundKind(Finish("asphalt", (0.33, 0.32, 0.31)), 40, 0.0),
+    "marking": GroundKind(Finish("marking"), 60, 0.0),
+    "parking": GroundKind(Finish("paving", (0.40, 0.38, 0.37)), 44, 0.015),
+    "driveway": GroundKind(Finish("paving", (0.55, 0.50, 0.46)), 44, 0.11),
+    "sidewalk": GroundKind(Finish("paving"), 48, 0.12),
+    "cycleway": GroundKind(Finish("asphalt", (0.45, 0.27, 0.24)), 48, 0.12),
+    "kerb": GroundKind(Finish("kerbstone"), 48, 0.12),
+    "plaza": GroundKind(Finish("cobble"), 49, 0.12),
+    "rails": GroundKind(Finish("gravel", (0.38, 0.35, 0.33)), 49, 0.03),
 }
-"""Every kind of ground by name."""
+"""The kinds of ground by name."""
 
 NAMES = tuple(KINDS)
 _ROUGH = [NAMES.index(k) for k in ("grass", "soil", "field")]
@@ -51,7 +51,13 @@ _LIFT = np.array([k.lift for k in KINDS.values()])
 
 
 class Corner(NamedTuple):
-    """A rounded kerb: the corner point, the side (+1 or -1 along s and t) on which the pavement lies, metres."""
+    """A rounded corner of a kerb.
+
+    Args:
+        s, t: the corner point, metres.
+        along, across: on which side of it the pavement lies, +1 or -1 along s and along t.
+        radius: metres.
+    """
 
     s: float
     t: float
@@ -64,13 +70,13 @@ class Ground:
     """The ground of a stretch.
 
     Args:
-        course: bends it.
-        relief: lifts it.
-        edge: metres from the centre line to the kerb, (right, left); the carriageway falls towards it.
-        reach: (lowest s, highest s, lowest t, highest t) of all ground.
-        fine: the interval of s in which cells are 3 m long; coarser outside.
-        rects: (s, s, t, t, place in ``NAMES``): what is painted, later ones over earlier ones.
-        corners: rounded kerbs.
+        course: the centre line that it follows.
+        relief: the heights of the terrain.
+        edge: metres from the centre line to the kerb, (right, left); the carriageway slopes down towards the kerb.
+        reach: (lowest s, highest s, lowest t, highest t) of all ground, metres.
+        fine: the interval of s in which cells are at most 3 m long; they are longer outside.
+        rects: (lowest s, highest s, lowest t, highest t, index in ``NAMES``); later rectangles cover earlier ones.
+        corners: rounded corners of kerbs.
     """
 
     def __init__(
@@ -98,25 +104,25 @@ class Ground:
             self._kinds[s0:s1, t0:t1] = int(kind)
 
     def kind(self, s: ArrayLike, t: ArrayLike) -> NDArray[np.int32]:
-        """Place in ``NAMES`` of the ground at street coordinates (corners taken as square)."""
+        """Index in ``NAMES`` of the ground at street coordinates (rounded corners count as square)."""
         i = np.clip(np.searchsorted(self._s, s, "right") - 1, 0, len(self._s) - 2)
         j = np.clip(np.searchsorted(self._t, t, "right") - 1, 0, len(self._t) - 2)
         return np.asarray(self._kinds[i, j])
 
     def height(self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None) -> Array:
-        """Metres, of the ground at street coordinates, or of a kind of ground if it lay there."""
+        """Height at street coordinates, metres: of the ground there, or of the given kind of ground instead."""
         lift = _LIFT[self.kind(s, t) if kind is None else np.asarray(kind)]
         s, t = np.asarray(s, float), np.asarray(t, float)
         half = np.where(t > 0, self.edge[1], self.edge[0])
         return np.asarray(self.relief(s, t) - 0.018 * np.minimum(np.abs(t), half) + lift)
 
     def points(self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None) -> Array:
-        """(..., 3) world coordinates of the ground's surface at street coordinates."""
+        """(..., 3) world coordinates of the ground's surface at street coordinates, metres."""
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
         return np.concatenate([self.course.points(s, t), self.height(s, t, kind)[..., None]], -1)
 
     def mesh(self, rng: np.random.Generator) -> Mesh:
-        """All ground as triangles; a slot is a place in ``NAMES``. The draws are for what is not paved."""
+        """All ground as triangles, with indices in ``NAMES`` as slots; ``rng`` roughens unpaved ground."""
         bare = self.points(self._s[:, None], self._t[None], 0) - (0, 0, _LIFT[0])
         rough = np.ones(bare.shape[:2], bool)
         soft = np.isin(self._kinds, _ROUGH)
@@ -137,7 +143,7 @@ class Ground:
         return merge([solid, *steps, *(self._rounded(c) for c in self.corners)])
 
     def _rounded(self, c: Corner) -> Mesh:
-        """The square cell of a corner: carriageway outside the arc, kerb and pavement inside."""
+        """The square cell of a rounded corner: carriageway outside the arc, kerb and pavement inside."""
         angle = np.linspace(0, np.pi / 2, 7)
         centre = np.array((c.s + c.along * c.radius, c.t + c.across * c.radius))
         way = -np.stack([c.along * np.cos(angle), c.across * np.sin(angle)], -1)
@@ -158,7 +164,7 @@ class Ground:
 
 
 def _lines(edges: Array, reach: tuple[float, float], fine: tuple[float, float]) -> Array:
-    """The grid's lines along one axis: all edges, and others between at most 3 m apart, more outside ``fine``."""
+    """Grid lines along one axis: all edges, and lines between them at most 3 m apart, wider outside ``fine``."""
     edges = np.unique(np.round(np.r_[edges[(edges > reach[0]) & (edges < reach[1])], reach], 3))
     edges = edges[np.r_[True, np.diff(edges) > 0.02]]
     lines = [edges[:1]]
@@ -169,7 +175,7 @@ def _lines(edges: Array, reach: tuple[float, float], fine: tuple[float, float]) 
 
 
 def _steps(cells: Array, kinds: NDArray[np.int32], hole: NDArray[np.bool_], axis: int) -> Mesh:
-    """Upright faces between neighbours of different height along an axis."""
+    """Vertical faces between neighbouring cells of different height along an axis."""
     before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
     a, b = (
         (cells[before][:, :, [1, 2]], cells[after][:, :, [0, 3]])

@@ -1,6 +1,6 @@
-"""Lots along a street: which house stands where, its driveway, what bounds its front.
+"""The plan of the lots along a street: houses, driveways and front boundaries.
 
-Lots are drawn before the ground is laid, because driveways and yards are painted on it; ``yards`` builds them.
+Lots are sampled before the ground is built, because driveways and yards are painted on it; ``yards`` then builds them.
 """
 
 from dataclasses import dataclass, replace
@@ -17,18 +17,18 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Lot:
-    """A piece of ground beside the street.
+    """A lot beside the street.
 
     Args:
-        start, end: its s, start < end.
+        start, end: its interval of s, metres, start < end.
         side: RIGHT or LEFT.
-        front: |t| of its front boundary.
-        setback: metres from there to the house.
-        plan: its house, or None.
-        at: metres from ``start`` to the house's corner of lower s.
-        driveway: (start, end) in s of a paved strip, or None.
-        boundary: what bounds its front: hedge, wall, bars, boards, wire, wallhedge or nothing.
-        garden: how green it is, 0..1.
+        front: |t| of its front boundary, metres.
+        setback: metres from the front boundary to the house.
+        plan: the plan of its house, or None for an empty lot.
+        house_offset: metres along s from ``start`` to the house.
+        driveway: (start, end) of a paved strip along s, metres, or None.
+        boundary: the kind of its front boundary, one of ``boundaries.KINDS``.
+        garden: density of its plants, 0..1.
     """
 
     start: float
@@ -37,19 +37,19 @@ class Lot:
     front: float
     setback: float
     plan: BuildingPlan | None
-    at: float
+    house_offset: float
     driveway: tuple[float, float] | None
     boundary: str
     garden: float
 
     @property
     def sign(self) -> int:
-        """Of t on this side."""
+        """The sign of t on this side of the street."""
         return 2 * self.side - 1
 
 
-def draw_house(style: str, width: float, depth: float, rng: Rng) -> BuildingPlan:
-    """A house, row, block, shop or hall of the given width and depth in metres."""
+def sample_house(style: str, width: float, depth: float, rng: Rng) -> BuildingPlan:
+    """The sampled plan of a house, row, block, shop or hall of the given width and depth in metres."""
     match style:
         case "house":
             roof = str(rng.choice(["gable", "cross", "hip"], p=[0.6, 0.25, 0.15]))
@@ -74,6 +74,7 @@ _SIZES = {"house": (8.5, 13.5), "row": (6.0, 8.5), "block": (15.0, 26.0), "shop"
 
 
 def _style(street: Street, side: int, rng: Rng) -> str:
+    """The sampled style of a building: house, row, block, shop or hall."""
     if street.kind == "residential":
         return str(rng.choice(["house", "row", "block"], p=[0.74, 0.14, 0.12]))
     if street.kind == "edge":
@@ -83,8 +84,8 @@ def _style(street: Street, side: int, rng: Rng) -> str:
     return str(rng.choice(["house", "row", "block", "shop", "hall"], p=[0.25, 0.12, 0.28, 0.27, 0.08]))
 
 
-def draw_lots(street: Street, rng: Rng) -> list[Lot]:
-    """The lots of both sides, from one end of the stretch to the other."""
+def sample_lots(street: Street, rng: Rng) -> list[Lot]:
+    """Sampled lots on both sides, from one end of the stretch to the other."""
     lots = []
     for side in (RIGHT, LEFT):
         front = street.front(side)
@@ -94,7 +95,7 @@ def draw_lots(street: Street, rng: Rng) -> list[Lot]:
             s = low
             while high - s > 7:
                 on_plaza = street.plaza == side and s + 9 > -12 and s < street.length + 12
-                lot = _draw_lot(
+                lot = _sample_lot(
                     street, side, s, high, front + (PLAZA_DEPTH if on_plaza else 0.0), setback, boundary, rng
                 )
                 lots.append(lot)
@@ -102,9 +103,10 @@ def draw_lots(street: Street, rng: Rng) -> list[Lot]:
     return lots
 
 
-def _draw_lot(
+def _sample_lot(
     street: Street, side: int, s: float, high: float, front: float, setback: float, boundary: str, rng: Rng
 ) -> Lot:
+    """A sampled lot that starts at s and ends at ``high`` at the latest."""
     style = _style(street, side, rng)
     low, top = _SIZES[style]
     if rng.random() < (0.72 if street.kind == "edge" else 0.07) or high - s < low + 2:
@@ -134,7 +136,7 @@ def _draw_lot(
     if rng.random() < 0.25 and style not in ("shop", "row"):
         boundary = str(rng.choice(KINDS))
     near = -45 < s + width / 2 < street.length + 50
-    plan = replace(draw_house(style, width, rng.uniform(8, 12), rng), detail=near)
+    plan = replace(sample_house(style, width, rng.uniform(8, 12), rng), detail=near)
     return Lot(
         s,
         end,
@@ -150,7 +152,7 @@ def _draw_lot(
 
 
 def paint_lots(lots: list[Lot], paint: Paint, rng: Rng) -> None:
-    """Driveways, yards and flower beds."""
+    """Paint driveways, yards and flower beds onto the ground."""
     for lot in lots:
         if lot.plan is not None and lot.garden < 0.25:
             paint((lot.start, lot.end), (lot.sign * lot.front, lot.sign * (lot.front + lot.setback)), "yard")

@@ -1,8 +1,7 @@
-"""What things are made of, as a 905 nm laser and as a camera see it, and the table of all surfaces of a scene.
+"""Materials, as a 905 nm laser and as a camera see them, and the table of all surfaces of a scene.
 
-The LiDAR's figures are in the sensor's own units of reflectance (0..1 as the KITTI datasets store it, which
-is neither albedo nor calibrated): set so that each class of the town lies where the same class lies in
-labelled street scans at 10 to 25 m.
+Reflectance is in the unit of the KITTI datasets (0..1, neither albedo nor calibrated). The values are fitted so that
+each class of the town has the reflectance that it has in labelled street scans at 10 to 25 m.
 """
 
 from dataclasses import dataclass, field
@@ -19,26 +18,26 @@ class Material(NamedTuple):
     """One material.
 
     Args:
-        reflectance: what a LiDAR reads at 10 to 25 m, face on.
-        speckle: standard deviation of that from one return to the next.
-        gloss: how mirror-like, 0..1: glossy faces send little back unless they face the sensor.
-        through: share of rays that pass on to what is behind.
-        lost: share of rays that never come back.
-        depth: metres, roughness along the ray (leaves, grass).
+        reflectance: mean reflectance that a LiDAR measures at 10 to 25 m and normal incidence.
+        speckle: standard deviation of the reflectance between returns.
+        gloss: how specular it is, 0..1; glossy faces return little unless they face the sensor.
+        transmission: share of rays that pass through it.
+        dropout: share of rays that never return.
+        roughness: metres, standard deviation of the range noise of rough materials (leaves, grass).
         colour: RGB in 0..1 for the camera.
-        grain: strength of the camera's texture.
-        tone: whether a darker finish also reflects less in the infrared.
+        grain: strength of its texture in the camera image.
+        colour_dependent: whether a darker finish also reflects less at 905 nm.
     """
 
     reflectance: float
     speckle: float = 0.05
     gloss: float = 0.0
-    through: float = 0.0
-    lost: float = 0.0
-    depth: float = 0.0
+    transmission: float = 0.0
+    dropout: float = 0.0
+    roughness: float = 0.0
     colour: RGB = (0.5, 0.5, 0.5)
     grain: float = 0.1
-    tone: bool = False
+    colour_dependent: bool = False
 
 
 MATERIALS: dict[str, Material] = {
@@ -47,46 +46,50 @@ MATERIALS: dict[str, Material] = {
     "paving": Material(0.315, 0.045, colour=(0.50, 0.48, 0.46), grain=0.14),
     "cobble": Material(0.285, 0.06, colour=(0.42, 0.40, 0.39), grain=0.25),
     "kerbstone": Material(0.31, 0.05, colour=(0.56, 0.55, 0.53), grain=0.10),
-    "grass": Material(0.365, 0.07, depth=0.025, colour=(0.30, 0.37, 0.17), grain=0.5),
-    "soil": Material(0.32, 0.06, depth=0.02, colour=(0.41, 0.33, 0.23), grain=0.35),
-    "gravel": Material(0.30, 0.06, depth=0.01, colour=(0.55, 0.52, 0.48), grain=0.30),
-    "render": Material(0.42, 0.07, 0.03, colour=(0.86, 0.84, 0.79), grain=0.06, tone=True),
+    "grass": Material(0.365, 0.07, roughness=0.025, colour=(0.30, 0.37, 0.17), grain=0.5),
+    "soil": Material(0.32, 0.06, roughness=0.02, colour=(0.41, 0.33, 0.23), grain=0.35),
+    "gravel": Material(0.30, 0.06, roughness=0.01, colour=(0.55, 0.52, 0.48), grain=0.30),
+    "render": Material(0.42, 0.07, 0.03, colour=(0.86, 0.84, 0.79), grain=0.06, colour_dependent=True),
     "brick": Material(0.34, 0.08, colour=(0.55, 0.28, 0.20), grain=0.15),
     "concrete": Material(0.34, 0.06, colour=(0.58, 0.57, 0.55), grain=0.12),
     "stone": Material(0.34, 0.09, colour=(0.50, 0.45, 0.40), grain=0.30),
     "tile": Material(0.30, 0.08, colour=(0.45, 0.21, 0.15), grain=0.15),
-    "wood": Material(0.38, 0.08, colour=(0.45, 0.31, 0.19), grain=0.18, tone=True),
-    "plastic": Material(0.28, 0.08, 0.15, lost=0.01, colour=(0.25, 0.25, 0.26), grain=0.03, tone=True),
-    "metal": Material(0.30, 0.11, 0.45, lost=0.04, colour=(0.52, 0.54, 0.55), grain=0.05, tone=True),
-    "wire": Material(0.22, 0.10, through=0.80, colour=(0.35, 0.42, 0.36)),
-    "paint": Material(0.42, 0.09, 0.75, lost=0.015, colour=(0.6, 0.6, 0.62), grain=0.0, tone=True),
-    "glass": Material(0.08, 0.06, 0.6, through=0.45, lost=0.50, colour=(0.10, 0.12, 0.14), grain=0.0),
-    "carglass": Material(0.02, 0.02, 0.9, through=0.1, lost=0.9, colour=(0.06, 0.07, 0.08), grain=0.0),
-    "tyre": Material(0.05, 0.04, 0.1, lost=0.08, colour=(0.06, 0.06, 0.065), grain=0.1),
-    "interior": Material(0.12, 0.06, 0.1, lost=0.2, colour=(0.11, 0.10, 0.10), grain=0.1),
+    "wood": Material(0.38, 0.08, colour=(0.45, 0.31, 0.19), grain=0.18, colour_dependent=True),
+    "plastic": Material(0.28, 0.08, 0.15, dropout=0.01, colour=(0.25, 0.25, 0.26), grain=0.03, colour_dependent=True),
+    "metal": Material(0.30, 0.11, 0.45, dropout=0.04, colour=(0.52, 0.54, 0.55), grain=0.05, colour_dependent=True),
+    "wire": Material(0.22, 0.10, transmission=0.80, colour=(0.35, 0.42, 0.36)),
+    "paint": Material(0.42, 0.09, 0.75, dropout=0.015, colour=(0.6, 0.6, 0.62), grain=0.0, colour_dependent=True),
+    "glass": Material(0.08, 0.06, 0.6, transmission=0.45, dropout=0.50, colour=(0.10, 0.12, 0.14), grain=0.0),
+    "carglass": Material(0.02, 0.02, 0.9, transmission=0.1, dropout=0.9, colour=(0.06, 0.07, 0.08), grain=0.0),
+    "tyre": Material(0.05, 0.04, 0.1, dropout=0.08, colour=(0.06, 0.06, 0.065), grain=0.1),
+    "interior": Material(0.12, 0.06, 0.1, dropout=0.2, colour=(0.11, 0.10, 0.10), grain=0.1),
     "curtain": Material(0.40, 0.08, colour=(0.78, 0.76, 0.72), grain=0.10),
     "plate": Material(0.90, 0.10, colour=(0.85, 0.85, 0.82), grain=0.0),
     "sign": Material(0.80, 0.18, colour=(0.80, 0.80, 0.80), grain=0.0),
-    "lamp": Material(0.35, 0.25, 0.3, lost=0.1, colour=(0.85, 0.85, 0.80), grain=0.0),
-    "leaf": Material(0.37, 0.12, through=0.10, lost=0.006, depth=0.03, colour=(0.19, 0.33, 0.10), grain=0.50),
-    "foliage": Material(0.34, 0.12, depth=0.03, colour=(0.12, 0.21, 0.07), grain=0.60),
-    "bark": Material(0.38, 0.13, depth=0.005, colour=(0.33, 0.27, 0.21), grain=0.45),
-    "cloth": Material(0.42, 0.11, lost=0.01, depth=0.005, colour=(0.3, 0.3, 0.4), grain=0.12, tone=True),
+    "lamp": Material(0.35, 0.25, 0.3, dropout=0.1, colour=(0.85, 0.85, 0.80), grain=0.0),
+    "leaf": Material(
+        0.37, 0.12, transmission=0.10, dropout=0.006, roughness=0.03, colour=(0.19, 0.33, 0.10), grain=0.50
+    ),
+    "foliage": Material(0.34, 0.12, roughness=0.03, colour=(0.12, 0.21, 0.07), grain=0.60),
+    "bark": Material(0.38, 0.13, roughness=0.005, colour=(0.33, 0.27, 0.21), grain=0.45),
+    "cloth": Material(
+        0.42, 0.11, dropout=0.01, roughness=0.005, colour=(0.3, 0.3, 0.4), grain=0.12, colour_dependent=True
+    ),
     "skin": Material(0.40, 0.08, colour=(0.78, 0.58, 0.47), grain=0.05),
 }
-"""Every material by name."""
+"""The materials by name."""
 
 INDEX = {name: i for i, name in enumerate(MATERIALS)}
-"""A material's number by its name."""
+"""The number of each material by name."""
 
 
 def column(name: str) -> NDArray[np.float32]:
-    """One property of all materials by number."""
+    """One property of all materials, indexed by material number."""
     return np.array([getattr(m, name) for m in MATERIALS.values()], np.float32)
 
 
 class Finish(NamedTuple):
-    """What a slot of an object wears: a material and, where it is not the material's own, a colour."""
+    """The finish of a slot: a material and, unless it is the material's own, a colour."""
 
     material: str
     colour: RGB | None = None
@@ -95,9 +98,9 @@ class Finish(NamedTuple):
 @cache
 def _reflectance(finish: Finish) -> float:
     material = MATERIALS[finish.material]
-    if finish.colour is None or not material.tone:
+    if finish.colour is None or not material.colour_dependent:
         return material.reflectance
-    # Paints and cloths that are dark to the eye are mostly, not always, dark at 905 nm; red ones are bright.
+    # Dark paints and cloths are mostly dark at 905 nm too; red ones are bright.
     bright = 0.55 * finish.colour[0] + 0.3 * finish.colour[1] + 0.15 * finish.colour[2]
     low = 0.03 if material.gloss > 0.5 else 0.45
     return material.reflectance * (low + (1.15 - low) * min(1.0, bright / 0.75))
@@ -105,20 +108,20 @@ def _reflectance(finish: Finish) -> float:
 
 @dataclass
 class Surfaces:
-    """All surfaces of a scene, each a finish on an object; a triangle names its surface by number.
+    """All surfaces of a scene, each a finish on one object; triangles refer to surfaces by number.
 
-    ``freeze`` gives them as columns, for lookups by the surfaces that rays hit.
+    ``freeze`` returns them as columns, for lookups by the surface numbers of ray hits.
     """
 
     rows: list[tuple[int, int, int, float, RGB]] = field(default_factory=list)
 
     def add(self, finish: Finish, raw: int, instance: int = 0) -> int:
-        """The number of a new surface.
+        """Add a surface and return its number.
 
         Args:
             finish: its material and colour.
             raw: SemanticKITTI's class id.
-            instance: of the object it belongs to, 0 = none.
+            instance: instance number of its object, 0 = none.
         """
         colour = finish.colour or MATERIALS[finish.material].colour
         self.rows.append((INDEX[finish.material], raw, instance, _reflectance(finish), colour))
@@ -137,10 +140,10 @@ class Surfaces:
 
 
 class SurfaceTable(NamedTuple):
-    """Columns by surface number.
+    """All surfaces as columns, indexed by surface number.
 
     Args:
-        material: (S,) uint8, a key's place in ``MATERIALS``.
+        material: (S,) uint8, index in ``MATERIALS``.
         raw: (S,) uint32 SemanticKITTI class id.
         instance: (S,) int32, 0 = none.
         reflectance: (S,) float32.

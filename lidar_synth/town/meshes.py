@@ -1,8 +1,8 @@
-"""Triangles and the few ways to make them.
+"""Triangle meshes and functions that build them.
 
-A mesh is plain triangles without shared vertices: that is what Embree takes, joining meshes is joining
-arrays, and a face's look is one number beside it. Coordinates are metres, right-handed, z up; an object's
-own frame has x forward, y left and its origin on the ground below its middle.
+A mesh is a list of triangles without shared vertices, as Embree takes it; meshes are merged by concatenating arrays,
+and each triangle has a slot number for its finish. Coordinates are metres, right-handed, z up; an object's own frame
+has x forward, y left and its origin on the ground below its centre.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,7 +18,7 @@ Slots = int | NDArray[np.int32]
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles and, for each, the slot that says which of its object's finishes it wears.
+    """Triangles, each with a slot: the number of its finish among the finishes of its object.
 
     Args:
         triangles: (F, 3, 3) float32 corners in metres.
@@ -32,7 +32,7 @@ class Mesh:
         return len(self.slot)
 
     def moved(self, offset: ArrayLike = (0, 0, 0), yaw: float = 0.0, scale: ArrayLike = 1.0) -> "Mesh":
-        """The mesh scaled (one factor or one per axis), then turned about z (radians), then shifted (metres)."""
+        """The mesh scaled (one factor or one per axis), then rotated about z (radians), then translated (metres)."""
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)], np.float32)
         shape = np.asarray(scale, np.float32)
@@ -40,7 +40,7 @@ class Mesh:
         return Mesh(points.reshape(-1, 3, 3).astype(np.float32), self.slot)
 
     def posed(self, pose: NDArray[np.float64]) -> "Mesh":
-        """The mesh under a rigid motion (4, 4)."""
+        """The mesh transformed by a rigid motion (4, 4)."""
         points = self.triangles.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
         return Mesh(points.reshape(-1, 3, 3), self.slot)
 
@@ -52,7 +52,7 @@ class Mesh:
 
     @cached_property
     def outline(self) -> Points:
-        """(P, 3) the corners that lie outermost in some direction: no view of the mesh reaches beyond them."""
+        """(P, 3) extreme corners in 160 directions, which approximate the convex hull for image boxes."""
         angle = np.pi * (1 + 5**0.5) * np.arange(160)
         up = 1 - 2 * (np.arange(160) + 0.5) / 160
         flat = np.sqrt(1 - up * up)
@@ -63,7 +63,7 @@ class Mesh:
 
 
 def merge(parts: Iterable[Mesh]) -> Mesh:
-    """One mesh of several; none make an empty one."""
+    """Merge meshes into one; no parts give an empty mesh."""
     parts = list(parts)
     if not parts:
         return Mesh(np.zeros((0, 3, 3), np.float32), np.zeros(0, np.int32))
@@ -80,7 +80,7 @@ def quads(corners: ArrayLike, slot: Slots = 0) -> Mesh:
     """Flat quadrilaterals.
 
     Args:
-        corners: (Q, 4, 3) metres, around each.
+        corners: (Q, 4, 3) metres, in order around each quadrilateral.
         slot: one for all, or (Q,).
     """
     points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
@@ -92,7 +92,7 @@ _BOX_FACES = np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (
 
 
 def boxes(low: ArrayLike, high: ArrayLike, slot: Slots = 0) -> Mesh:
-    """Upright boxes by their lowest and highest corners, each (B, 3) metres."""
+    """Axis-aligned boxes, given by their lowest and highest corners, each (B, 3) metres."""
     ends = np.stack([np.asarray(low, np.float32).reshape(-1, 3), np.asarray(high, np.float32).reshape(-1, 3)])
     pick = np.array([(i >> 2, i >> 1 & 1, i & 1) for i in range(8)])
     corners = np.stack([ends[pick[:, axis], :, axis] for axis in range(3)], -1)
@@ -101,10 +101,10 @@ def boxes(low: ArrayLike, high: ArrayLike, slot: Slots = 0) -> Mesh:
 
 
 def loft(sections: ArrayLike, slot: Slots = 0, closed: bool = False) -> Mesh:
-    """The skin through a row of cross-sections.
+    """The surface through a sequence of cross-sections.
 
     Args:
-        sections: (S, P, 3) metres, P points around each of S sections.
+        sections: (S, P, 3) metres, P points around each of S cross-sections.
         slot: one for all, or (S-1, P-1) by panel ((S-1, P) if closed).
         closed: whether the last point of a section joins the first.
     """
@@ -116,26 +116,26 @@ def loft(sections: ArrayLike, slot: Slots = 0, closed: bool = False) -> Mesh:
 
 
 def fan(outline: ArrayLike, slot: int = 0) -> Mesh:
-    """A convex flat polygon (P, 3)."""
+    """A flat convex polygon with corners (P, 3), metres."""
     points = np.asarray(outline, np.float32)
     triangles = np.stack([np.broadcast_to(points[0], points[2:].shape), points[1:-1], points[2:]], 1)
     return Mesh(triangles, np.full(len(triangles), slot, np.int32))
 
 
 def prism(outline: ArrayLike, bottom: float, top: float, slot: int = 0, cap: int | None = None) -> Mesh:
-    """Walls over a convex outline (P, 2) with a flat top (of slot ``cap``) and an open floor."""
+    """Vertical walls over a convex outline (P, 2) with a flat top (of slot ``cap``), open at the bottom."""
     plan = np.asarray(outline, np.float32)
     low, high = np.c_[plan, np.full(len(plan), bottom)], np.c_[plan, np.full(len(plan), top)]
     return merge([loft([low, high], slot, closed=True), fan(high, slot if cap is None else cap)])
 
 
 def disc(centre: ArrayLike, normal: ArrayLike, radius: float, sides: int = 8, slot: int = 0) -> Mesh:
-    """A flat regular polygon."""
+    """A flat regular polygon around ``centre``."""
     return fan(np.asarray(centre) + radius * _rings(np.asarray(normal, float)[None], sides)[0], slot)
 
 
 def _rings(axes: NDArray[np.float64], sides: int) -> NDArray[np.float64]:
-    """(K, sides, 3) unit circles across K axes (K, 3)."""
+    """(K, sides, 3) unit circles perpendicular to K axes (K, 3)."""
     ahead = axes / np.sqrt((axes * axes).sum(1, keepdims=True))
     steep = np.abs(ahead[:, 2]) >= 0.9
     x, y, z = ahead.T
@@ -150,13 +150,13 @@ def _rings(axes: NDArray[np.float64], sides: int) -> NDArray[np.float64]:
 
 
 def tube(path: ArrayLike, radius: ArrayLike, sides: int = 6, slot: int = 0, caps: bool = True) -> Mesh:
-    """A round bar along a path.
+    """A tube along a path.
 
     Args:
         path: (K, 3) metres.
         radius: metres, one or (K,).
-        sides: corners of its cross-section.
-        slot: finish of all faces.
+        sides: number of corners of its cross-section.
+        slot: slot of all faces.
         caps: whether its ends are closed.
     """
     points = np.asarray(path, float)
@@ -170,17 +170,17 @@ def tube(path: ArrayLike, radius: ArrayLike, sides: int = 6, slot: int = 0, caps
 
 
 def tubes(pieces: Sequence[tuple[ArrayLike, ArrayLike]], sides: int = 5, slot: int = 0) -> Mesh:
-    """Several bars, each (path, radius)."""
+    """Several tubes, each given as (path, radius)."""
     return merge(tube(path, radius, sides, slot) for path, radius in pieces)
 
 
 def leaves(centres: ArrayLike, size: ArrayLike, rng: np.random.Generator, slot: Slots = 0) -> Mesh:
-    """Small triangles of random attitude, each standing for a bunch of leaves.
+    """Small triangles of random orientation, each representing a cluster of leaves.
 
     Args:
         centres: (L, 3) metres.
-        size: metres from the middle to a corner, one or (L,).
-        rng: draws the attitudes.
+        size: metres from the centre to a corner, one or (L,).
+        rng: samples the orientations.
         slot: one for all, or (L,).
     """
     middle = np.asarray(centres, np.float32).reshape(-1, 3)
@@ -195,7 +195,7 @@ def leaves(centres: ArrayLike, size: ArrayLike, rng: np.random.Generator, slot: 
 
 
 def ball(centre: ArrayLike, radii: ArrayLike, slot: int = 0, rings: int = 4, sides: int = 8) -> Mesh:
-    """An ellipsoid with half axes ``radii`` (one or three, metres)."""
+    """An ellipsoid with semi-axes ``radii`` (one or three, metres)."""
     polar = np.linspace(0, np.pi, rings + 1)[:, None]
     angle = 2 * np.pi * np.arange(sides) / sides
     unit = np.stack(

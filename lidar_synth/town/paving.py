@@ -1,4 +1,4 @@
-"""What a street's ground is painted with: verges, pavements, bays, carriageways, markings, crossings."""
+"""The kinds of ground of a street: verges, pavements, parking bays, carriageways, markings, crossings."""
 
 from dataclasses import dataclass, field
 
@@ -8,17 +8,19 @@ from lidar_synth.town.ground import NAMES, Corner, Rect
 from lidar_synth.town.street import LEFT, REACH, RIGHT, SideStreet, Street
 
 PLAZA_DEPTH = 34.0
-"""Metres of open square behind the pavement."""
+"""Depth of an open square behind the pavement, metres."""
 BEYOND = 260.0
-"""Metres of ground around the driven part, for the camera's horizon."""
+"""Metres of ground around the driven part, so that the camera image has a horizon."""
 
 
 @dataclass
 class Paint:
-    """Rectangles of ground, later ones over earlier ones.
+    """Rectangles of ground; later ones cover earlier ones.
 
     Args:
-        reach: (lowest s, highest s, lowest t, highest t) of all ground.
+        reach: (lowest s, highest s, lowest t, highest t) of all ground, metres.
+        rects: the rectangles, see ``Ground``.
+        corners: rounded corners of kerbs.
     """
 
     reach: tuple[float, float, float, float]
@@ -26,36 +28,36 @@ class Paint:
     corners: list[Corner] = field(default_factory=list)
 
     def __call__(self, s: tuple[float, float], t: tuple[float, float], kind: str) -> None:
-        """Paint a rectangle; the ends of s and of t in either order."""
+        """Paint a rectangle with a kind of ground; ``s`` and ``t`` are its intervals in metres, in either order."""
         self.rects.append((min(s), max(s), min(t), max(t), NAMES.index(kind)))
 
 
 def pave(street: Street, rng: np.random.Generator) -> Paint:
-    """All ground of a street but its lots, from the pavements in to the markings."""
+    """Paint all ground of a street except its lots, from the pavements inwards to the markings."""
     paint = Paint((-BEYOND, street.length + BEYOND, -BEYOND, BEYOND))
-    whole = paint.reach[:2]
+    full_length = paint.reach[:2]
     asphalt = "road" if rng.random() < 0.7 else "old_road"
     for side, sign in ((RIGHT, -1), (LEFT, 1)):
         front = street.front(side)
         if street.kind == "edge" and rng.random() < 0.6:
-            paint(whole, (sign * (front + rng.uniform(2, 8)), sign * BEYOND), "field")
+            paint(full_length, (sign * (front + rng.uniform(2, 8)), sign * BEYOND), "field")
         if street.plaza == side:
             paint((-12, street.length + 12), (sign * front, sign * (front + PLAZA_DEPTH)), "plaza")
         at = front
         for band in reversed(street.bands[side]):
             at -= band.width
-            paint(whole, (sign * at, sign * (at + band.width)), band.kind)
+            paint(full_length, (sign * at, sign * (at + band.width)), band.kind)
             if band.kind == "sidewalk":
-                paint(whole, (sign * at, sign * (at + 0.13)), "kerb")
+                paint(full_length, (sign * at, sign * (at + 0.13)), "kerb")
             if band.kind == "parking":
                 for s in np.arange(-REACH, street.length + REACH, rng.uniform(18, 40)):
                     paint((s, s + 1.6), (sign * at, sign * (at + band.width)), "grass")
     for c in street.crossings:
         _pavements(street, c, paint)
-    paint(whole, (-street.edge[RIGHT], street.edge[LEFT]), asphalt)
+    paint(full_length, (-street.edge[RIGHT], street.edge[LEFT]), asphalt)
     if street.median:
         inner = street.median - 0.15
-        paint(whole, (-inner, inner), str(rng.choice(["grass", "rails", "kerb"])))
+        paint(full_length, (-inner, inner), str(rng.choice(["grass", "rails", "kerb"])))
     if street.marked:
         _markings(street, paint)
     for c in street.crossings:
@@ -64,27 +66,28 @@ def pave(street: Street, rng: np.random.Generator) -> Paint:
 
 
 def _pavements(street: Street, c: SideStreet, paint: Paint) -> None:
+    """Paint the pavements and kerbs of a side street."""
     if not c.pavement:
         return
     for side in c.sides:
         sign, edge = 2 * side - 1, street.edge[side]
         out = c.half + c.pavement
         paint((c.s - out, c.s + out), (sign * edge, sign * BEYOND), "sidewalk")
-        for way in (-1, 1):
-            paint((c.s + way * c.half, c.s + way * (c.half + 0.13)), (sign * edge, sign * BEYOND), "kerb")
-            paint((c.s, c.s + way * out), (sign * edge, sign * (edge + 0.13)), "kerb")
-            paint.corners.append(Corner(c.s + way * c.half, sign * edge, way, sign, min(c.pavement, 3.0)))
+        for direction in (-1, 1):
+            paint((c.s + direction * c.half, c.s + direction * (c.half + 0.13)), (sign * edge, sign * BEYOND), "kerb")
+            paint((c.s, c.s + direction * out), (sign * edge, sign * (edge + 0.13)), "kerb")
+            paint.corners.append(Corner(c.s + direction * c.half, sign * edge, direction, sign, min(c.pavement, 3.0)))
 
 
 def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> None:
-    """A side street's asphalt; lines, stop lines and zebras where the streets are big."""
+    """Paint the asphalt of a side street, and on larger streets its lines, stop lines and zebra crossings."""
     low = -BEYOND if RIGHT in c.sides else -street.edge[RIGHT]
     high = BEYOND if LEFT in c.sides else street.edge[LEFT]
     if len(c.sides) == 1 and street.median:
         low, high = (low, -street.median) if RIGHT in c.sides else (street.median, high)
     paint((c.s - c.half, c.s + c.half), (low, high), asphalt)
     if street.kind == "junction" and street.median:
-        # The strip between the ways ends before the zebra crossings.
+        # The median ends before the zebra crossings.
         paint((c.s - c.half - 6.5, c.s + c.half + 6.5), (-street.median, street.median), asphalt)
     if not street.marked or street.kind not in ("junction", "main", "square"):
         return
@@ -94,17 +97,23 @@ def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> N
         for t in np.arange(edge + 3, 60, 6.0):
             paint((c.s - 0.06, c.s + 0.06), (sign * t, sign * (t + 3)), "marking")
     if street.kind == "junction":
-        for way in (-1, 1):
-            s = c.s + way * (c.half + 1.8)
+        for direction in (-1, 1):
+            s = c.s + direction * (c.half + 1.8)
             for t in np.arange(-street.edge[RIGHT] + 0.4, street.edge[LEFT] - 0.5, 1.0):
-                paint((s, s + way * 3.0), (t, t + 0.5), "marking")
-            lanes = (-street.edge[RIGHT], -0.1) if way < 0 else (0.1, street.edge[LEFT])
-            paint((s + way * 4.2, s + way * 4.6), lanes, "marking")
+                paint((s, s + direction * 3.0), (t, t + 0.5), "marking")
+            lanes = (-street.edge[RIGHT], -0.1) if direction < 0 else (0.1, street.edge[LEFT])
+            paint((s + direction * 4.2, s + direction * 4.6), lanes, "marking")
 
 
 def _markings(street: Street, paint: Paint) -> None:
-    whole = paint.reach[:2]
-    dashes = {round((a.t + b.t) / 2, 3) for a in street.lanes for b in street.lanes if a.way == b.way and a.t < b.t}
+    """Paint the lane markings of the street."""
+    full_length = paint.reach[:2]
+    dashes = {
+        round((a.t + b.t) / 2, 3)
+        for a in street.lanes
+        for b in street.lanes
+        if a.direction == b.direction and a.t < b.t
+    }
     if not street.median:
         dashes.add(0.0)
     for s in np.arange(-REACH - 60, street.length + REACH + 60, 9.0):
@@ -112,10 +121,10 @@ def _markings(street: Street, paint: Paint) -> None:
             paint((s, s + 3.0), (t - 0.06, t + 0.06), "marking")
     if street.median:
         for sign in (-1, 1):
-            paint(whole, (sign * street.median, sign * (street.median + 0.12)), "marking")
+            paint(full_length, (sign * street.median, sign * (street.median + 0.12)), "marking")
     if street.kind == "edge":
         for t in (-street.edge[RIGHT] + 0.2, street.edge[LEFT] - 0.32):
-            paint(whole, (t, t + 0.12), "marking")
+            paint(full_length, (t, t + 0.12), "marking")
     for side, sign in ((RIGHT, -1), (LEFT, 1)):
         if street.parking[side] == "street":
-            paint(whole, (sign * (street.edge[side] - 2.15), sign * (street.edge[side] - 2.05)), "marking")
+            paint(full_length, (sign * (street.edge[side] - 2.15), sign * (street.edge[side] - 2.05)), "marking")

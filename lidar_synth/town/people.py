@@ -1,7 +1,7 @@
-"""Pedestrians and riders: a body of limbs in the pose of the moment.
+"""Pedestrians and riders, as tubes and ellipsoids in a sequence of poses.
 
-A walker's joints follow its phase, radians: one stride is 2 pi. A rider shares one mesh, one instance and
-one box with what it rides, as SemanticKITTI and KITTI label them.
+The joints of a walker follow a phase in radians; one stride is 2 pi. A rider shares one mesh, one instance and one
+box with its bicycle or motorcycle, as in the labels of SemanticKITTI and KITTI.
 """
 
 from functools import cache
@@ -20,7 +20,7 @@ CLOTHES: tuple[RGB, ...] = (
     (0.34, 0.36, 0.30), (0.62, 0.52, 0.38), (0.18, 0.30, 0.22), (0.85, 0.80, 0.25), (0.45, 0.28, 0.42),
 )  # fmt: skip
 PHASES = 8
-"""Poses in a walker's stride."""
+"""Number of poses in a walker's stride."""
 
 _BODY = (
     Finish("cloth", (0.3, 0.3, 0.4)), Finish("cloth", (0.16, 0.18, 0.24)), Finish("skin"),
@@ -29,6 +29,7 @@ _BODY = (
 
 
 def _torso(hip: tuple[float, float, float], neck: tuple[float, float, float], top: int, head: int) -> Mesh:
+    """The torso and the head of a person, between the hip and the neck."""
     h, n = np.array(hip), np.array(neck)
     chest = h + 0.62 * (n - h)
     skull = n + (n - h) / np.linalg.norm(n - h) * 0.16 + (0.02, 0, 0)
@@ -43,7 +44,7 @@ def _torso(hip: tuple[float, float, float], neck: tuple[float, float, float], to
 
 
 def _walker(phase: float, stride: float, bag: bool) -> Mesh:
-    """A person of 1.75 m; a stride of 0 stands."""
+    """A person 1.75 m tall; ``stride`` scales the swing of the limbs, 0 = standing."""
     hip, neck = (0.0, 0.0, 0.93 - 0.02 * stride * abs(np.sin(phase))), (0.03, 0.0, 1.45)
     legs, shoes, arms, hands = [], [], [], []
     for side, turn in ((-1, phase), (1, phase + np.pi)):
@@ -68,7 +69,7 @@ def _walker(phase: float, stride: float, bag: bool) -> Mesh:
 
 @cache
 def walker(phase: int, standing: bool = False, bag: bool = False) -> Prototype:
-    """A pedestrian in one of ``PHASES`` poses of the stride."""
+    """A pedestrian in pose number ``phase`` of the ``PHASES`` poses of a stride."""
     mesh = _walker(2 * np.pi * phase / PHASES, 0.12 if standing else 1.0, bag)
     return Prototype(mesh, _BODY, "Pedestrian", (30, 254))
 
@@ -111,7 +112,7 @@ def _rider(hip: tuple[float, float, float], neck: tuple[float, float, float], gr
 
 @cache
 def cyclist(phase: int) -> Prototype:
-    """A cyclist in one of ``PHASES`` positions of the pedals."""
+    """A cyclist in position number ``phase`` of the ``PHASES`` positions of the pedals."""
     turn = 2 * np.pi * phase / PHASES
     feet = [(-0.08 + 0.17 * np.cos(a), 0.30 + 0.17 * np.sin(a)) for a in (turn, turn + np.pi)]
     person = _rider((-0.22, 0, 1.0), (0.05, 0, 1.50), (0.30, 0.26, 1.05), (feet[0], feet[1]), HAIR)
@@ -126,6 +127,7 @@ def motorcyclist() -> Prototype:
 
 
 def _mounted(person: Mesh, machine: Mesh, name: str, raw: tuple[int, int]) -> Prototype:
+    """The prototype of a rider together with the bicycle or motorcycle."""
     below = Mesh(machine.triangles, machine.slot + len(_BODY))
     frame = (Finish("paint", (0.2, 0.22, 0.26)), *bodywork.FINISHES[1:])
     return Prototype(merge([person, below]), (*_BODY, *frame), name, raw)

@@ -1,7 +1,7 @@
-"""Trees, bushes and hedges: trunks and boughs as tubes, foliage as many small triangles.
+"""Meshes of trees, bushes and hedges: trunks and branches as tubes, foliage as many small triangles.
 
-Rays slip between the leaves as they do in a real crown: some end on the outside, some on a bough, some
-behind the tree. Prototypes are drawn once per process from fixed keys; a scene turns, scales and tints them.
+Rays pass between the leaves as in a real crown: some hit outer leaves, some a branch, and some an object behind the
+tree. Each prototype is sampled once per process with a fixed key; a scene rotates, scales and tints it.
 """
 
 from functools import cache
@@ -14,9 +14,9 @@ from lidar_synth.town.meshes import Mesh, leaves, loft, merge, tube
 
 LEAF, BARK, TWIG = 0, 1, 2
 TREE_CLASSES = (70, 71, 70)
-"""SemanticKITTI's class by slot: foliage and boughs are vegetation, the stem below them is trunk."""
+"""SemanticKITTI's class id of each slot: leaves and branches are vegetation, the stem is trunk."""
 VARIANTS = 4
-"""Prototypes of each species."""
+"""Number of prototypes of each species."""
 
 SPECIES: dict[str, tuple[Finish, ...]] = {
     "round": (Finish("leaf", (0.20, 0.36, 0.10)), Finish("bark"), Finish("bark")),
@@ -27,38 +27,40 @@ SPECIES: dict[str, tuple[Finish, ...]] = {
     "bush": (Finish("leaf", (0.22, 0.35, 0.11)), Finish("bark"), Finish("bark")),
     "thuja": (Finish("leaf", (0.16, 0.29, 0.12)), Finish("bark"), Finish("bark")),
 }
-"""Finishes of each species; the first is tinted per plant."""
+"""The finishes of each species; the colour of the first one varies per plant."""
 
 
 def _rng(name: str, variant: int) -> np.random.Generator:
+    """The random generator of a prototype; keyed by its species and variant, so that plants never change."""
     return np.random.Generator(np.random.Philox(key=(sorted(SPECIES).index(name), variant)))
 
 
 def _stem(height: float, radius: float, rng: np.random.Generator) -> tuple[Mesh, NDArray[np.float64]]:
-    """A slightly crooked trunk with roots spreading at its foot; also its path."""
+    """A slightly crooked trunk that widens at its foot, and its path (5, 3)."""
     levels = np.array([-0.2, 0.12, 0.45, 0.5 * height, height])
     lean = np.cumsum(rng.normal(0, 0.05, (5, 2)), axis=0) * (levels[:, None] > 0.2)
     path = np.c_[lean, levels]
     return tube(path, radius * np.array([1.7, 1.25, 1.0, 0.9, 0.75]), 8, BARK), path
 
 
-def _boughs(foot: NDArray[np.float64], ends: NDArray[np.float64], radius: float) -> Mesh:
+def _branches(foot: NDArray[np.float64], ends: NDArray[np.float64], radius: float) -> Mesh:
+    """Branches from ``foot`` (3,) to each of ``ends`` (K, 3)."""
     return merge(
         tube([foot, 0.5 * (foot + e) + (0, 0, 0.1), e], [radius, 0.6 * radius, 0.02], 4, TWIG, caps=False) for e in ends
     )
 
 
-def _clumps(centres: NDArray[np.float64], spread: NDArray[np.float64] | float, count: int, size: float,
+def _leaf_clusters(centres: NDArray[np.float64], spread: NDArray[np.float64] | float, count: int, size: float,
             rng: np.random.Generator) -> Mesh:  # fmt: skip
-    """Bunches of leaves around each centre."""
+    """Clusters of leaves, ``count`` triangles around each centre."""
     middle = np.repeat(centres, count, axis=0) + rng.normal(0, 1, (count * len(centres), 3)) * spread
     return leaves(middle, size * rng.uniform(0.6, 1.3, len(middle)), rng, LEAF)
 
 
-def _shell(
+def _ellipsoid_points(
     count: int, radii: tuple[float, float, float], middle: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Points near the surface of an ellipsoid above the origin."""
+    """(count, 3) points near the surface of an ellipsoid whose centre is ``middle`` metres above the origin."""
     out = rng.standard_normal((count, 3))
     out *= rng.uniform(0.55, 1.0, (count, 1)) ** 0.6 / np.linalg.norm(out, axis=1, keepdims=True)
     points: NDArray[np.float64] = out * radii + (0, 0, middle)
@@ -66,29 +68,35 @@ def _shell(
 
 
 def _broadleaf(rng: np.random.Generator, height: float, clear: float, width: float, size: float, droop: float) -> Mesh:
+    """A broadleaf tree; sizes in metres, ``clear`` is the height of the trunk below the crown."""
     trunk, path = _stem(clear, rng.uniform(0.13, 0.24), rng)
     middle, up = (height + clear) / 2, (height - clear) / 2 + 0.3
-    heart = _shell(46, (0.44 * width, 0.44 * width, 0.9 * up), middle, rng)
-    boughs = _boughs(path[-1], heart[rng.permutation(len(heart))[:6]], 0.08)
+    crown = _ellipsoid_points(46, (0.44 * width, 0.44 * width, 0.9 * up), middle, rng)
+    branches = _branches(path[-1], crown[rng.permutation(len(crown))[:6]], 0.08)
     spread = np.array([0.42, 0.42, 0.34 + droop])
-    inside = (0, 0, middle) + 0.7 * (_shell(80, (width / 2, width / 2, up), 0, rng))
-    return merge([trunk, boughs, _clumps(heart - (0, 0, droop), spread, 12, 1.06 * size, rng),
+    inside = (0, 0, middle) + 0.7 * (_ellipsoid_points(80, (width / 2, width / 2, up), 0, rng))
+    return merge([trunk, branches, _leaf_clusters(crown - (0, 0, droop), spread, 12, 1.06 * size, rng),
                   leaves(inside, 0.11 * width, rng, LEAF)])  # fmt: skip
 
 
 def _conifer(rng: np.random.Generator, height: float, clear: float, width: float) -> Mesh:
+    """A conifer; sizes in metres, ``clear`` is the height at which its leaves begin."""
     trunk, _ = _stem(0.8 * height, 0.02 + 0.012 * height, rng)
     level = 1 - rng.uniform(0, 1, 420) ** 0.6
     reach = width / 2 * (1 - level) * np.sqrt(rng.uniform(0.25, 1, 420)) + 0.06
     angle = rng.uniform(0, 2 * np.pi, 420)
     centres = np.c_[reach * np.cos(angle), reach * np.sin(angle), clear + (height - clear) * level - 0.25 * reach]
     return merge(
-        [trunk, leaves(centres, (0.08 + 0.05 * width) * (1.2 - 0.5 * level), rng, LEAF), _skirt(height, clear, width)]
+        [
+            trunk,
+            leaves(centres, (0.08 + 0.05 * width) * (1.2 - 0.5 * level), rng, LEAF),
+            _inner_cone(height, clear, width),
+        ]
     )
 
 
-def _skirt(height: float, clear: float, width: float) -> Mesh:
-    """The dense cone inside a conifer."""
+def _inner_cone(height: float, clear: float, width: float) -> Mesh:
+    """The opaque cone inside a conifer."""
     angle = np.linspace(0, 2 * np.pi, 9)[:-1]
     rings = [np.c_[0.33 * width * f * np.cos(angle), 0.33 * width * f * np.sin(angle), np.full(8, z)]
              for f, z in ((1.0, clear + 0.05 * height), (0.01, 0.95 * height))]  # fmt: skip
@@ -96,14 +104,15 @@ def _skirt(height: float, clear: float, width: float) -> Mesh:
 
 
 def _bush(rng: np.random.Generator, height: float, width: float) -> Mesh:
-    heart = _shell(14, (0.42 * width, 0.42 * width, 0.42 * height), 0.52 * height, rng)
-    twigs = _boughs(np.zeros(3), heart[:3], 0.025)
-    return merge([twigs, _clumps(heart, 0.18, 12, 0.16, rng), _clumps(heart * 0.5, 0.12, 3, 0.3, rng)])
+    """A bush; sizes in metres."""
+    crown = _ellipsoid_points(14, (0.42 * width, 0.42 * width, 0.42 * height), 0.52 * height, rng)
+    twigs = _branches(np.zeros(3), crown[:3], 0.025)
+    return merge([twigs, _leaf_clusters(crown, 0.18, 12, 0.16, rng), _leaf_clusters(crown * 0.5, 0.12, 3, 0.3, rng)])
 
 
 @cache
 def coarse_plant(species: str, variant: int) -> Mesh:
-    """``plant`` for one that is only seen from afar: a quarter of its leaves, each twice as wide."""
+    """``plant`` with fewer triangles, to be seen from afar: a quarter of the leaves, each twice as wide."""
     mesh = plant(species, variant)
     leaf = mesh.slot == LEAF
     if species in ("spruce", "thuja"):
@@ -117,7 +126,7 @@ def coarse_plant(species: str, variant: int) -> Mesh:
 
 @cache
 def plant(species: str, variant: int) -> Mesh:
-    """One of the ``VARIANTS`` of a species of ``SPECIES``; slots LEAF, BARK, TWIG."""
+    """Prototype number ``variant`` (0 to ``VARIANTS`` - 1) of a species; slots LEAF, BARK, TWIG."""
     rng = _rng(species, variant)
     match species:
         case "round":
@@ -136,7 +145,7 @@ def plant(species: str, variant: int) -> Mesh:
 
 
 def hedge(length: float, height: float, depth: float, rng: np.random.Generator) -> Mesh:
-    """A clipped hedge along +x from the origin, half its depth to either side; leaves are slot 0, its inside slot 1."""
+    """A clipped hedge along +x from the origin, centred on the x axis; slot 0 = leaves, slot 1 = opaque core."""
     steps = max(2, int(length / 0.5) + 1)
     x = np.linspace(0, length, steps)
     half, top = 0.36 * depth, height - 0.08

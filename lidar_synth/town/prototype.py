@@ -1,4 +1,4 @@
-"""One kind of object with an instance: its shape, its looks, its classes and the name of its box."""
+"""Prototypes of objects with an instance number: mesh, finishes, classes and box name."""
 
 from dataclasses import dataclass
 
@@ -8,13 +8,13 @@ from lidar_synth.town.meshes import Mesh
 
 @dataclass(frozen=True)
 class Prototype:
-    """One kind of object, standing on the ground at the origin and facing +x.
+    """One kind of object, with its origin on the ground and its front along +x.
 
     Args:
-        mesh: its triangles, slots numbered by place in ``finishes``.
-        finishes: what each slot wears; slot 0 is repainted per object.
-        name: KITTI's name of its box, "" = no box.
-        raw: SemanticKITTI's class standing still, and moving.
+        mesh: its triangles; slots are indices in ``finishes``.
+        finishes: the finish of each slot; the colour of slot 0 varies per object.
+        name: KITTI's class name of its box, "" = no box.
+        raw: SemanticKITTI's class id when static, and when moving.
     """
 
     mesh: Mesh
@@ -23,5 +23,5 @@ class Prototype:
     raw: tuple[int, int]
 
     def painted(self, colour: RGB) -> tuple[Finish, ...]:
-        """The finishes with another colour in slot 0."""
+        """The finishes with slot 0 in the given colour."""
         return (Finish(self.finishes[0].material, colour), *self.finishes[1:])

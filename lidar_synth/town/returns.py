@@ -1,9 +1,9 @@
-"""What comes back to the sensor from where its rays end: range, reflectance, or nothing.
+"""The sensor model: from ray hits to returns with range and reflectance, or to no return.
 
-The model follows what labelled street scans of an HDL-64E show. Its reflectance is corrected for distance up to
-about 25 m and then falls; it hardly depends on the angle until a face is nearly grazed; glossy paint and glass
-answer only when they face the sensor; plates and signs send everything back; each laser has its own gain.
-A ray is lost at random, the more so the less light returns.
+The model is fitted to labelled street scans of an HDL-64E. Reflectance is corrected for distance up to about 25 m and
+then decreases; it hardly depends on the angle of incidence except near grazing incidence; glossy paint and glass
+return light only at normal incidence; number plates and signs are retroreflectors; each laser has its own gain.
+Rays are dropped at random, with a probability that grows as the returned signal falls.
 """
 
 from dataclasses import dataclass
@@ -12,35 +12,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.town.cast import MISS, Hits, Stage
+from lidar_synth.town.cast import MISS, Hits, Snapshot
 from lidar_synth.town.materials import SurfaceTable, column
 
 Floats = NDArray[np.float32]
 LEVELS = 256
 """Reflectance is stored as k / 256, as KITTI-360 does."""
 
-_THROUGH, _LOST, _SPECKLE = column("through"), column("lost"), column("speckle")
-_GLOSS, _DEPTH = column("gloss"), column("depth")
+_TRANSMISSION, _DROPOUT, _SPECKLE = column("transmission"), column("dropout"), column("speckle")
+_GLOSS, _ROUGHNESS = column("gloss"), column("roughness")
 _STEP = 0.25
 _RANGES = np.array([0, 4, 8, 20, 25, 35, 50, 70, 130])
-_FALL = np.interp(np.arange(0, 130, _STEP), _RANGES, [0.72, 0.82, 0.98, 0.98, 0.90, 0.64, 0.40, 0.22, 0.10]).astype(
-    np.float32
-)
-"""How reflectance falls with distance, by steps of ``_STEP`` metres."""
-_DARK = 0.10
-"""Below about this, the sensor reads 0."""
-_BLANK = 0.025
-"""Share of returns whose reflectance reads 0 for no visible reason."""
+_DISTANCE_FACTOR = np.interp(
+    np.arange(0, 130, _STEP), _RANGES, [0.72, 0.82, 0.98, 0.98, 0.90, 0.64, 0.40, 0.22, 0.10]
+).astype(np.float32)
+"""Factor of reflectance by distance, in steps of ``_STEP`` metres."""
+_DARK_LIMIT = 0.10
+"""Values below this are reduced further, to 0 at two thirds of it: the sensor measures 0 for dark surfaces."""
+_ZERO_SHARE = 0.025
+"""Share of returns whose reflectance is 0 at random."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """How imperfect the sensor is.
+    """The measurement noise of the sensor.
 
     Args:
-        range_std: metres, of every range.
-        gain_std: spread of the lasers' gains.
-        threshold: returned signal at which half of the rays are lost.
+        range_std: metres, standard deviation of the range.
+        gain_std: standard deviation of the lasers' gains.
+        threshold: signal strength at which half of the rays are dropped.
     """
 
     range_std: float = 0.018
@@ -49,15 +49,18 @@ class Noise:
 
 
 def laser_gains(sensor: Sensor, noise: Noise) -> Floats:
-    """(H,) gain of each laser, always the same for a sensor; a few lasers are weak."""
+    """(H,) gain of each laser, the same for every scan of a sensor; a few lasers are weak."""
     rng = np.random.Generator(np.random.Philox(key=sensor.shape[0]))
     gains = rng.normal(1.15, noise.gain_std, sensor.shape[0])
     gains[rng.random(sensor.shape[0]) < 0.08] *= 0.6
     return np.clip(gains, 0.4, 1.4).astype(np.float32)
 
 
-def patches(points: Floats, size: float) -> Floats:
-    """(N,) uniform in [0, 1), the same for all points (N, 3) of a cube of ``size`` metres: panes answer as wholes."""
+def cell_noise(points: Floats, size: float) -> Floats:
+    """(N,) pseudo-random values, uniform in [0, 1), one per cube of ``size`` metres in which the points (N, 3) lie.
+
+    A hash of the cube's indices, so that all points of a window pane get the same value.
+    """
     x, y, z = np.floor(points / np.float32(size)).astype(np.int64).astype(np.uint64).T
     mixed = x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9)
     mixed = (mixed ^ (mixed >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -66,7 +69,7 @@ def patches(points: Floats, size: float) -> Floats:
 
 
 def see_through(
-    stage: Stage,
+    snapshot: Snapshot,
     hits: Hits,
     origins: Floats,
     directions: Floats,
@@ -74,24 +77,24 @@ def see_through(
     surfaces: SurfaceTable,
     rng: np.random.Generator,
 ) -> None:
-    """Send on, in place, the rays that pass glass, wire mesh and leaves; at most three times."""
-    on = np.flatnonzero(hits.surface != MISS)
+    """Continue, in place, the rays that pass through glass, wire mesh and leaves, through at most three layers."""
+    rays = np.flatnonzero(hits.surface != MISS)
     for _ in range(3):
-        share = _THROUGH[surfaces.material[hits.surface[on]]]
-        on, share = on[share > 0], share[share > 0]
-        pane = _GLOSS[surfaces.material[hits.surface[on]]] > 0
-        draw = rng.random(len(on), np.float32)
-        glass = on[pane]
-        draw[pane] = patches(origins[glass] + hits.distance[glass, None] * directions[glass], 0.4)
-        on = on[draw < share]
-        if not len(on):
+        share = _TRANSMISSION[surfaces.material[hits.surface[rays]]]
+        rays, share = rays[share > 0], share[share > 0]
+        pane = _GLOSS[surfaces.material[hits.surface[rays]]] > 0
+        sample = rng.random(len(rays), np.float32)
+        glass = rays[pane]
+        sample[pane] = cell_noise(origins[glass] + hits.distance[glass, None] * directions[glass], 0.4)
+        rays = rays[sample < share]
+        if not len(rays):
             return
-        start = hits.distance[on] + np.float32(0.004)
-        again = stage.cast(origins[on] + start[:, None] * directions[on], directions[on], eye)
-        hits.distance[on] = start + again.distance
-        hits.surface[on] = again.surface
-        hits.normal[on] = again.normal
-        on = on[again.surface != MISS]
+        start = hits.distance[rays] + np.float32(0.004)
+        beyond = snapshot.cast(origins[rays] + start[:, None] * directions[rays], directions[rays], eye)
+        hits.distance[rays] = start + beyond.distance
+        hits.surface[rays] = beyond.surface
+        hits.normal[rays] = beyond.normal
+        rays = rays[beyond.surface != MISS]
 
 
 def measure(
@@ -103,40 +106,42 @@ def measure(
     noise: Noise,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Which rays return, with what range and reflectance.
+    """Sample which rays return, and their range and reflectance.
 
     Args:
-        hits: where N rays end.
+        hits: the hits of N rays.
         directions: (N, 3) unit vectors.
-        laser: (N,) which laser sent each.
-        surfaces: of the scene.
-        gains: (H,) by laser.
-        noise: the sensor's.
-        rng: draws noise and losses.
+        laser: (N,) the laser of each ray.
+        surfaces: the surfaces of the scene.
+        gains: (H,) gain of each laser.
+        noise: the measurement noise of the sensor.
+        rng: samples noise and dropped rays.
 
     Returns:
-        The M rays that return, their ranges (M,) in metres and reflectances (M,) in [0, 1).
+        (M,) indices of the rays that return, (M,) ranges in metres and (M,) reflectances in [0, 1).
     """
-    back = np.flatnonzero(hits.surface != MISS)
-    surface, far = hits.surface[back], hits.distance[back]
+    hit = np.flatnonzero(hits.surface != MISS)
+    surface, distance = hits.surface[hit], hits.distance[hit]
     material = surfaces.material[surface]
-    facing = np.abs(np.einsum("ij,ij->i", hits.normal[back], directions[back]))
+    facing = np.abs(np.einsum("ij,ij->i", hits.normal[hit], directions[hit]))
     power = surfaces.reflectance[surface] * (1 - _GLOSS[material] * (1 - facing * facing))
-    signal = power * np.minimum(1, facing * 9) * np.minimum(1, 900 / np.maximum(far * far, 1)) + np.float32(0.002)
-    kept = (1 - _LOST[material]) * signal**2 / (signal**2 + np.float32(noise.threshold) ** 2)
-    returned = np.flatnonzero(rng.random(len(back), np.float32) < kept)
-    back, far, material, power, facing = (
-        back[returned],
-        far[returned],
+    spreading = np.minimum(1, 900 / np.maximum(distance * distance, 1))
+    signal = power * np.minimum(1, facing * 9) * spreading + np.float32(0.002)
+    return_probability = (1 - _DROPOUT[material]) * signal**2 / (signal**2 + np.float32(noise.threshold) ** 2)
+    returned = np.flatnonzero(rng.random(len(hit), np.float32) < return_probability)
+    hit, distance, material, power, facing = (
+        hit[returned],
+        distance[returned],
         material[returned],
         power[returned],
         facing[returned],
     )
-    draw = rng.standard_normal((2, len(back)), np.float32)
-    seen = power + _SPECKLE[material] * draw[0] * np.minimum(1, 4 * power)
-    step = np.minimum(far * np.float32(1 / _STEP), len(_FALL) - 1).astype(np.int32)
-    value = seen * gains[laser[back]] * _FALL[step] * np.clip((facing - 0.015) / 0.075, 0, 1)
-    value = np.where(value < _DARK, 3 * value - 2 * _DARK, value) * (rng.random(len(back), np.float32) > _BLANK)
-    measured = far + np.maximum(np.float32(noise.range_std), _DEPTH[material]) * draw[1]
+    gaussian = rng.standard_normal((2, len(hit)), np.float32)
+    speckled = power + _SPECKLE[material] * gaussian[0] * np.minimum(1, 4 * power)
+    distance_bin = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1).astype(np.int32)
+    value = speckled * gains[laser[hit]] * _DISTANCE_FACTOR[distance_bin] * np.clip((facing - 0.015) / 0.075, 0, 1)
+    value = np.where(value < _DARK_LIMIT, 3 * value - 2 * _DARK_LIMIT, value)
+    value = value * (rng.random(len(hit), np.float32) > _ZERO_SHARE)
+    measured = distance + np.maximum(np.float32(noise.range_std), _ROUGHNESS[material]) * gaussian[1]
     reflectance = np.floor(np.clip(value, 0, 0.995) * LEVELS) / LEVELS
-    return back, measured, reflectance.astype(np.float32)
+    return hit, measured, reflectance.astype(np.float32)

@@ -1,7 +1,7 @@
-"""A scene under construction: where things are put, and the objects that carry an instance.
+"""A scene under construction: static objects, and objects with an instance number.
 
-Things are given in street coordinates; the scene turns them along the street, sets them on the ground and
-collects their triangles with the surface that each wears.
+Objects are placed in street coordinates. The scene rotates them along the street, puts them on the ground, and
+collects their triangles with a surface number for each.
 """
 
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lidar_synth.town.furniture import Thing
+from lidar_synth.town.furniture import StaticObject
 from lidar_synth.town.ground import Ground
 from lidar_synth.town.materials import RGB, Surfaces
 from lidar_synth.town.meshes import Mesh, merge
@@ -19,15 +19,15 @@ Pose = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Placed:
-    """An object with an instance: a vehicle, a person, a rider.
+class PlacedObject:
+    """An object with an instance number, placed in the world: a vehicle, a person or a rider.
 
     Args:
-        prototype: its shape and kind.
+        prototype: its kind.
         pose: (4, 4) from its own frame to the world.
-        instance: 1 and up, unique in the stretch.
+        instance: its instance number, 1 and up, unique in the stretch.
         surfaces: the surface number of each slot of its mesh.
-        scale: of the prototype.
+        scale: the scale of its prototype.
     """
 
     prototype: Prototype
@@ -39,57 +39,64 @@ class Placed:
 
 @dataclass
 class Scene:
-    """What has been put into a stretch so far.
+    """The contents of a stretch.
 
     Args:
-        ground: on what it stands.
-        surfaces: all looks, of static things and of movers.
+        ground: the ground of the stretch.
+        surfaces: all surfaces, of static objects and of movers.
+        pending: static objects that are not in ``meshes`` yet: (object, s, t, yaw, lift).
+        meshes: static triangles in the world, with surface numbers as slots.
+        placed: static objects with an instance number.
+        footprints: (lowest s, highest s, lowest t, highest t) of obstacles, metres.
+        instances: the number of instances, of static objects and of movers.
     """
 
     ground: Ground
     surfaces: Surfaces = field(default_factory=Surfaces)
-    standing: list[tuple[Thing, float, float, float, float]] = field(default_factory=list)
+    pending: list[tuple[StaticObject, float, float, float, float]] = field(default_factory=list)
     meshes: list[Mesh] = field(default_factory=list)
-    placed: list[Placed] = field(default_factory=list)
+    placed: list[PlacedObject] = field(default_factory=list)
     footprints: list[tuple[float, float, float, float]] = field(default_factory=list)
     instances: int = 0
 
-    def add(self, mesh: Mesh, surfaces: NDArray[np.int32]) -> None:
-        """A mesh that is already in the world, with the surface of each slot."""
+    def add_mesh(self, mesh: Mesh, surfaces: NDArray[np.int32]) -> None:
+        """Add a mesh in world coordinates; ``surfaces`` holds the surface number of each slot."""
         self.meshes.append(Mesh(mesh.triangles, surfaces[mesh.slot]))
 
-    def put(self, thing: Thing, s: float, t: float, yaw: float = 0.0, lift: float = 0.0, solid: float = 0.0) -> None:
-        """Set a thing on the ground.
+    def put(
+        self, item: StaticObject, s: float, t: float, yaw: float = 0.0, lift: float = 0.0, solid: float = 0.0
+    ) -> None:
+        """Put a static object on the ground.
 
         Args:
-            thing: what.
-            s, t: where, street coordinates of its origin.
-            yaw: radians from the street's heading.
+            item: the object.
+            s, t: street coordinates of its origin, metres.
+            yaw: radians relative to the street's heading.
             lift: metres above the ground.
-            solid: metres around its origin that walkers avoid.
+            solid: half the side of the square around its origin that pedestrians and cyclists avoid, metres.
         """
-        self.standing.append((thing, s, t, yaw, lift))
+        self.pending.append((item, s, t, yaw, lift))
         if solid:
             self.footprints.append((s - solid, s + solid, t - solid, t + solid))
 
     def mesh(self) -> Mesh:
-        """Everything static that was added, put and parked, in the world; a slot is a surface number."""
-        places = np.array([row[1:] for row in self.standing]).reshape(-1, 4)
+        """All static triangles in the world, with surface numbers as slots."""
+        places = np.array([row[1:] for row in self.pending]).reshape(-1, 4)
         points = self.ground.points(places[:, 0], places[:, 1]) + places[:, 3:] * (0, 0, 1)
         yaws = self.ground.course.heading(places[:, 0]) + places[:, 2]
-        for (thing, *_), point, yaw in zip(self.standing, points, yaws, strict=True):
-            rows = [self.surfaces.add(f, raw) for f, raw in zip(thing.finishes, thing.raw, strict=True)]
-            self.add(thing.mesh.moved(point, float(yaw)), np.array(rows, np.int32))
-        self.standing.clear()
+        for (item, *_), point, yaw in zip(self.pending, points, yaws, strict=True):
+            rows = [self.surfaces.add(f, raw) for f, raw in zip(item.finishes, item.raw, strict=True)]
+            self.add_mesh(item.mesh.moved(point, float(yaw)), np.array(rows, np.int32))
+        self.pending.clear()
         return merge(self.meshes)
 
     def poses(self, s: ArrayLike, t: ArrayLike, yaw: ArrayLike, length: ArrayLike) -> Pose:
-        """(..., 4, 4) of objects standing on the ground, tilted as the ground under their length.
+        """(..., 4, 4) poses of objects on the ground, tilted with the ground under them.
 
         Args:
             s, t: street coordinates, metres.
-            yaw: radians from the street's heading.
-            length: metres.
+            yaw: radians relative to the street's heading.
+            length: length of the objects, metres.
         """
         s, t, yaw, half = np.broadcast_arrays(
             *(np.asarray(v, float) for v in (s, t, yaw, np.asarray(length, float) / 3))
@@ -110,25 +117,25 @@ class Scene:
         pose[..., 3, 3] = 1
         return pose
 
-    def dress(self, prototype: Prototype, colour: RGB, moving: bool) -> tuple[int, NDArray[np.int32]]:
-        """A new instance number and the surfaces of its slots."""
+    def add_instance(self, prototype: Prototype, colour: RGB, moving: bool) -> tuple[int, NDArray[np.int32]]:
+        """Register a new instance; return its number and the surface number of each slot."""
         self.instances += 1
         rows = [self.surfaces.add(f, prototype.raw[int(moving)], self.instances) for f in prototype.painted(colour)]
         return self.instances, np.array(rows, np.int32)
 
     def park(self, prototype: Prototype, colour: RGB, s: float, t: float, yaw: float, scale: float = 1.0) -> None:
-        """Stand an object with an instance on the ground; it becomes part of the static world."""
-        instance, surfaces = self.dress(prototype, colour, moving=False)
+        """Put a static object with an instance number on the ground."""
+        instance, surfaces = self.add_instance(prototype, colour, moving=False)
         low, high = prototype.mesh.bounds
         pose = self.poses(s, t, yaw, high[0] - low[0])
-        placed = Placed(prototype, pose, instance, surfaces, scale)
+        placed = PlacedObject(prototype, pose, instance, surfaces, scale)
         self.placed.append(placed)
-        self.add(prototype.mesh.moved(scale=scale).posed(pose), surfaces)
+        self.add_mesh(prototype.mesh.moved(scale=scale).posed(pose), surfaces)
         half = np.abs(np.array([[np.cos(yaw), np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])) @ (high[:2] - low[:2]) / 2
         self.footprints.append((s - half[0], s + half[0], t - half[1], t + half[1]))
 
-    def free(self, s: float, t: float, half: tuple[float, float]) -> bool:
-        """Whether nothing solid stands within the half extents (along s, along t) around a place."""
+    def is_free(self, s: float, t: float, half: tuple[float, float]) -> bool:
+        """Whether no obstacle lies within the half extents ``half`` (along s, along t) around a position, metres."""
         if not self.footprints:
             return True
         f = np.array(self.footprints)

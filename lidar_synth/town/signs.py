@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidar_synth.town.furniture import GALVANISED, OTHER, POLE, SIGN, Thing
+from lidar_synth.town.furniture import GALVANISED, OTHER, POLE, SIGN, StaticObject
 from lidar_synth.town.materials import RGB, Finish
 from lidar_synth.town.meshes import Mesh, boxes, disc, fan, merge, tube
 
@@ -31,11 +31,11 @@ BOARDS: dict[str, tuple[Outline, RGB, Outline, RGB]] = {
     "town": (_rectangle(1.20, 0.80), YELLOW, _rectangle(0.80, 0.08, 0.06), BLACK),
     "street": (_rectangle(0.90, 0.14), (0.12, 0.20, 0.50), _rectangle(0.70, 0.04), WHITE),
 }
-"""Each sign's board and the mark on it: outlines in metres (left, up) and colours."""
+"""The board of each sign and the symbol on it: (outline, colour, outline, colour); outlines in metres (left, up)."""
 
 
-def road_sign(kind: str, height: float) -> Thing:
-    """A traffic sign of a kind of ``BOARDS``, facing +x, the middle of its board at a height in metres."""
+def road_sign(kind: str, height: float) -> StaticObject:
+    """A traffic sign facing +x; ``kind`` is a key of ``BOARDS``, ``height`` is the centre of the board in metres."""
     board, ground, mark, colour = BOARDS[kind]
 
     def flat(outline: Outline, x: float, slot: int) -> Mesh:
@@ -43,13 +43,13 @@ def road_sign(kind: str, height: float) -> Thing:
 
     pole = tube([(0, 0, -0.2), (0, 0, height + 0.3)], 0.038, 6)
     mesh = merge([pole, flat(board, 0.05, 1), flat(mark, 0.054, 2), flat(board, 0.042, 3)])
-    return Thing(
+    return StaticObject(
         mesh, (GALVANISED, Finish("sign", ground), Finish("sign", colour), GALVANISED), (POLE, SIGN, SIGN, SIGN)
     )
 
 
-def traffic_light(height: float, reach: float) -> Thing:
-    """Signals facing +x; with a reach also on an arm over the road towards +y."""
+def traffic_light(height: float, reach: float) -> StaticObject:
+    """Traffic lights on a pole, facing +x, and with ``reach`` > 0 (metres) also on an arm over the road towards +y."""
     parts = [tube([(0, 0, -0.2), (0, 0, height)], 0.06, 7)]
     spots = [(0.0, 2.3)]
     if reach:
@@ -60,6 +60,6 @@ def traffic_light(height: float, reach: float) -> Thing:
         parts += [disc((0.225, y, z + 0.15 + 0.3 * i), (1, 0, 0), 0.1, 8, 2 + i) for i in range(3)]
     colours: tuple[RGB, ...] = ((0.1, 0.5, 0.25), (0.35, 0.25, 0.05), (0.3, 0.05, 0.05))
     dark = Finish("plastic", (0.07, 0.09, 0.08))
-    return Thing(
+    return StaticObject(
         merge(parts), (GALVANISED, dark, *(Finish("lamp", c) for c in colours)), (POLE, OTHER, OTHER, OTHER, OTHER)
     )

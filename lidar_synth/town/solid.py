@@ -1,4 +1,4 @@
-"""Triangles that rays can hit: the one place that knows Embree (PyPI ``embreex``)."""
+"""Ray casting against triangles with Embree (PyPI ``embreex``), which only this module imports."""
 
 from typing import Any
 
@@ -11,26 +11,27 @@ Floats = NDArray[np.float32]
 
 
 def _embree() -> tuple[Any, Any]:
+    """Embree's scene and triangle mesh classes."""
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
     except ImportError as error:
         raise LibraryError(
-            f"the town needs embreex, which does not import here ({error})",
-            "embreex 2.17 or later; there is no wheel for Linux on aarch64",
-            "Type 'pip install embreex', or read a dataset that was made elsewhere: everything but the town works.",
+            f"the town needs embreex, which cannot be imported ({error})",
+            "embreex 2.17 or later; PyPI has no wheel for Linux on aarch64",
+            "Type 'pip install embreex', or read a town that was exported on another machine: only the town needs it.",
         ) from error
     return EmbreeScene, TriangleMesh
 
 
 class Solid:
-    """Triangles that rays can hit.
+    """Triangles as an Embree scene.
 
     Args:
         triangles: (F, 3, 3) float32 metres.
 
     Raises:
-        LibraryError: where embreex is missing.
+        LibraryError: if embreex is missing.
     """
 
     def __init__(self, triangles: Floats) -> None:
@@ -39,7 +40,7 @@ class Solid:
         self._mesh = mesh(self._scene, np.ascontiguousarray(triangles, np.float32))
 
     def first(self, origins: Floats, directions: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
-        """Distance (inf = none), triangle (-1 = none) and normal (not unit) of the first hit of each ray."""
+        """Distance (inf = no hit), triangle (-1 = no hit) and normal (not unit) of the first hit of each ray."""
         out = self._scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1)
         face: NDArray[np.int32] = out["primID"]
         distance: Floats = out["tfar"]

@@ -1,7 +1,7 @@
-"""The plan of a stretch: how wide its carriageway, pavements, bays and lots are, where streets cross it.
+"""The plan of a stretch of road: widths of carriageway, pavements and parking bays, and the streets that cross it.
 
-Five kinds: ``residential``, ``main`` (main road), ``junction``, ``square``, ``edge`` (edge of town).
-Traffic keeps right: lanes at t < 0 run towards +s.
+There are five kinds: ``residential``, ``main`` (main road), ``junction``, ``square``, ``edge`` (edge of town).
+Traffic drives on the right: lanes at t < 0 run towards +s.
 """
 
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ import numpy as np
 
 KINDS = ("residential", "main", "junction", "square", "edge")
 SHARES = (0.48, 0.18, 0.14, 0.09, 0.11)
-"""How often each kind comes."""
+"""Probability of each kind."""
 REACH = 88.0
-"""Metres of detailed world before, behind and beside the ego vehicle: the sensor's range and a little."""
+"""Metres of detailed world in front of, behind and beside the ego vehicle: slightly more than the sensor's range."""
 RIGHT, LEFT = 0, 1
 
 
 class Band(NamedTuple):
-    """A strip along one side: its kind of ground and its width, metres."""
+    """A strip along one side of the street: its kind of ground and its width in metres."""
 
     kind: str
     width: float
@@ -28,10 +28,10 @@ class SideStreet(NamedTuple):
     """A street that crosses or meets the stretch.
 
     Args:
-        s: of its centre line.
-        half: metres from there to its kerbs.
-        pavement: metres, width of its pavements.
-        sides: which of RIGHT and LEFT it goes to.
+        s: s of its centre line, metres.
+        half: half of its width between the kerbs, metres.
+        pavement: width of its pavements, metres.
+        sides: the sides of the stretch on which it continues: RIGHT, LEFT or both.
     """
 
     s: float
@@ -41,31 +41,32 @@ class SideStreet(NamedTuple):
 
 
 class Lane(NamedTuple):
-    """A lane of moving traffic along s: its middle t and way (+1 or -1)."""
+    """A lane of moving traffic along s: t of its centre in metres, and its direction (+1 or -1)."""
 
     t: float
-    way: int
+    direction: int
 
 
 @dataclass(frozen=True)
 class Street:
-    """A stretch's plan.
+    """The plan of a stretch of road.
 
     Args:
         kind: one of ``KINDS``.
         length: metres that the ego vehicle drives, from s = 0.
-        edge: metres to the kerb, (right, left).
-        bands: strips beyond the kerb, outwards, by side.
-        lanes: the ego vehicle drives in the first.
-        crossings: streets that meet this one.
-        parking: how cars park by side: ``none``, ``street`` (inside the kerb), ``bay``, ``kerb`` (astride it).
-        speed: the ego vehicle's, m/s.
-        median: half width of the strip between the ways, 0 = none.
+        edge: metres from the centre line to the kerb, (right, left).
+        bands: strips beyond the kerb, from the inside to the outside, (right, left).
+        lanes: the lanes; the ego vehicle drives in the first.
+        crossings: the side streets.
+        parking: how cars park, (right, left): ``none``, ``street`` (inside the kerb), ``bay``, ``kerb`` (half on the
+            pavement).
+        speed: speed of the ego vehicle, m/s.
+        median: half of the width of the strip between the two directions of traffic, metres; 0 = none.
         marked: whether lane markings are painted.
-        plaza: the side with an open square (RIGHT, LEFT), or None.
-        turn: the side street into which the ego vehicle turns and the side to which, or None.
-        ends: lowest and highest s of the street, where it meets another one and houses close the view; infinite
-            where it goes on.
+        plaza: the side with an open square (RIGHT or LEFT), or None.
+        turn: (side street into which the ego vehicle turns, side to which it turns), or None.
+        ends: lowest and highest s of the street, where it meets a cross street with houses behind it; infinite where
+            the street continues.
     """
 
     kind: str
@@ -83,11 +84,11 @@ class Street:
     ends: tuple[float, float] = (-np.inf, np.inf)
 
     def front(self, side: int) -> float:
-        """|t| at which the lots of a side begin."""
+        """|t| at which the lots of a side begin, metres."""
         return self.edge[side] + sum(b.width for b in self.bands[side])
 
     def band(self, side: int, kind: str) -> tuple[float, float] | None:
-        """|t| where a side's strip of a kind begins and ends, or None."""
+        """|t| at which the strip of a kind of ground on a side begins and ends, metres, or None."""
         at = self.edge[side]
         for b in self.bands[side]:
             if b.kind == kind:
@@ -96,7 +97,7 @@ class Street:
         return None
 
     def gaps(self, side: int, margin: float) -> list[tuple[float, float]]:
-        """Intervals of s, within reach and the street's ends, that no side street of a side takes."""
+        """Intervals of s between the side streets of a side, within ``REACH`` and the ends of the street, metres."""
         low, high = max(-REACH, self.ends[0]), min(self.length + REACH, self.ends[1])
         gaps = []
         for c in sorted(self.crossings):
@@ -108,13 +109,14 @@ class Street:
 
 
 def _ends(kind: str, length: float, rng: np.random.Generator) -> tuple[float, float]:
+    """Sampled ends of the street; infinite where it continues."""
     share = {"edge": 0.1, "main": 0.3}.get(kind, 0.6)
     back = -rng.uniform(30, 85) if rng.random() < share else -np.inf
     return back, length + rng.uniform(30, 85) if rng.random() < share else np.inf
 
 
 def _crossings(kind: str, length: float, ends: tuple[float, float], rng: np.random.Generator) -> tuple[SideStreet, ...]:
-    """Streets across: at closed ends, at a junction, and by chance elsewhere."""
+    """Sampled side streets: at closed ends, at a junction, and at random elsewhere."""
     places = [SideStreet(e - np.sign(e) * 6.0, 2.8, 1.6, (RIGHT, LEFT)) for e in ends if np.isfinite(e)]
     if kind == "junction":
         middle = length * rng.uniform(0.45, 0.75) + 5
@@ -131,6 +133,7 @@ def _crossings(kind: str, length: float, ends: tuple[float, float], rng: np.rand
 
 
 def _residential(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
+    """Sampled bands, kerbs, parking and lanes of a residential street."""
     parking = [str(rng.choice(["none", "street", "bay", "kerb"], p=[0.34, 0.30, 0.18, 0.18])) for _ in range(2)]
     lane = rng.uniform(2.5, 3.0)
     edge = [lane + (2.0 if p == "street" else 0.0) for p in parking]
@@ -144,6 +147,7 @@ def _residential(rng: np.random.Generator) -> tuple[list[list[Band]], list[float
 
 
 def _main(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane], float]:
+    """Sampled bands, kerbs, parking, lanes and median of a main road."""
     each = int(rng.choice([1, 2], p=[0.6, 0.4]))
     width = rng.uniform(3.1, 3.6)
     median = float(rng.choice([0.0, rng.uniform(1.0, 3.6)], p=[0.6, 0.4]))
@@ -165,6 +169,7 @@ def _main(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list
 
 
 def _edge(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
+    """Sampled bands, kerbs, parking and lanes of a road at the edge of town."""
     width = rng.uniform(2.9, 3.6)
     bands = []
     for _ in range(2):
@@ -176,7 +181,7 @@ def _edge(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list
 
 
 _TURNS = {"residential": 0.3, "main": 0.1, "junction": 0.4, "square": 0.25, "edge": 0.0}
-"""How often the ego vehicle turns off, where there is a street to turn into."""
+"""Probability that the ego vehicle turns into a side street."""
 _SPEEDS = {
     "residential": (6.5, 9.5),
     "main": (10.0, 14.5),
@@ -186,8 +191,8 @@ _SPEEDS = {
 }
 
 
-def draw_street(kind: str, seconds: float, rng: np.random.Generator) -> Street:
-    """A street of a kind, long enough for the ego vehicle to drive ``seconds``."""
+def sample_street(kind: str, seconds: float, rng: np.random.Generator) -> Street:
+    """The sampled plan of a street of a kind, long enough for the ego vehicle to drive ``seconds``."""
     turns = rng.random() < _TURNS[kind]
     speed = rng.uniform(4.5, 7.0) if turns else rng.uniform(*_SPEEDS[kind])
     length = speed * seconds

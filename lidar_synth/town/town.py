@@ -1,5 +1,4 @@
-"""The town as a source of scans: ``Town(seed)[i]`` is scan number i, in any process and any order of access.
-
+"""The town as a source of scans: ``Town(seed)[i]`` is the same scan in every process and in any order of access.
 Twenty neighbouring scans share a stretch of road. The ego vehicle drives along it, with ``interval`` seconds from scan
 to scan, among static and moving objects. Stretches lie a kilometre apart in the world frame of the poses, so that
 accumulating scans by pose never mixes two of them.
@@ -18,17 +17,17 @@ from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.town.boxes import boxes_of
 from lidar_synth.town.camera import CAMERA
-from lidar_synth.town.cast import Stage
+from lidar_synth.town.cast import Snapshot
 from lidar_synth.town.ego import HEIGHT, free_rays, optics
 from lidar_synth.town.materials import SurfaceTable
-from lidar_synth.town.movers import ego_place, ego_pose, stand
+from lidar_synth.town.movers import ego_place, ego_pose, place_movers
 from lidar_synth.town.returns import Noise, laser_gains, measure, see_through
 from lidar_synth.town.scene import Pose
-from lidar_synth.town.shading import draw_light, render
-from lidar_synth.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, generator
+from lidar_synth.town.shading import render, sample_light
+from lidar_synth.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, rng_for
 
 APART = 1000.0
-"""Metres between the origins of two stretches in the world of the poses."""
+"""Metres between the origins of two stretches in the world frame of the poses."""
 
 
 class Town:
@@ -65,14 +64,15 @@ class Town:
     ) -> None:
         if seed < 0 or scans < 0 or not 0 < interval < 60:
             raise ConfigError(
-                f"seed {seed}, {scans} scans, {interval} s apart", "a seed and a number from 0 up, 0 to 60 s"
+                f"a town with seed {seed}, {scans} scans and an interval of {interval} s",
+                "seed >= 0, scans >= 0 and 0 < interval < 60 s",
             )
         self.seed, self.sensor, self.interval = seed, load_sensor(sensor), interval
         self._scans, self._noise = scans, noise or Noise()
         self._worlds: OrderedDict[int, World] = OrderedDict()
         elevation, height = optics(self.sensor)
         columns = self.sensor.columns
-        # As the sensor writes them: ring by ring from the top, counter-clockwise from straight ahead.
+        # The order in which the sensor writes points: ring by ring from the top, counter-clockwise from straight ahead.
         order = np.r_[columns // 2 - 1 : -1 : -1, columns - 1 : columns // 2 - 1 : -1]
         self._laser, column = np.nonzero(free_rays(self.sensor)[:, order])
         azimuth = self.sensor.column_azimuths().astype(float)[order][column]
@@ -95,7 +95,7 @@ class Town:
         return self._scans
 
     def world(self, index: int) -> World:
-        """The stretch of road in which a scan is taken; the last two stay in memory."""
+        """The stretch of road of a scan; the last two stretches are cached."""
         stretch = index // STRETCH_FRAMES
         if stretch not in self._worlds:
             if len(self._worlds) > 1:
@@ -103,15 +103,15 @@ class Town:
             self._worlds[stretch] = build_world(self.seed, stretch, self.interval)
         return self._worlds[stretch]
 
-    def moment(self, index: int) -> tuple[Stage, Pose, np.random.Generator]:
-        """The scene of a scan, the sensor's pose in its stretch, and the scan's random numbers."""
+    def moment(self, index: int) -> tuple[Snapshot, Pose, np.random.Generator]:
+        """The scene of a scan, the sensor's pose in its stretch, and the random generator of the scan."""
         stretch, frame = divmod(index, STRETCH_FRAMES)
-        rng = generator(SCAN, self.seed, stretch, frame)
+        rng = rng_for(SCAN, self.seed, stretch, frame)
         world, time = self.world(index), frame * self.interval
         pose = ego_pose(world.street, world.scene, time, HEIGHT, rng.normal(0, 0.003, 2))
         about = ego_place(world.street, time)[:2]
-        movers = stand(world.movers, world.scene, time, about, self.sensor.range_max + 20)
-        return Stage(world, movers), pose, rng
+        movers = place_movers(world.movers, world.scene, time, about, self.sensor.range_max + 20)
+        return Snapshot(world, movers), pose, rng
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """(376, 1408, 3) uint8 RGB, the image that the camera of ``calibration`` takes with scan ``index``.
@@ -119,14 +119,14 @@ class Town:
         Raises:
             IndexError: on an index outside 0 to ``len - 1``.
         """
-        stage, pose, _ = self.moment(self._checked(index))
+        snapshot, pose, _ = self.moment(self._checked(index))
         stretch, frame = divmod(index, STRETCH_FRAMES)
-        light = draw_light(generator(LIGHT, self.seed, stretch))
-        return render(stage, pose, self.world(index).surfaces, light, generator(IMAGE, self.seed, stretch, frame))
+        light = sample_light(rng_for(LIGHT, self.seed, stretch))
+        return render(snapshot, pose, self.world(index).surfaces, light, rng_for(IMAGE, self.seed, stretch, frame))
 
     def _checked(self, index: int) -> int:
         if not 0 <= index < len(self):
-            raise IndexError(f"scan {index} of a town of {len(self)}")
+            raise IndexError(f"scan {index} of a town of {len(self)} scans")
         return index
 
     def __getitem__(self, index: int) -> Scan:
@@ -135,12 +135,12 @@ class Town:
         Raises:
             IndexError: on an index outside 0 to ``len - 1``.
         """
-        stage, pose, rng = self.moment(self._checked(index))
+        snapshot, pose, rng = self.moment(self._checked(index))
         world = self.world(index)
-        laser, surface, points, reflectance = self._turn(stage, pose, world.surfaces, rng)
+        laser, surface, points, reflectance = self._turn(snapshot, pose, world.surfaces, rng)
         raw, instance = world.surfaces.raw[surface], world.surfaces.instance[surface]
         returned = np.bincount(instance, minlength=world.scene.instances + 1)
-        objects = [o for o in (*world.scene.placed, *stage.movers) if o.prototype.name and returned[o.instance]]
+        objects = [o for o in (*world.scene.placed, *snapshot.movers) if o.prototype.name and returned[o.instance]]
         placed = pose.copy()
         placed[0, 3] += APART * (index // STRETCH_FRAMES)
         return Scan(
@@ -151,22 +151,22 @@ class Town:
             raw_label=raw | instance.astype(np.uint32) << np.uint32(16),
             instance=instance,
             ring=laser.astype(np.int16),
-            boxes=boxes_of(objects, pose, stage),
+            boxes=boxes_of(objects, pose, snapshot),
             pose=placed,
             id=f"town-{self.seed}-{index:06d}",
             domain=SYNTHETIC,
         )
 
     def _turn(
-        self, stage: Stage, pose: Pose, surfaces: SurfaceTable, rng: np.random.Generator
+        self, snapshot: Snapshot, pose: Pose, surfaces: SurfaceTable, rng: np.random.Generator
     ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-        """Laser, surface, point in the sensor frame and reflectance of every return of one turn."""
+        """Laser, surface number, point in the sensor frame and reflectance of each return of one revolution."""
         turn = pose[:3, :3].astype(np.float32)
         directions = self._rays @ turn.T
         origins = pose[:3, 3].astype(np.float32) + self._heights[:, None] * turn[:, 2]
         eye = origins.mean(0)
-        hits = stage.cast(origins, directions, eye)
-        see_through(stage, hits, origins, directions, eye, surfaces, rng)
+        hits = snapshot.cast(origins, directions, eye)
+        see_through(snapshot, hits, origins, directions, eye, surfaces, rng)
         back, far, reflectance = measure(hits, directions, self._laser, surfaces, self._gains, self._noise, rng)
         points = far[:, None] * self._rays[back]
         points[:, 2] += self._heights[back]

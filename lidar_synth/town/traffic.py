@@ -1,14 +1,14 @@
-"""The traffic of a stretch: who drives, walks and rides where.
+"""The traffic of a stretch: vehicles, pedestrians and cyclists.
 
-Every mover keeps to one street coordinate and runs along the other at its own speed. Two movers, or a mover
-and something solid, never share a place at any moment of the stretch: whoever would is left out.
+Every mover has a constant s or t and moves along the other coordinate at constant speed. A sampled mover is discarded
+if it would collide with an earlier mover or, where ``solid`` is set, with a static obstacle in any frame.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.town.bodywork import PAINTS
-from lidar_synth.town.furnish import draw_vehicle
+from lidar_synth.town.furnish import sample_vehicle
 from lidar_synth.town.materials import RGB
 from lidar_synth.town.movers import Mover, ego_place
 from lidar_synth.town.paving import PLAZA_DEPTH
@@ -26,20 +26,20 @@ _DRIVEN = {
 }  # fmt: skip
 
 
-Box = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 
-def _track(shape: Prototype, along: bool, at: float, start: float, velocity: float, times: Box, gap: float) -> Box:
-    """(T, 4) lowest and highest s, lowest and highest t that something takes at each time."""
+def _track(shape: Prototype, along: bool, at: float, start: float, velocity: float, times: Array, gap: float) -> Array:
+    """(T, 4) bounds (lowest s, highest s, lowest t, highest t) of a moving shape at each time, metres."""
     low, high = shape.mesh.bounds
     half = (np.abs([low[:2], high[:2]]).max(0) + gap)[:: 1 if along else -1]
-    way, other = start + velocity * times, np.full(len(times), at)
-    s, t = (way, other) if along else (other, way)
+    moving, constant = start + velocity * times, np.full(len(times), at)
+    s, t = (moving, constant) if along else (constant, moving)
     return np.stack([s - half[0], s + half[0], t - half[1], t + half[1]], 1)
 
 
-def _ego_track(street: Street, times: Box) -> Box:
-    """``_track`` of the ego vehicle, 4.7 m long and 1.8 m wide, with 1.2 m around it."""
+def _ego_track(street: Street, times: Array) -> Array:
+    """The track of the ego vehicle, 4.7 m long and 1.8 m wide, with a margin of 1.2 m."""
     s, t, yaw = np.array([ego_place(street, time) for time in times]).T
     along, across = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
     half_s, half_t = 2.35 * along + 0.9 * across + 1.2, 2.35 * across + 0.9 * along + 1.2
@@ -50,55 +50,60 @@ class Traffic:
     """All movers of a stretch.
 
     Args:
-        street, scene: where they move.
-        times: (T,) seconds at which they must be clear of one another.
-        rng: draws them.
+        street, scene: the stretch.
+        times: (T,) seconds, the times of the frames, at which movers must not collide.
+        rng: samples them.
     """
 
-    def __init__(self, street: Street, scene: Scene, times: Box, rng: Rng) -> None:
+    def __init__(self, street: Street, scene: Scene, times: Array, rng: Rng) -> None:
         self._street, self._scene, self._times, self._rng = street, scene, times, rng
         self._tracks = [_ego_track(street, times)]
         self.movers: list[Mover] = []
-        self._drive()
-        self._cross()
-        self._walk()
-        self._ride()
+        self._add_vehicles()
+        self._add_side_traffic()
+        self._add_pedestrians()
+        self._add_cyclists()
 
-    def _try(
+    def _add(
         self,
         shapes: tuple[Prototype, ...],
         colour: RGB,
         along: bool,
         at: float,
         start: float,
-        way: int,
+        direction: int,
         speed: float,
         gap: float,
         stride: float = 1.0,
         scale: float = 1.0,
         solid: bool = False,
     ) -> None:
-        """Add a mover with a gap (metres) around it, unless it would meet another, or what is solid on its way."""
-        track = _track(shapes[0], along, at, start, way * speed, self._times, gap)
+        """Add a mover unless it would collide with another one or, if ``solid``, with a static obstacle.
+
+        ``colour`` is that of its paint or clothes, and ``gap`` the margin around it in metres; the other arguments are
+        those of ``Mover``.
+        """
+        track = _track(shapes[0], along, at, start, direction * speed, self._times, gap)
         low, high = self._street.ends
-        if track[:, 0].min() < low or track[:, 1].max() > high or any(_meet(track, other) for other in self._tracks):
+        if track[:, 0].min() < low or track[:, 1].max() > high or any(_overlap(track, other) for other in self._tracks):
             return
         if solid:
             footprints = np.array(self._scene.footprints).reshape(-1, 1, 4)
-            if len(footprints) and _meet(track[None], footprints):
+            if len(footprints) and _overlap(track[None], footprints):
                 return
         self._tracks.append(track)
-        instance, surfaces = self._scene.dress(shapes[0], colour, moving=speed > 0)
-        self.movers.append(Mover(shapes, stride, along, at, start, way, speed, instance, surfaces, scale))
+        instance, surfaces = self._scene.add_instance(shapes[0], colour, moving=speed > 0)
+        self.movers.append(Mover(shapes, stride, along, at, start, direction, speed, instance, surfaces, scale))
 
-    def _vehicle(self) -> tuple[tuple[Prototype, ...], RGB]:
+    def _sample_mover(self) -> tuple[tuple[Prototype, ...], RGB]:
+        """A sampled vehicle or motorcyclist: its prototypes and its colour."""
         rng = self._rng
         if rng.random() < 0.04:
             return (motorcyclist(),), CLOTHES[rng.integers(len(CLOTHES))]
-        return (vehicles()[draw_vehicle(rng, _DRIVEN)],), PAINTS[rng.integers(len(PAINTS))]
+        return (vehicles()[sample_vehicle(rng, _DRIVEN)],), PAINTS[rng.integers(len(PAINTS))]
 
-    def _drive(self) -> None:
-        """Cars on the stretch's own lanes, a tram on its rails."""
+    def _add_vehicles(self) -> None:
+        """Add vehicles on the lanes of the stretch, and a tram on its rails."""
         street, rng = self._street, self._rng
         density = {"residential": 0.25, "main": 0.6, "junction": 0.55, "square": 0.4, "edge": 0.4}[street.kind]
         for lane in street.lanes:
@@ -106,21 +111,21 @@ class Traffic:
             s = rng.uniform(-70, -40)
             while s < street.length + 150:
                 if rng.random() < density:
-                    shapes, colour = self._vehicle()
+                    shapes, colour = self._sample_mover()
                     speed = street.speed if lane == street.lanes[0] else mean
-                    self._try(
+                    self._add(
                         shapes,
                         colour,
                         True,
                         lane.t + rng.normal(0, 0.12),
-                        s if lane.way > 0 else street.length - s,
-                        lane.way,
+                        s if lane.direction > 0 else street.length - s,
+                        lane.direction,
                         speed,
                         0.6,
                     )
                 s += rng.uniform(9, 40)
         if street.median > 2.2 and rng.random() < 0.6:
-            self._try(
+            self._add(
                 (vehicles()["tram"],),
                 (0.85, 0.75, 0.15),
                 True,
@@ -131,23 +136,23 @@ class Traffic:
                 0.1,
             )
 
-    def _cross(self) -> None:
-        """Cars on side streets: waiting at their line or leaving."""
+    def _add_side_traffic(self) -> None:
+        """Add vehicles on side streets, waiting at the stop line or driving away."""
         street, rng = self._street, self._rng
         for c in street.crossings:
             for side in c.sides:
                 sign = 2 * side - 1
                 stop = street.edge[side] + 4.2
                 for k in range(rng.poisson(1.2 if street.kind == "junction" else 0.5)):
-                    shapes, colour = self._vehicle()
-                    self._try(shapes, colour, False, c.s - sign * c.half / 2, sign * (stop + 7.5 * k), -sign, 0.0, 0.4)
+                    shapes, colour = self._sample_mover()
+                    self._add(shapes, colour, False, c.s - sign * c.half / 2, sign * (stop + 7.5 * k), -sign, 0.0, 0.4)
                 if rng.random() < 0.7:
-                    shapes, colour = self._vehicle()
+                    shapes, colour = self._sample_mover()
                     start = sign * (street.edge[side] + rng.uniform(5, 40))
-                    self._try(shapes, colour, False, c.s + sign * c.half / 2, start, sign, rng.uniform(4, 9), 0.5)
+                    self._add(shapes, colour, False, c.s + sign * c.half / 2, start, sign, rng.uniform(4, 9), 0.5)
 
-    def _walk(self) -> None:
-        """Pedestrians on pavements, on the square, on their way across."""
+    def _add_pedestrians(self) -> None:
+        """Add pedestrians on pavements, on squares and crossing the street."""
         street, rng = self._street, self._rng
         strips = []
         for side in (RIGHT, LEFT):
@@ -161,37 +166,39 @@ class Traffic:
         for side, low, high, mean in strips:
             for _ in range(rng.poisson(mean)):
                 sign = 2 * side - 1
-                self._person(True, sign * rng.uniform(low, max(low, high)), rng.uniform(-50, street.length + 60))
+                self._add_pedestrian(
+                    True, sign * rng.uniform(low, max(low, high)), rng.uniform(-50, street.length + 60)
+                )
         for _ in range(rng.poisson({"residential": 1, "edge": 0.2}.get(street.kind, 3))):
-            self._person(False, rng.uniform(-10, street.length + 40), rng.uniform(-10, 10))
+            self._add_pedestrian(False, rng.uniform(-10, street.length + 40), rng.uniform(-10, 10))
 
-    def _person(self, along: bool, at: float, start: float) -> None:
-        """Someone who walks, or on a pavement also stands."""
+    def _add_pedestrian(self, along: bool, at: float, start: float) -> None:
+        """Add a pedestrian; some of those along the street stand."""
         rng = self._rng
-        bag, stands = bool(rng.random() < 0.3), along and bool(rng.random() < 0.2)
-        shapes = tuple(walker(p, stands, bag) for p in range(1 if stands else PHASES))
+        bag, standing = bool(rng.random() < 0.3), along and bool(rng.random() < 0.2)
+        shapes = tuple(walker(p, standing, bag) for p in range(1 if standing else PHASES))
         scale = rng.uniform(0.6, 0.8) if rng.random() < 0.12 else rng.uniform(0.9, 1.08)
-        way, speed = int(rng.choice([-1, 1])), 0.0 if stands else rng.uniform(0.9, 1.7)
+        direction, speed = int(rng.choice([-1, 1])), 0.0 if standing else rng.uniform(0.9, 1.7)
         colour = CLOTHES[rng.integers(len(CLOTHES))]
-        self._try(shapes, colour, along, at, start, way, speed, 0.25, 1.4 * scale, scale, solid=True)
+        self._add(shapes, colour, along, at, start, direction, speed, 0.25, 1.4 * scale, scale, solid=True)
 
-    def _ride(self) -> None:
-        """Cyclists at the right edge of the carriageway or on their own way."""
+    def _add_cyclists(self) -> None:
+        """Add cyclists on cycleways or at the right edge of the carriageway."""
         street, rng = self._street, self._rng
         shapes = tuple(cyclist(p) for p in range(PHASES))
-        for side, way in ((RIGHT, 1), (LEFT, -1)):
+        for side, direction in ((RIGHT, 1), (LEFT, -1)):
             own = street.band(side, "cycleway")
             sign = 2 * side - 1
             kerb = street.edge[side] - (2.9 if street.parking[side] == "street" else 0.7)
             for _ in range(rng.poisson(2.2 if own else 1.1)):
                 at = sign * ((own[0] + own[1]) / 2 if own else kerb)
-                self._try(
+                self._add(
                     shapes,
                     CLOTHES[rng.integers(len(CLOTHES))],
                     True,
                     at,
                     rng.uniform(-40, street.length + 50),
-                    way,
+                    direction,
                     rng.uniform(3, 6.5),
                     0.4,
                     4.0,
@@ -199,8 +206,8 @@ class Traffic:
                 )
 
 
-def _meet(a: Box, b: Box) -> bool:
-    """Whether two boxes (..., 4) ever overlap."""
+def _overlap(a: Array, b: Array) -> bool:
+    """Whether two tracks (..., 4) overlap at any time."""
     return bool(
         ((a[..., 0] < b[..., 1]) & (a[..., 1] > b[..., 0]) & (a[..., 2] < b[..., 3]) & (a[..., 3] > b[..., 2])).any()
     )

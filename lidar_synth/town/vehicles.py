@@ -1,4 +1,4 @@
-"""Cars, vans, lorries, buses, trams and trailers with a real silhouette."""
+"""Prototypes of cars, vans, lorries, buses, trams and trailers."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -9,10 +9,10 @@ from lidar_synth.town.bodywork import (
     FINISHES,
     GLASS,
     HEAD,
-    INSIDE,
+    INTERIOR,
     PAINT,
     PLATE,
-    SECOND,
+    SECONDARY,
     TAIL,
     TRIM,
     Station,
@@ -27,7 +27,20 @@ from lidar_synth.town.prototype import Prototype
 
 @dataclass(frozen=True)
 class _Shape:
-    """Measures of a car or van: metres, and shares of the length from the front."""
+    """Dimensions of a car or van.
+
+    Args:
+        length, width, height: metres.
+        belt: height of the belt line, metres.
+        cowl: lower edge of the windscreen, share of the length from the front.
+        screen: upper edge of the windscreen, share of the length.
+        roof_end: rear end of the roof, share of the length.
+        tail: lower edge of the rear window, share of the length.
+        boot: height of the boot lid, metres; 0 = none.
+        pillars: positions of the pillars between side windows, shares of the length.
+        panel_from: from here on the side is metal instead of glass, share of the length.
+        roof: width of the roof as a share of ``width``.
+    """
 
     length: float
     width: float
@@ -60,6 +73,7 @@ VANS = ("minivan", "van", "panel_van")
 
 
 def _stations(s: _Shape) -> list[Station]:
+    """The cross-sections of a car or van, front to rear."""
     nose = 0.66 * s.belt + 0.08
     bend = s.belt - 0.05
     stations = [
@@ -86,10 +100,11 @@ def _stations(s: _Shape) -> list[Station]:
 
 
 def _seats(s: _Shape) -> Mesh:
+    """Seats and floor, which rays through the windows hit."""
     rows = [0.5 * s.length - s.length * f for f in (s.screen + 0.10, min(s.screen + 0.33, s.roof_end - 0.1))]
     low = [(x - 0.12, -0.40 * s.width, 0.4) for x in rows] + [(-0.38 * s.length, -0.42 * s.width, 0.30)]
     high = [(x + 0.10, 0.40 * s.width, s.belt + 0.15) for x in rows] + [(0.22 * s.length, 0.42 * s.width, 0.45)]
-    return boxes(low, high, INSIDE)
+    return boxes(low, high, INTERIOR)
 
 
 def _car(kind: str) -> Mesh:
@@ -106,7 +121,7 @@ def _car(kind: str) -> Mesh:
 
 
 def _lorry(length: float, height: float, open_bed: bool) -> Mesh:
-    """A cab and, apart from it, a box or a dropside bed on a frame."""
+    """A lorry: a cab, and behind it a box or an open bed on a frame."""
     width, cab = 2.35, 1.9
     front = length / 2
     cab_stations = [
@@ -120,9 +135,9 @@ def _lorry(length: float, height: float, open_bed: bool) -> Mesh:
         half, rim = width / 2, bed + 0.5
         low = [(-front, -half, bed), (-front, -half, bed), (-front, half - 0.04, bed), (-front, -half, bed)]
         high = [(back, half, bed + 0.08), (back, -half + 0.04, rim), (back, half, rim), (-front + 0.04, half, rim)]
-        load = [boxes(low, high, SECOND), boxes([(-front + 0.5, -0.8, bed)], [(back - 1.0, 0.7, bed + 0.8)], TRIM)]
+        load = [boxes(low, high, SECONDARY), boxes([(-front + 0.5, -0.8, bed)], [(back - 1.0, 0.7, bed + 0.8)], TRIM)]
     else:
-        load = [boxes([(-front, -width / 2, bed - 0.1)], [(back, width / 2, height)], SECOND)]
+        load = [boxes([(-front, -width / 2, bed - 0.1)], [(back, width / 2, height)], SECONDARY)]
     return merge([
         shell(cab_stations, cab, width - 0.15).moved((front - cab / 2, 0, 0)),
         *load,
@@ -134,7 +149,7 @@ def _lorry(length: float, height: float, open_bed: bool) -> Mesh:
 
 
 def _coach(length: float, width: float, height: float, low: float, rails: bool) -> Mesh:
-    """A bus or, on rails, a tram: one long body with a band of windows."""
+    """A bus or, with ``rails``, a tram: one long body with a band of windows; ``low`` is the height of its sill."""
     stations = [Station(0.0, low, 1.0, height - 0.5, 0.93, 0.9, above=GLASS)]
     stations.append(Station(0.012, low, 1.0, height - 0.08, 0.99, 0.92, side=GLASS))
     for p in np.arange(0.1, 0.96, 0.1):
@@ -148,7 +163,7 @@ def _coach(length: float, width: float, height: float, low: float, rails: bool) 
         wheels(axles, 0.36 if rails else 0.48, width, arch=not rails),
         face(length / 2 + 0.006, low + 0.2, low + 0.4, width * 0.9, (HEAD, PLATE), low + 0.1),
         face(-length / 2 - 0.006, low + 0.4, low + 0.7, width * 0.9, (TAIL, PLATE), low + 0.2),
-        boxes([(-0.45 * length, -0.4 * width, low + 0.1)], [(0.42 * length, 0.4 * width, 1.15)], INSIDE),
+        boxes([(-0.45 * length, -0.4 * width, low + 0.1)], [(0.42 * length, 0.4 * width, 1.15)], INTERIOR),
     ])  # fmt: skip
 
 
@@ -171,12 +186,12 @@ def _trailer() -> Mesh:
             (back + 0.04, side, 0.9)]  # fmt: skip
     bars = tubes([([(front, y, 0.5), (2.2, 0, 0.45)], 0.04) for y in (-0.6, 0.6)], 4, TRIM)
     lights = face(back - 0.01, 0.4, 0.5, 1.4, (TAIL, PLATE), 0.38)
-    return merge([boxes(low, high, SECOND), bars, wheels([-0.1], 0.28, 1.75, arch=False), lights])
+    return merge([boxes(low, high, SECONDARY), bars, wheels([-0.1], 0.28, 1.75, arch=False), lights])
 
 
 @cache
 def vehicles() -> dict[str, Prototype]:
-    """Every vehicle without a rider, by kind."""
+    """The prototypes of all vehicles without a rider, by kind."""
     kinds = {k: Prototype(_car(k), FINISHES, "Van" if k in VANS else "Car", (10, 252)) for k in _SHAPES}
     return kinds | {
         "box_lorry": Prototype(_lorry(7.2, 3.3, False), FINISHES, "Truck", (18, 258)),

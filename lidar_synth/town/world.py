@@ -1,7 +1,7 @@
-"""A stretch of road, whole: its static world as triangles, its movers, the ego vehicle's way.
+"""A complete stretch of road: its plan, its static world as triangles, and its movers.
 
-Everything is drawn from a counter-based generator keyed by (seed, stretch), so that a stretch is the same
-whoever asks for it and in whatever order.
+Everything is sampled from a counter-based generator keyed by (seed, stretch), so that a stretch is the same in every
+process and in any order of access.
 """
 
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from lidar_synth.town.backdrop import close_ends, line_side_streets, second_row
 from lidar_synth.town.course import Course, Relief
 from lidar_synth.town.furnish import furnish
 from lidar_synth.town.ground import KINDS, Ground
-from lidar_synth.town.lots import draw_lots, paint_lots
+from lidar_synth.town.lots import paint_lots, sample_lots
 from lidar_synth.town.materials import SurfaceTable
 from lidar_synth.town.movers import Mover
 from lidar_synth.town.paving import pave
 from lidar_synth.town.scene import Scene
 from lidar_synth.town.solid import Solid
 from lidar_synth.town.street import KINDS as STREETS
-from lidar_synth.town.street import REACH, SHARES, Street, draw_street
+from lidar_synth.town.street import REACH, SHARES, Street, sample_street
 from lidar_synth.town.traffic import Traffic
 from lidar_synth.town.yards import build_lot
 
@@ -30,11 +30,11 @@ STRETCH_FRAMES = 20
 
 
 WORLD, LIGHT, SCAN, IMAGE = range(4)
-"""What random numbers are for."""
+"""Purposes of random numbers; each has its own generator."""
 
 
-def generator(purpose: int, seed: int, stretch: int, frame: int = 0) -> np.random.Generator:
-    """The random numbers for one purpose in a stretch, or in one of its frames."""
+def rng_for(purpose: int, seed: int, stretch: int, frame: int = 0) -> np.random.Generator:
+    """The random generator for one purpose in a stretch or in one of its frames."""
     return np.random.Generator(np.random.Philox(key=(seed, purpose), counter=(0, 0, stretch, frame)))
 
 
@@ -44,11 +44,11 @@ class World:
 
     Args:
         street: its plan.
-        scene: what stands in it, and its ground.
+        scene: its ground and its objects.
         triangles: (F, 3, 3) float32, metres, the static world.
-        faces: (F,) int32 surface number of each.
+        faces: (F,) int32 surface number of each triangle.
         surfaces: all surfaces, of the static world and of the movers.
-        movers: what moves.
+        movers: vehicles, pedestrians and cyclists.
     """
 
     street: Street
@@ -60,22 +60,22 @@ class World:
 
     @cached_property
     def solid(self) -> Solid:
-        """The static world made ready for rays (half a second, once)."""
+        """The static world as an Embree scene (built on first access, half a second)."""
         return Solid(self.triangles)
 
 
 def build_world(seed: int, stretch: int, interval: float) -> World:
-    """The stretch number ``stretch`` of a seed's town.
+    """Build one stretch of a town.
 
     Args:
-        seed: of the town.
-        stretch: 0 and up.
-        interval: seconds from frame to frame.
+        seed: the seed of the town.
+        stretch: number of the stretch, 0 and up.
+        interval: seconds between neighbouring frames.
     """
-    rng = generator(WORLD, seed, stretch)
+    rng = rng_for(WORLD, seed, stretch)
     kind = str(rng.choice(STREETS, p=SHARES))
     times = np.arange(STRETCH_FRAMES, dtype=float) * interval
-    street = draw_street(kind, float(times[-1]), rng)
+    street = sample_street(kind, float(times[-1]), rng)
     course = Course(
         -REACH - 40,
         street.length + REACH + 40,
@@ -83,14 +83,14 @@ def build_world(seed: int, stretch: int, interval: float) -> World:
         rng,
     )
     relief = Relief(0.004 if rng.random() < 0.6 else 0.014, rng)
-    lots = draw_lots(street, rng)
+    lots = sample_lots(street, rng)
     paint = pave(street, rng)
     paint_lots(lots, paint, rng)
     fine = (-REACH, street.length + REACH)
     ground = Ground(course, relief, street.edge, paint.reach, fine, paint.rects, paint.corners)
     scene = Scene(ground)
     rows = [scene.surfaces.add(k.finish, k.raw) for k in KINDS.values()]
-    scene.add(ground.mesh(rng), np.array(rows, np.int32))
+    scene.add_mesh(ground.mesh(rng), np.array(rows, np.int32))
     for lot in lots:
         build_lot(lot, street, scene, rng)
     close_ends(street, scene, rng)

@@ -1,7 +1,7 @@
-"""Seeing scans: pictures, sheets, a page for the browser, a window.
+"""Visualisation of scans: pictures, sheets, an HTML page with a viewer, and a window.
 
-``write_view`` makes a file of any scans; the rest is what it is made of. Nothing here needs a graphics card, a
-screen or a network, but ``show``.
+``write_view`` writes scans to a picture or page; the other functions are its parts. Only ``show`` needs a screen
+and OpenGL; nothing needs a network connection.
 """
 
 from collections.abc import Callable, Sequence
@@ -51,33 +51,33 @@ _WRITERS: dict[str, Callable[[Path, Sequence[Scan | RangeImage], str, str], None
 
 
 def view_suffix(path: Path) -> str:
-    """The suffix of a file that ``write_view`` can write.
+    """The suffix of a path, if ``write_view`` can write such a file.
 
     Raises:
-        ConfigError: on another one.
+        ConfigError: on any other suffix than .png and .html.
     """
     if path.suffix not in _WRITERS:
-        raise ConfigError(f"a view in {path}", f"a file that ends in {' or '.join(_WRITERS)}")
+        raise ConfigError(f"cannot write a view to {path}", f"a file that ends in {' or '.join(_WRITERS)}")
     return path.suffix
 
 
 def write_view(
     path: str | Path, given: Sequence[Scan | RangeImage], *, title: str = "LiDAR scans", notes: str = ""
 ) -> None:
-    """Writes what scans look like to a file.
+    """Write a picture or a page of scans to a file.
 
     Args:
-        path: ``.png`` for a sheet with all views of one scan, or with many scans side by side; ``.html`` for
+        path: ``.png`` for a sheet with all views of one scan, or with several scans side by side; ``.html`` for
             a page with an interactive viewer.
         given: scans or range images, at least one.
-        title: the heading of a page or of a sheet with many.
+        title: the heading of a page, or of a sheet of several scans.
         notes: text for the page; an empty line starts a paragraph.
 
     Raises:
-        ConfigError: on another suffix, or when nothing is given.
-        FileError: where the file cannot be written.
+        ConfigError: on another suffix, or without scans.
+        FileError: if the file cannot be written.
     """
     path = Path(path)
     if not given:
-        raise ConfigError(f"a view of no scans in {path}", "at least one scan")
+        raise ConfigError(f"no scans to write to {path}", "at least one scan")
     _WRITERS[view_suffix(path)](path, given, title, notes)

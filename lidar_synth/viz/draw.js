@@ -28,7 +28,7 @@ void main() {
   colour = texture(table, place);
 }`];
 
-// Eye-dome lighting with the weights of render.py; writes the depth on, for the lines to be hidden by.
+// Eye-dome lighting with the weights of render.py; it also writes the depth, so that points can occlude lines.
 const SHADE = [`#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }`, `#version 300 es
 precision highp float;
@@ -56,7 +56,7 @@ layout(location=0) in vec3 p; uniform mat4 matrix;
 void main() { gl_Position = matrix * vec4(p, 1); gl_Position.z -= 0.0005 * gl_Position.w; }`, `#version 300 es
 precision highp float; uniform vec4 ink; out vec4 colour; void main() { colour = ink; }`];
 
-// Returns draw(scan, by, settings), or null where there is no WebGL 2.
+// Returns draw(scan, by, settings), or null if the browser has no WebGL 2.
 function viewer(canvas, table) {
   const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
   if (!gl) return null;
@@ -134,7 +134,7 @@ function viewer(canvas, table) {
     const at = lines.use();
     gl.bindVertexArray(line.array);
     gl.uniformMatrix4fv(at.matrix, false, matrix);
-    for (const [test, share] of [[gl.LEQUAL, 1], [gl.GREATER, 0.25]]) { // what the scan hides stays visible, faintly
+    for (const [test, share] of [[gl.LEQUAL, 1], [gl.GREATER, 0.25]]) { // lines behind points are drawn faintly
       gl.depthFunc(test);
       gl.uniform4f(at.ink, ink[0], ink[1], ink[2], ink[3] * share);
       gl.drawArrays(gl.LINES, 0, line.count);

@@ -1,4 +1,4 @@
-"""Range images as pictures: a cell is a pixel, a cell without a return is dark."""
+"""Range images as pictures with one pixel per cell; cells without a return are dark."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,35 +13,35 @@ from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.viz.colour import EMPTY, Rgb, Scale, scales
 
 CHANNELS = ("range", "reflectance", "label")
-"""What a range image is shown by, where it has it."""
+"""The channels of a range image that are shown, if it has them."""
 
 
 class View(NamedTuple):
-    """One scan both ways, as points and on its sensor's grid."""
+    """A scan and its range image."""
 
     scan: Scan
     image: RangeImage
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Those of ``CHANNELS`` that it has."""
+        """The members of ``CHANNELS`` that the range image has."""
         return tuple(name for name in CHANNELS if name == "range" or name in self.image.channels)
 
     @property
     def classes(self) -> NDArray[np.int64]:
-        """(20,) points of each class, the unlabelled ones last; all zero without labels."""
+        """(20,) number of points of each class, unlabelled points last; all zero without labels."""
         if self.scan.label is None:
             return np.zeros(len(NAMES) + 1, np.int64)
         return np.bincount(np.where(self.scan.label == IGNORE, len(NAMES), self.scan.label), minlength=len(NAMES) + 1)
 
 
 def views(given: Sequence[Scan | RangeImage]) -> list[View]:
-    """Each scan with its range image (spherical), each range image with its points."""
+    """Project scans to range images (spherical projection), and unproject range images to scans."""
     return [
-        View(one, project(one, channels=[n for n in CHANNELS if n in one.fields()]))
-        if isinstance(one, Scan)
-        else View(unproject(one), one)
-        for one in given
+        View(item, project(item, channels=[n for n in CHANNELS if n in item.fields()]))
+        if isinstance(item, Scan)
+        else View(unproject(item), item)
+        for item in given
     ]
 
 
@@ -49,16 +49,16 @@ def picture(image: RangeImage, channel: str = "range", scale: Scale | None = Non
     """(H, W, 3) uint8 picture of one of the ``CHANNELS``; cells without a return are dark.
 
     Args:
-        image: what to show.
+        image: the range image to show.
         channel: one of ``CHANNELS``.
-        scale: the meaning of the colours; by default that of a scan of the image's sensor.
+        scale: the colour scale; by default that of this image alone.
 
     Raises:
         ConfigError: on a channel that the image does not have.
     """
-    has = ("range", *(name for name in CHANNELS if name in image.channels))
-    if channel not in has:
-        raise ConfigError(f"a picture of {channel!r}", f"one of {', '.join(has)}")
+    available = ("range", *(name for name in CHANNELS if name in image.channels))
+    if channel not in available:
+        raise ConfigError(f"a picture of {channel!r}", f"one of {', '.join(available)}")
     values = image.range if channel == "range" else image.channels[channel]
     colours = (scale or scales([unproject(image)])[channel])(values)
     return np.where(image.mask[..., None], colours, EMPTY)

@@ -1,4 +1,4 @@
-// What page.html does: its controls, legend and pictures. The data is what page.py packs; draw.js draws it.
+// Controls, legend and pictures of page.html. page.py packs the data; draw.js draws it.
 "use strict";
 
 const data = JSON.parse(document.getElementById("data").textContent);
@@ -128,7 +128,7 @@ function redraw() {
     waiting = false;
     if (state.turning) { state.camera.azimuth += 0.3; }
     const by = data.scales[shown()];
-    // Classes are hidden where the legend that hides them is seen.
+    // Classes are hidden only while the points are coloured by label: otherwise there is no legend to show them again.
     draw(data.scans[state.scan], by, { ...state, empty: data.empty, hidden: shown() === "label" ? state.hidden : [] });
     if (state.turning) redraw();
   });

@@ -1,7 +1,8 @@
-"""One HTML file that shows scans: nothing else is needed, neither a network nor a server.
+"""A self-contained HTML page that shows scans; it needs no network and no server.
 
-The viewer (``draw.js``, ``page.js``) is WebGL 2 without a library. Points travel quantised in 8 bytes (``POINT``):
-a scan of 120,000 is 1.3 MB of text, and keeps its positions to 1.3 mm where the farthest is 80 m away.
+The viewer (``draw.js``, ``page.js``) uses WebGL 2 without a library. Points are quantised to 8 bytes (``POINT``): a
+scan of 120,000 points is 1.3 MB of text, with an error of at most 1.3 mm per coordinate if the farthest point is at
+80 m.
 """
 
 import base64
@@ -23,16 +24,16 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import read_picture
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, known, scales
+from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, available, scales
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Orbit, box_segments, render, ring_segments
 
 POINT = np.dtype([("cell", "<i2", 3), ("reflectance", "u1"), ("label", "u1")])
-"""A packed point: position = cell * metres per step; reflectance * 255; train id, 255 = ignore."""
+"""A packed point: position = ``cell`` * metres per step; reflectance * 255; train id, 255 = ignore."""
 
 
 def pack(scan: Scan) -> tuple[NDArray[Any], float]:
-    """(N,) points as ``POINT``, and the metres that one step of ``cell`` is."""
+    """Pack a scan into (N,) elements of ``POINT``; also returns the size of one step of ``cell`` in metres."""
     farthest = float(np.abs(scan.points).max(initial=0.0))
     metres = max(farthest, 1.0) / 32767
     packed = np.empty(len(scan), POINT)
@@ -43,18 +44,18 @@ def pack(scan: Scan) -> tuple[NDArray[Any], float]:
 
 
 def html_page(given: Sequence[Scan | RangeImage], *, title: str = "LiDAR scans", notes: str = "") -> str:
-    """A page with an interactive viewer and the range images of every scan.
+    """The HTML text of a page with an interactive viewer and the range images of every scan.
 
     Args:
-        given: scans, or range images, whose points are then shown.
+        given: scans, or range images, which are unprojected to points; at least one.
         title: the heading.
-        notes: text below it; an empty line starts a paragraph.
+        notes: text below the heading; an empty line starts a paragraph.
 
     Raises:
-        ConfigError: when nothing is given.
+        ConfigError: without scans.
     """
     if not given:
-        raise ConfigError("a page of no scans", "at least one")
+        raise ConfigError("no scans for a page", "at least one scan")
     all_views = views(given)
     colours = scales([view.scan for view in all_views])
     content = {
@@ -63,10 +64,10 @@ def html_page(given: Sequence[Scan | RangeImage], *, title: str = "LiDAR scans",
         "empty": EMPTY.tolist(),
         "domains": list(DOMAINS),
         "classes": [*NAMES, "unlabelled"],
-        "scales": {name: _scale(scale, row) for row, (name, scale) in enumerate(colours.items())},
-        "table": _text(np.concatenate([scale.table for scale in colours.values()]).tobytes()),
+        "scales": {name: _scale_data(scale, row) for row, (name, scale) in enumerate(colours.items())},
+        "table": _base64(np.concatenate([scale.table for scale in colours.values()]).tobytes()),
         "scans": [
-            _scan(view, colours)
+            _scan_data(view, colours)
             for view in tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)
         ],
     }
@@ -74,7 +75,7 @@ def html_page(given: Sequence[Scan | RangeImage], *, title: str = "LiDAR scans",
     parts = {
         "title": html.escape(title),
         "notes": "".join(paragraphs),
-        # "<" would let a name in the data end its element.
+        # An unescaped "<" in a name could close the script element that contains the data.
         "data": json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         "draw": _resource("draw.js"),
         "script": _resource("page.js"),
@@ -86,47 +87,47 @@ def _resource(name: str) -> str:
     return files("lidar_synth.viz").joinpath(name).read_text(encoding="utf-8")
 
 
-def _scale(scale: Scale, row: int) -> dict[str, Any]:
+def _scale_data(scale: Scale, row: int) -> dict[str, Any]:
     return {"title": scale.title, "row": row, "low": scale.low, "high": scale.high, "gamma": scale.gamma}
 
 
-def _scan(view: View, colours: dict[str, Scale]) -> dict[str, Any]:
+def _scan_data(view: View, colours: dict[str, Scale]) -> dict[str, Any]:
     scan = view.scan
     packed, metres = pack(scan)
     by = "label" if scan.label is not None else "height"
     pictures = [
-        {"title": colours[name].title, "uri": _uri(picture(view.image, name, colours[name])), "cells": True}
+        {"title": colours[name].title, "uri": _data_uri(picture(view.image, name, colours[name])), "cells": True}
         for name in view.channels
     ]
     if scan.image_path is not None and scan.image_path.is_file():
-        pictures.append({"title": "camera", "uri": _photo(scan.image_path), "cells": False})
+        pictures.append({"title": "camera", "uri": _camera_image(scan.image_path), "cells": False})
     return {
         "id": scan.id or "scan",
         "sensor": scan.sensor.name,
         "domain": scan.domain,
         "count": len(scan),
         "metres": metres,
-        "points": _text(packed.tobytes()),
-        "colours": list(known(scan)),
+        "points": _base64(packed.tobytes()),
+        "colours": list(available(scan)),
         "classes": view.classes.tolist(),
-        "boxes": _text(box_segments(scan.boxes).tobytes()) if scan.boxes is not None else "",
-        "rings": _text(ring_segments(scan).tobytes()),
-        "still": _uri(render(scan, by, size=(960, 540), scale=colours[by]), "JPEG"),
+        "boxes": _base64(box_segments(scan.boxes).tobytes()) if scan.boxes is not None else "",
+        "rings": _base64(ring_segments(scan).tobytes()),
+        "still": _data_uri(render(scan, by, size=(960, 540), scale=colours[by]), "JPEG"),
         "pictures": pictures,
     }
 
 
-def _text(content: bytes) -> str:
+def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode("ascii")
 
 
-def _uri(pixels: Rgb, kind: str = "PNG") -> str:
+def _data_uri(pixels: Rgb, kind: str = "PNG") -> str:
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, kind, optimize=True)
-    return f"data:image/{kind.lower()};base64,{_text(file.getvalue())}"
+    return f"data:image/{kind.lower()};base64,{_base64(file.getvalue())}"
 
 
-def _photo(path: Path) -> str:
+def _camera_image(path: Path) -> str:
     small = read_picture(path).convert("RGB")
     small.thumbnail((1200, 600))
-    return _uri(np.asarray(small), "JPEG")
+    return _data_uri(np.asarray(small), "JPEG")

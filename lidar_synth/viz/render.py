@@ -1,8 +1,8 @@
-"""Points to pixels: a z-buffer in numpy, so that a scan can be seen without a graphics card or a screen.
+"""Software renderer for points: a z-buffer in numpy, which needs no graphics card and no screen.
 
-Every point is a disc as large as the patch of surface its beam stands for (the gap to the next beam grows with
-range), the nearest disc owns a pixel, and eye-dome lighting (Boucheny 2009) shades by the depth of the
-neighbouring pixels: a cloud has no surfaces or normals, and without it no shape.
+Every point is drawn as a disc whose size grows with range, like the gap between beams, so that surfaces look closed.
+The nearest disc fills a pixel. Eye-dome lighting (Boucheny 2009) shades by the depth of neighbouring pixels, which
+makes shapes visible although points have no normals.
 """
 
 from dataclasses import dataclass
@@ -15,19 +15,19 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.viz.colour import EMPTY, Rgb, Scale, point_values, scales
 
 SAMPLES = 2
-"""Samples per pixel and axis; their mean is the pixel."""
+"""Samples per pixel along each axis, averaged for antialiasing."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where a picture is taken from, in the scan's frame (x forward, y left, z up, metres).
+    """A camera in the scan's frame (x forward, y left, z up, metres).
 
     Args:
-        eye: position.
-        target: what the middle of the picture shows.
-        up: which way is up in the picture.
-        field: vertical field of view, degrees; or, where ``parallel``, the metres from bottom to top.
-        parallel: orthographic, as a map is.
+        eye: position of the camera.
+        target: the point at the centre of the picture.
+        up: the direction that is up in the picture.
+        field: vertical field of view in degrees; with ``parallel``, the height of the picture in metres.
+        parallel: orthographic projection instead of perspective.
     """
 
     eye: tuple[float, float, float]
@@ -47,11 +47,11 @@ class Camera:
     def look(
         self, points: NDArray[np.floating], size: tuple[int, int]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Where points (N, 3) appear in a picture of ``size`` (width, height) pixels.
+        """Project points (N, 3) into a picture of ``size`` (width, height) pixels.
 
         Returns:
             (N, 2) pixel coordinates (x right, y down, from the upper left corner), (N,) depth in metres
-            along the view (negative: behind the camera), (N,) pixels per metre there.
+            along the viewing direction (negative: behind the camera), (N,) pixels per metre at that depth.
         """
         local = ((points - np.asarray(self.eye)) @ self.axes().T).astype(np.float32)
         depth = local[:, 2]
@@ -64,12 +64,12 @@ class Camera:
 
 
 class Orbit(NamedTuple):
-    """Where a camera stands around what it looks at; growing azimuths make a turntable.
+    """A camera position on a sphere around a target; increasing azimuths give a turntable animation.
 
-    The usual view is from behind on the right and above.
+    The default view is from behind, slightly to the right, and above.
 
     Args:
-        azimuth: degrees clockwise from straight ahead; 180 = behind.
+        azimuth: of the camera as seen from the target, degrees clockwise from straight ahead; 180 = behind.
         elevation: degrees above the horizon.
         distance: metres from the target.
         field: vertical field of view, degrees.
@@ -83,7 +83,7 @@ class Orbit(NamedTuple):
     target: tuple[float, float, float] = (0.0, 0.0, -1.5)
 
     def camera(self) -> Camera:
-        """The camera that stands there."""
+        """The perspective camera at this position."""
         a, e = np.radians(self.azimuth), np.radians(self.elevation)
         away = self.distance * np.array([np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)])
         x, y, z = (self.target + away).tolist()
@@ -91,7 +91,7 @@ class Orbit(NamedTuple):
 
 
 def bird(extent: float = 50.0) -> Camera:
-    """A camera that sees ``extent`` metres to either side from above, ahead up."""
+    """An orthographic camera from above that shows ``extent`` metres on each side; straight ahead is up."""
     return Camera((0.0, 0.0, 100.0), up=(1.0, 0.0, 0.0), field=2 * extent, parallel=True)
 
 
@@ -102,7 +102,7 @@ def _splat(
     colours: Rgb,
     size: tuple[int, int],
 ) -> tuple[Rgb, NDArray[np.float32]]:
-    """Picture and depth buffer, (h, w, 3) and (h, w), inf where nothing is; the nearest disc owns a pixel."""
+    """Picture (h, w, 3) and depth buffer (h, w), inf = empty, of points drawn as discs; the nearest disc wins."""
     width, height = size
     buffer = np.full(width * height, np.inf, np.float32)
     owner = np.full(width * height, -1, np.int64)
@@ -113,8 +113,8 @@ def _splat(
         span = np.arange(-reach, reach + 1)
         for dy, dx in ((dy, dx) for dy in span for dx in span if dx * dx + dy * dy <= reach * reach + 0.5):
             x, y = column[chosen] + dx, row[chosen] + dy
-            seen = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            index, disc = y[seen] * width + x[seen], chosen[seen]
+            visible = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            index, disc = y[visible] * width + x[visible], chosen[visible]
             np.minimum.at(buffer, index, depth[disc])
             front = depth[disc] == buffer[index]
             owner[index[front]] = disc[front]
@@ -124,7 +124,7 @@ def _splat(
 
 
 def _shade(picture: Rgb, buffer: NDArray[np.float32], strength: float = 40.0) -> Rgb:
-    """Eye-dome lighting: a pixel darkens with how far its neighbours stand in front of it, in log depth."""
+    """Eye-dome lighting: darken a pixel by the log-depth differences to neighbours in front of it."""
     filled = np.isfinite(buffer)
     logs = np.log2(np.where(filled, np.maximum(buffer, 1e-3), 1.0)).astype(np.float32)
     logs[~filled] = np.inf
@@ -133,7 +133,7 @@ def _shade(picture: Rgb, buffer: NDArray[np.float32], strength: float = 40.0) ->
         padded = np.pad(logs, reach, constant_values=np.inf)
         for dy, dx in ((0, 1), (1, 0), (0, -1), (-1, 0)):
             neighbour = padded[reach + dy :, reach + dx :][: buffer.shape[0], : buffer.shape[1]]
-            # A step of more than 2 % is an edge, whatever its height; an empty neighbour casts no shade.
+            # Steps of more than 2 % in depth all count as edges; an empty neighbour does not darken.
             behind += np.clip(np.where(filled, logs, 0) - neighbour, 0, 0.03)
     light = np.where(filled, np.exp(-strength * behind / 8), 1)
     return np.rint(EMPTY + (picture.astype(np.float32) - EMPTY) * light[..., None]).astype(np.uint8)
@@ -147,33 +147,33 @@ def _lines(
     colour: tuple[int, int, int],
     opacity: float = 1.0,
 ) -> None:
-    """Draws segments (S, 2, 3) into the picture, faint where the scan hides them."""
+    """Draw segments (S, 2, 3) into the picture, faint where points of the scan occlude them."""
     height, width = buffer.shape
     ends, depth, _ = camera.look(segments.reshape(-1, 3), (width, height))
-    before = (depth > 0.1).reshape(-1, 2)
+    in_front = (depth > 0.1).reshape(-1, 2)
     length = np.abs(np.diff(ends.reshape(-1, 2, 2), axis=1)).max((1, 2))
-    counts = np.where(before.any(1), np.clip(np.ceil(2 * length), 2, 8 * width), 0).astype(np.int64)
+    counts = np.where(in_front.any(1), np.clip(np.ceil(2 * length), 2, 8 * width), 0).astype(np.int64)
     which = np.repeat(np.arange(len(segments)), counts)
     along = (np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)) / np.maximum(counts[which] - 1, 1)
     points = segments[which, 0] * (1 - along[:, None]) + segments[which, 1] * along[:, None]
     pixels, depth, _ = camera.look(points, (width, height))
     for dy, dx in ((0, 0), (0, 1), (1, 0), (1, 1)):
         x, y = np.floor(pixels).astype(np.int64).T + np.array([[dx], [dy]])
-        seen = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (depth > 0.1)
-        clear = depth[seen] <= buffer[y[seen], x[seen]] + 0.15
+        visible = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (depth > 0.1)
+        clear = depth[visible] <= buffer[y[visible], x[visible]] + 0.15
         strength = np.zeros(buffer.shape, np.float32)
-        np.maximum.at(strength, (y[seen], x[seen]), np.where(clear, opacity, 0.25 * opacity).astype(np.float32))
+        np.maximum.at(strength, (y[visible], x[visible]), np.where(clear, opacity, 0.25 * opacity).astype(np.float32))
         row, column = np.nonzero(strength)
         share = strength[row, column, None]
         picture[row, column] = picture[row, column] * (1 - share) + np.array(colour) * share
 
 
 EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
-"""The 12 edges of a box, by the order of ``Boxes.corners``."""
+"""The 12 edges of a box, as indices of ``Boxes.corners``."""
 
 
 def box_segments(boxes: Boxes) -> NDArray[np.float32]:
-    """(13 M, 2, 3) edges of the boxes, and for each a line on its roof from the middle to the front."""
+    """(13 M, 2, 3) edges of the boxes, and for each box a line on its top from the centre to the front."""
     corners = boxes.corners()
     roof = corners[:, 4:].mean(1)
     nose = (corners[:, 4] + corners[:, 7]) / 2
@@ -182,7 +182,7 @@ def box_segments(boxes: Boxes) -> NDArray[np.float32]:
 
 
 def ring_segments(scan: Scan) -> NDArray[np.float32]:
-    """(S, 2, 3) circles every 10 m on the ground, so that a picture has a measure."""
+    """(S, 2, 3) circles on the ground every 10 m, which show distances."""
     near = scan.points[np.linalg.norm(scan.points[:, :2], axis=1) < 20, 2]
     ground = float(np.percentile(near, 5)) if len(near) else 0.0
     turn = np.linspace(0, 2 * np.pi, 97)
@@ -201,31 +201,31 @@ def render(
     boxes: bool = True,
     rings: bool = True,
 ) -> Rgb:
-    """A picture of a scan's points.
+    """Render the points of a scan.
 
     Args:
-        scan: what to show.
+        scan: the scan to show.
         by: the quantity that colours the points, one of ``colour.VALUES``.
-        camera: where from; that of ``Orbit()`` without it.
+        camera: the camera; by default that of ``Orbit()``.
         size: width and height in pixels.
-        scale: the meaning of the colours; that of this scan alone without it.
-        boxes: draw the scan's boxes, with a line to each front.
-        rings: draw circles on the ground, 10 m apart.
+        scale: the colour scale; by default that of this scan alone.
+        boxes: whether to draw the scan's boxes, with a line to the front of each.
+        rings: whether to draw circles on the ground, 10 m apart.
 
     Returns:
         (height, width, 3) uint8.
 
     Raises:
-        ConfigError: when the scan does not know the quantity.
+        ConfigError: if the scan does not have the quantity.
     """
     camera = camera or Orbit().camera()
     values = point_values(scan, by)
     colours = (scale or scales([scan])[by])(values)
     fine = (size[0] * SAMPLES, size[1] * SAMPLES)
     pixels, depth, per_metre = camera.look(scan.points, fine)
-    kept = depth > 0.1
-    gap = 0.015 + 0.003 * np.linalg.norm(scan.points[kept], axis=1)
-    picture, buffer = _splat(pixels[kept], depth[kept], gap * per_metre[kept], colours[kept], fine)
+    in_front = depth > 0.1
+    gap = 0.015 + 0.003 * np.linalg.norm(scan.points[in_front], axis=1)
+    picture, buffer = _splat(pixels[in_front], depth[in_front], gap * per_metre[in_front], colours[in_front], fine)
     picture = _shade(picture, buffer)
     if rings:
         _lines(picture, buffer, ring_segments(scan), camera, (150, 160, 180), 0.35)

@@ -1,6 +1,6 @@
-"""Sheets: every view of one scan, many scans side by side, or the figures of very many, composed by matplotlib.
+"""Figures with matplotlib: all views of one scan, several scans side by side, or histograms of many scans.
 
-Figures are made without pyplot, so nothing global changes and no screen is needed.
+Figures are created without pyplot, so they change no global state and need no screen.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,15 +28,15 @@ _DPI = 100
 
 
 def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: float = 50.0) -> Figure:
-    """All views of one scan: in perspective, from above, and its range image by every channel it has.
+    """All views of one scan: in perspective, from above, and every channel of its range image.
 
     Args:
-        given: a scan, or a range image, whose points are then shown.
-        camera: of the view in perspective.
-        extent: metres to either side that the view from above shows.
+        given: a scan, or a range image, which is unprojected to points.
+        camera: the camera of the perspective view; by default that of ``Orbit()``.
+        extent: metres on each side of the sensor that the view from above shows.
 
     Returns:
-        A figure; ``figure.savefig`` or ``write_sheet`` makes a file of it.
+        A figure; write it with ``figure.savefig``.
     """
     [view] = views([given])
     colours = scales([view.scan])
@@ -61,20 +61,21 @@ def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: flo
 def contact_sheet(
     given: Sequence[Scan | RangeImage], *, columns: int | None = None, by: str | None = None, title: str = ""
 ) -> Figure:
-    """Many scans side by side, each in perspective above its range image, and the image of its labels if they colour
-    the points.
+    """Several scans side by side: each one in perspective above its range image (and its label image, if labels
+    colour the points).
 
     Args:
-        given: scans or range images.
-        columns: tiles in a row; about a square without it.
-        by: what colours the points, one of ``colour.VALUES``; labels if all have them, else heights.
-        title: a line above.
+        given: scans or range images, at least one.
+        columns: tiles per row; by default the sheet is about square.
+        by: the quantity that colours the points, one of ``colour.VALUES``; by default labels if all scans have them,
+            otherwise heights.
+        title: the title line.
 
     Raises:
-        ConfigError: when nothing is given, or a scan does not know the quantity.
+        ConfigError: without scans, or if a scan does not have the quantity.
     """
     if not given:
-        raise ConfigError("a sheet of no scans", "at least one")
+        raise ConfigError("no scans for a sheet", "at least one scan")
     all_views = views(given)
     colours = scales([view.scan for view in all_views])
     by = by or ("label" if all(view.scan.label is not None for view in all_views) else "height")
@@ -92,9 +93,9 @@ def contact_sheet(
     for place, view in enumerate(tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)):
         tile = grid[place].subgridspec(1 + len(strips), 1, height_ratios=[5, *[1] * len(strips)], hspace=0.02)
         above, *below = (figure.add_subplot(tile[row]) for row in range(1 + len(strips)))
-        _bare(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
+        _show_pixels(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
         for axes, channel in zip(below, strips, strict=True):
-            _bare(axes, picture(view.image, channel, colours[channel]))
+            _show_pixels(axes, picture(view.image, channel, colours[channel]))
         above.set_title(caption(view.scan, short=True), color=_DIM, fontsize=9, loc="left", pad=3)
     if by == "label":
         _legend(figure, all_views, colours[by].table)
@@ -104,13 +105,13 @@ def contact_sheet(
 def histograms(
     values: Mapping[str, NDArray[np.floating]], meanings: Mapping[str, str], marked: NDArray[np.bool_], title: str = ""
 ) -> Figure:
-    """How some figures of many scans are distributed, with some of the scans marked.
+    """Histograms of measures of many scans, with some of the scans highlighted.
 
     Args:
-        values: {name: (N,)}, at least one.
-        meanings: of each figure, in words.
-        marked: (N,) scans to show in another colour, on top.
-        title: a line above.
+        values: {name of a measure: (N,)}, at least one.
+        meanings: {name of a measure: what it means}, shown below its histogram.
+        marked: (N,) the scans to show in a second colour, stacked on top.
+        title: the title line.
     """
     columns = min(len(values), 4)
     rows = -(-len(values) // columns)
@@ -131,13 +132,13 @@ def histograms(
         axes = figure.add_subplot(grid[place], facecolor=_BACK)
         colours = [tuple((np.array(colour) / 255).tolist()) for colour in DOMAINS.values()]
         axes.hist([numbers[~marked], numbers[marked]], bins=60, stacked=True, color=colours)
-        axes.set_yscale("symlog", linthresh=1)  # one scan among thousands is seen
-        _dress(axes, name, "\n".join(wrap(meanings[name], 52)), "" if place % columns else "scans")
+        axes.set_yscale("symlog", linthresh=1)  # keeps a single scan among thousands visible
+        _style_axes(axes, name, "\n".join(wrap(meanings[name], 52)), "" if place % columns else "scans")
     return figure
 
 
 def caption(scan: Scan, short: bool = False) -> str:
-    """One line about a scan: id, sensor, domain, number of points."""
+    """A caption for a scan: id, sensor, domain, number of points; ``short``: id and domain."""
     domain = list(DOMAINS)[scan.domain]
     if short:
         return f"{scan.id or 'scan'}  ·  {domain}"
@@ -150,12 +151,12 @@ def _figure(width: float, height: float) -> Figure:
     return figure
 
 
-def _bare(axes: Any, pixels: Any) -> None:
+def _show_pixels(axes: Any, pixels: Any) -> None:
     axes.imshow(pixels, aspect="auto", interpolation="antialiased")
     axes.set_axis_off()
 
 
-def _dress(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
+def _style_axes(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
     axes.set_title(title, color=_INK, fontsize=11, loc="left")
     axes.set_xlabel(xlabel, color=_DIM, fontsize=9)
     axes.set_ylabel(ylabel, color=_DIM, fontsize=9)
@@ -164,7 +165,7 @@ def _dress(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
         spine.set_color("#3a3f4b")
 
 
-def _bar(axes: Any, scale: Scale) -> None:
+def _colour_bar(axes: Any, scale: Scale) -> None:
     """A colour bar at the right edge of the axes."""
     values = ScalarMappable(PowerNorm(scale.gamma, scale.low, scale.high), ListedColormap(scale.table / 255))
     bar = axes.figure.colorbar(values, cax=axes.inset_axes((1.008, 0, 0.011, 1), transform=axes.transAxes))
@@ -173,15 +174,15 @@ def _bar(axes: Any, scale: Scale) -> None:
 
 
 def _perspective(axes: Any, view: View, by: str, scale: Scale, camera: Camera | None) -> None:
-    _bare(axes, render(view.scan, by, camera=camera, size=(1020, 620), scale=scale))
+    _show_pixels(axes, render(view.scan, by, camera=camera, size=(1020, 620), scale=scale))
     axes.set_title(f"3-D, coloured by {scale.title}; circles every 10 m", color=_INK, fontsize=11, loc="left")
 
 
 def _from_above(axes: Any, view: View, scale: Scale, extent: float) -> None:
     pixels = render(view.scan, "height", camera=bird(extent), size=(600, 600), scale=scale)
     axes.imshow(pixels, extent=(extent, -extent, -extent, extent), interpolation="antialiased")
-    _dress(axes, f"from above, coloured by {scale.title}", "y, to the left (m)", "x, ahead (m)")
-    _bar(axes, scale)
+    _style_axes(axes, f"from above, coloured by {scale.title}", "y, to the left (m)", "x, ahead (m)")
+    _colour_bar(axes, scale)
 
 
 def _image(axes: Any, view: View, channel: str, scale: Scale) -> None:
@@ -190,15 +191,15 @@ def _image(axes: Any, view: View, channel: str, scale: Scale) -> None:
         picture(view.image, channel, scale), aspect="auto", interpolation="nearest",
         extent=(-180, 180, sensor.shape[0], 0),
     )  # fmt: skip
-    _dress(axes, scale.title, "", "row")
+    _style_axes(axes, scale.title, "", "row")
     names = ["behind", "-135°", "left", "-45°", "ahead", "45°", "right", "135°", "behind"]
     axes.set_xticks(range(-180, 181, 45), names)
     if not scale.classes:
-        _bar(axes, scale)
+        _colour_bar(axes, scale)
 
 
 def _legend(figure: Figure, all_views: Sequence[View], table: Rgb) -> None:
-    """Colour and share of each class that the scans have, below everything."""
+    """A legend at the bottom: colour and share of each class that occurs in the scans."""
     counts = np.sum([view.classes for view in all_views], axis=0)
     entries = [
         Patch(color=tuple((table[i] / 255).tolist()), label=f"{name} {count / counts.sum():.1%}")
@@ -210,5 +211,5 @@ def _legend(figure: Figure, all_views: Sequence[View], table: Rgb) -> None:
 
 
 def _per_row(width: float) -> int:
-    """How many classes a legend of that many inches has in a row."""
+    """The number of classes per row in a legend that is ``width`` inches wide."""
     return max(1, min(10, int(width / 1.65)))

@@ -1,4 +1,4 @@
-"""A window by open3d, for where there is a screen."""
+"""An interactive window with open3d, on machines with a screen."""
 
 import ctypes
 import os
@@ -18,10 +18,10 @@ _LEFT, _RIGHT = 263, 262  # GLFW's key codes
 
 
 def import_open3d() -> ModuleType:
-    """The library open3d.
+    """Import open3d.
 
     Raises:
-        LibraryError: where it or a system library behind it is missing.
+        LibraryError: if open3d or a system library that it needs is missing.
     """
     try:
         import open3d  # type: ignore[import-untyped,unused-ignore]
@@ -35,20 +35,20 @@ def import_open3d() -> ModuleType:
 
 
 def has_screen() -> bool:
-    """Whether a window would be seen: on a Unix a display server has to answer.
+    """Whether a window can be shown: on Unix, whether a display server answers.
 
-    A set DISPLAY is not enough: where nothing answers, open3d draws off screen and waits for ever.
+    A set DISPLAY is not enough: if no server answers, open3d renders off screen and waits forever.
     """
     if sys.platform in ("win32", "darwin"):
         return True
-    if _answers("libX11.so.6", "XOpenDisplay", "XCloseDisplay"):
+    if _can_connect("libX11.so.6", "XOpenDisplay", "XCloseDisplay"):
         return True
-    wayland = "XDG_RUNTIME_DIR" in os.environ  # without it the library complains on the terminal
-    return wayland and _answers("libwayland-client.so.0", "wl_display_connect", "wl_display_disconnect")
+    wayland = "XDG_RUNTIME_DIR" in os.environ  # without it, libwayland prints an error to the terminal
+    return wayland and _can_connect("libwayland-client.so.0", "wl_display_connect", "wl_display_disconnect")
 
 
-def _answers(library: str, connect: str, disconnect: str) -> bool:
-    """Whether a display server lets a client of this library connect."""
+def _can_connect(library: str, connect: str, disconnect: str) -> bool:
+    """Whether a client library can connect to its display server."""
     try:
         client = ctypes.CDLL(library)
     except OSError:
@@ -61,14 +61,15 @@ def _answers(library: str, connect: str, disconnect: str) -> bool:
 
 
 def show(scans: Sequence[Scan], title: str = "lidar-synth") -> bool:
-    """Opens a window and returns when it is closed; left and right arrows change the scan.
+    """Show scans in a window until it is closed; the left and right arrow keys switch between scans.
 
     Args:
-        scans: at least one.
-        title: the window's.
+        scans: at least one scan.
+        title: the title of the window.
 
     Returns:
-        False where no window can open: no screen, no open3d (or none of its system libraries), no OpenGL.
+        Whether a window was shown. False without a screen, without open3d or one of its system libraries, or without
+        OpenGL.
     """
     if not has_screen():
         return False
@@ -110,14 +111,14 @@ def show(scans: Sequence[Scan], title: str = "lidar-synth") -> bool:
 
 
 def geometries(scan: Scan, colours: dict[str, Scale]) -> list[Any]:
-    """What open3d draws of a scan: its points, by label where it has some or else by height, and its boxes.
+    """The open3d geometries of a scan: its points, coloured by label (or by height without labels), and its boxes.
 
     Args:
         scan: N points.
-        colours: as ``scales`` makes them.
+        colours: the colour scales, from ``scales``.
 
     Raises:
-        LibraryError: without open3d.
+        LibraryError: if open3d is missing.
     """
     open3d = import_open3d()
     vectors = open3d.utility.Vector3dVector

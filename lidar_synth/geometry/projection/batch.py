@@ -1,4 +1,4 @@
-"""The same projection for batches of torch tensors on any device, cell for cell and bit for bit."""
+"""Projection and unprojection of batches of torch tensors on any device, bit-identical to those on the CPU."""
 
 from typing import NamedTuple
 
@@ -27,10 +27,10 @@ class BatchImage(NamedTuple):
 
 
 def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cell (N,) int64 and range (N,) float32 (inf outside the limits) of points (N, 3)."""
+    """Cell (N,) int64 and range (N,) float32 of points (N, 3); cell 0 and range inf outside the range limits."""
     x, y, z = points.unbind(-1)
     r = torch_sqrt(x * x + y * y + z * z)
-    seen = (r >= float(grid.range_min)) & (r <= float(grid.range_max)) & (r > 0)
+    in_range = (r >= float(grid.range_min)) & (r <= float(grid.range_max)) & (r > 0)
     elevation = torch_asin(z / torch.where(r > 0, r, 1.0))
     if len(grid.edges):
         inner = torch.from_numpy(grid.edges[1:-1].copy()).to(points.device)
@@ -40,7 +40,7 @@ def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor
         row = ((1 - (elevation - down) / (up - down)) * grid.rows).clamp(0, grid.rows - 1).long()
     azimuth = -torch_atan2(y, x)
     column = ((azimuth / torch.pi + 1) * 0.5 * grid.columns).long() % grid.columns
-    return torch.where(seen, row * grid.columns + column, 0), torch.where(seen, r, torch.inf)
+    return torch.where(in_range, row * grid.columns + column, 0), torch.where(in_range, r, torch.inf)
 
 
 def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -> BatchImage:
@@ -73,11 +73,12 @@ def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -
     (height, width), batch = sensor.shape, len(offsets) - 1
     cell, distance = _cells(points[:, :3], grid_of(sensor))
     cloud = torch.repeat_interleave(torch.arange(batch, device=points.device), offsets.diff().to(points.device))
-    # Positive floats order like their bits: one integer minimum finds range and point, the first of equals.
+    # Positive floats are ordered like their bit patterns, so one integer minimum over (range bits, point index) finds
+    # the nearest point, and the first of points at equal range.
     key = distance.view(torch.int32).long() << 32 | torch.arange(len(points), device=points.device)
     best = torch.full((batch * height * width,), _NONE, device=points.device)
-    seen = distance < torch.inf
-    best.scatter_reduce_(0, (cloud * (height * width) + cell)[seen], key[seen], "amin")
+    in_range = distance < torch.inf
+    best.scatter_reduce_(0, (cloud * (height * width) + cell)[in_range], key[in_range], "amin")
     hit = best < _NONE
     point = torch.where(hit, best & 0xFFFFFFFF, -1).view(batch, height, width)
     shown = torch.where(hit.view_as(point)[..., None], points[point.clamp(min=0)][..., 3:], 0.0)

@@ -1,4 +1,4 @@
-"""From cells back to points: what a range-view network said of each cell, for every point of the scan."""
+"""From cells back to points: transfers the prediction of a range-view network from cells to all points of a scan."""
 
 import numba
 import numpy as np
@@ -8,13 +8,13 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection.spherical import Cells
 
-_NEIGHBOURS = 32  # at most this many of the nearest vote
+_NEIGHBOURS = 32  # largest k
 
 
 @numba.njit(cache=True)
 def _vote(cell, distance, point, image, labels, half, k, cutoff, out):  # type: ignore[no-untyped-def]
     rows, columns = image.shape
-    gaps, near = np.empty(_NEIGHBOURS, np.float32), np.empty(_NEIGHBOURS, np.int64)
+    gaps, neighbours = np.empty(_NEIGHBOURS, np.float32), np.empty(_NEIGHBOURS, np.int64)
     votes = np.empty(256, np.int64)
     for i in range(len(cell)):
         if cell[i] < 0:
@@ -24,28 +24,28 @@ def _vote(cell, distance, point, image, labels, half, k, cutoff, out):  # type: 
         if point[row, column] == i:
             out[i] = labels[row, column]
             continue
-        found = 0
+        count = 0
         for r in range(max(row - half, 0), min(row + half + 1, rows)):
             for offset in range(-half, half + 1):
                 c = (column + offset) % columns
                 if image[r, c] == 0:
                     continue
                 gap = abs(image[r, c] - distance[i])
-                if found == k and gap >= gaps[k - 1]:
+                if count == k and gap >= gaps[k - 1]:
                     continue
-                j = min(found, k - 1)
+                j = min(count, k - 1)
                 while j > 0 and gaps[j - 1] > gap:
-                    gaps[j], near[j] = gaps[j - 1], near[j - 1]
+                    gaps[j], neighbours[j] = gaps[j - 1], neighbours[j - 1]
                     j -= 1
-                gaps[j], near[j] = gap, labels[r, c]
-                found = min(found + 1, k)
+                gaps[j], neighbours[j] = gap, labels[r, c]
+                count = min(count + 1, k)
         votes[:] = 0
-        winner = near[0]
-        for j in range(found):
+        winner = neighbours[0]
+        for j in range(count):
             if gaps[j] <= cutoff:
-                votes[near[j]] += 1
-                if votes[near[j]] > votes[winner]:
-                    winner = near[j]
+                votes[neighbours[j]] += 1
+                if votes[neighbours[j]] > votes[winner]:
+                    winner = neighbours[j]
         out[i] = winner
 
 

@@ -1,14 +1,14 @@
-"""The owner of arctan2: where a point lies on a sensor's grid, and the loops over points and cells.
+"""Compiled kernels of the projection: the cell of a point on a sensor's grid, and the loops over points and cells.
 
-elevation = asin(z / r), azimuth = -atan2(y, x), row and column from them as in the paper and the
-public code of R2Flow and LiDM, float32 operation by operation.
+elevation = asin(z / r) and azimuth = -atan2(y, x). Row and column follow from them as in the paper and in the
+public code of R2Flow and LiDM, with the same float32 operations in the same order.
 
-The inverse functions are polynomials (Cephes ``atanf``, ``asinf``; error about 3e-7 rad), written
-without branches so that the compiler turns them into vector instructions, and made of nothing but
-IEEE +, -, *, / and sqrt so that numba on a CPU and torch on any device (batch.py) give the same bits.
+``atan2`` and ``asin`` are polynomials (Cephes ``atanf``, ``asinf``; error about 3e-7 rad). They have no branches, so
+that the compiler can vectorise them, and use only IEEE +, -, *, / and sqrt, so that numba on a CPU and torch on any
+device (batch.py) give the same bits.
 
-Everything that is compiled for ``project`` stands in this one file: numba's cache on disk notices a change of the
-file that holds a function, but not of a file whose functions it has inlined.
+Everything that is compiled for ``project`` is in this one file: numba's cache on disk detects a change of the file
+that defines a function, but not of a file whose functions were inlined into it.
 """
 
 from typing import NamedTuple
@@ -26,12 +26,12 @@ _A0, _A1, _A2, _A3 = ATAN
 _S0, _S1, _S2, _S3, _S4 = ASIN
 PI, PI_2, PI_4, TAN_PI_8 = _f(np.pi), _f(np.pi / 2), _f(np.pi / 4), _f(np.tan(np.pi / 8))
 _INF = np.float32(np.inf)
-_BLOCK = 1024  # points located at a time: the buffers stay in the first-level cache
+_BLOCK = 1024  # points per block, so that the buffers fit into the L1 cache
 _ZERO, _HALF, _ONE, _TWO = _f(0), _f(0.5), _f(1), _f(2)
 
 
 class Grid(NamedTuple):
-    """A sensor's grid as the kernels take it.
+    """A sensor's grid in the form that the kernels take.
 
     Args:
         up, down: edges of the field of view, radians.
@@ -50,7 +50,7 @@ class Grid(NamedTuple):
 
 
 def grid_of(sensor: Sensor) -> Grid:
-    """The grid of a sensor."""
+    """The ``Grid`` of a sensor."""
     up, down = np.radians(_f(sensor.up)), np.radians(_f(sensor.down))
     edges = sensor.edges if sensor.elevations is not None else np.empty(0, np.float32)
     return Grid(up, down, edges, *sensor.shape, _f(sensor.range_min), _f(sensor.range_max))
@@ -93,14 +93,14 @@ def column_of(azimuth, columns):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def row_of(elevation, up, down, rows):  # type: ignore[no-untyped-def]
-    """Row of an elevation (radians) where rows are linear; outside the field of view, the nearest."""
+    """Row of an elevation (radians) where rows are linear; the first or last row outside the field of view."""
     row = (_ONE - (elevation - down) / (up - down)) * _f(rows)
     return np.int32(min(max(row, _ZERO), _f(rows) - _ONE))
 
 
 @numba.njit(inline="always")
 def row_in_table(elevation, edges):  # type: ignore[no-untyped-def]
-    """Row of an elevation (radians) between tabulated edges; outside the field of view, the nearest."""
+    """Row of an elevation (radians) between tabulated edges; the first or last row outside the field of view."""
     low, high = 1, len(edges) - 1
     while low < high:
         middle = (low + high) // 2
@@ -118,11 +118,11 @@ def _locate_block(x, y, z, grid, cell, distance):  # type: ignore[no-untyped-def
     low, high = grid.range_min, grid.range_max
     for i in range(len(x)):
         r = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
-        seen = (r >= low) & (r <= high) & (r > 0)
+        in_range = (r >= low) & (r <= high) & (r > 0)
         elevation = asin(z[i] / (r if r > 0 else np.float32(1)))
-        place = row_of(elevation, up, down, rows) * columns + column_of(-atan2(y[i], x[i]), columns)
-        cell[i] = place if seen else np.int32(0)
-        distance[i] = r if seen else _INF
+        flat_index = row_of(elevation, up, down, rows) * columns + column_of(-atan2(y[i], x[i]), columns)
+        cell[i] = flat_index if in_range else np.int32(0)
+        distance[i] = r if in_range else _INF
     if len(grid.edges) > 0:
         for i in range(len(x)):
             if distance[i] < _INF:
@@ -131,7 +131,7 @@ def _locate_block(x, y, z, grid, cell, distance):  # type: ignore[no-untyped-def
 
 @numba.njit(error_model="numpy", cache=True, inline="always")
 def _scatter(cell, distance, start, image, index):  # type: ignore[no-untyped-def]
-    """Lets points start, start + 1, ... into their cells where they are nearer than what is there."""
+    """Write points start, start + 1, ... into their cells where they are nearer than the existing ones."""
     for i in range(len(cell)):
         c, r = cell[i], distance[i]
         if r < image[c]:
@@ -140,8 +140,8 @@ def _scatter(cell, distance, start, image, index):  # type: ignore[no-untyped-de
 
 
 @numba.njit(error_model="numpy", cache=True, inline="always")
-def _close(image, index):  # type: ignore[no-untyped-def]
-    """Marks the cells that no point reached."""
+def _mark_empty(image, index):  # type: ignore[no-untyped-def]
+    """Set cells without a point to range 0 and index -1."""
     for c in range(len(image)):
         if image[c] == _INF:
             image[c] = 0
@@ -150,7 +150,7 @@ def _close(image, index):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy", cache=True)
 def nearest_points(points, grid, image, index):  # type: ignore[no-untyped-def]
-    """Fills image (H*W,) with the smallest range per cell (0 = none) and index with its point (-1)."""
+    """Fill ``image`` (H*W,) with the smallest range per cell (0 = none) and ``index`` with its point (-1 = none)."""
     x, y, z = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
     cell, distance = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
     image[:] = _INF
@@ -160,22 +160,22 @@ def nearest_points(points, grid, image, index):  # type: ignore[no-untyped-def]
             x[i], y[i], z[i] = points[start + i, 0], points[start + i, 1], points[start + i, 2]
         _locate_block(x[:n], y[:n], z[:n], grid, cell, distance)
         _scatter(cell[:n], distance[:n], start, image, index)
-    _close(image, index)
+    _mark_empty(image, index)
 
 
 @numba.njit(error_model="numpy", cache=True)
 def nearest_in_cells(cell, distance, image, index):  # type: ignore[no-untyped-def]
-    """``nearest_points`` for points whose cells (-1 = none) are known."""
+    """``nearest_points`` for points with given cells (N,), -1 = none."""
     image[:] = _INF
     for i in range(len(cell)):
         if cell[i] >= 0:
             _scatter(cell[i : i + 1], distance[i : i + 1], i, image, index)
-    _close(image, index)
+    _mark_empty(image, index)
 
 
 @numba.njit(error_model="numpy", cache=True)
 def locate_points(points, grid, cell, distance):  # type: ignore[no-untyped-def]
-    """Cell (-1 outside the range limits) and range of every point."""
+    """Fill ``cell`` (N,) with the cell of each point (-1 outside the range limits) and ``distance`` with its range."""
     x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
     _locate_block(x, y, z, grid, cell, distance)
     for i in range(len(points)):
@@ -192,25 +192,25 @@ def gather(values, index, empty, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy", cache=True)
 def returns_in(image):  # type: ignore[no-untyped-def]
-    """How many cells of image (H*W,) have a return; -1 where a range is negative or not finite."""
-    n, sound = 0, True
+    """Number of cells of ``image`` (H*W,) with a return; -1 if any range is negative or not finite."""
+    n, valid = 0, True
     for c in range(len(image)):
         n += image[c] > 0
-        sound &= (image[c] >= 0) & (image[c] < _INF)
-    return n if sound else -1
+        valid &= (image[c] >= 0) & (image[c] < _INF)
+    return n if valid else -1
 
 
-# The two loops below write every cell to the next free place and only then ask whether it stays: a branch that nobody
-# can foresee costs more. So ``out`` has room for one more than there are returns.
+# The two loops below write every cell to the next free position, and advance that position only for a return: this is
+# faster than an unpredictable branch. ``out`` therefore has one element more than there are returns.
 
 
 @numba.njit(error_model="numpy", cache=True)
 def along_rays(image, directions, out):  # type: ignore[no-untyped-def]
-    """Points (N + 1, 3), the last of them spare, of the returns in image (H*W,) along directions (H*W, 3)."""
+    """Fill ``out`` (N + 1, 3) with the points of the N returns in ``image`` (H*W,) along ``directions`` (H*W, 3)."""
     n = 0
     for c in range(len(image)):
         r = image[c]
-        # All loads before the stores: the compiler has to take ``out`` for a part of the others.
+        # All loads come before the stores, because the compiler must assume that ``out`` aliases the inputs.
         x, y, z = r * directions[c, 0], r * directions[c, 1], r * directions[c, 2]
         out[n, 0], out[n, 1], out[n, 2] = x, y, z
         n += r > 0
@@ -218,7 +218,7 @@ def along_rays(image, directions, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def pick_returns(image, values, out):  # type: ignore[no-untyped-def]
-    """What values (H*W,) say of the returns in image (H*W,): (N + 1,), the last of them spare."""
+    """Fill ``out`` (N + 1,) with the ``values`` (H*W,) of the N returns in ``image`` (H*W,)."""
     n = 0
     for c in range(len(image)):
         out[n] = values[c]

@@ -1,8 +1,8 @@
-"""Points to range image and back, on one CPU core.
+"""Spherical projection of points to a range image and back, on one CPU core.
 
-Every point goes to the cell of its direction; the nearest one within the sensor's range limits wins, the
-first in the file among equals. A return goes back to the centre of its cell, so that an image survives
-the way to points and back in every cell.
+Each cell shows the nearest point in its direction within the sensor's range limits, and the first in the file among
+points at equal range. ``unproject`` puts a return at the centre of its cell, so that unprojecting and projecting an
+image again gives the same image.
 """
 
 from collections.abc import Iterable
@@ -71,12 +71,12 @@ def locate(points: NDArray[np.float32], sensor: Sensor) -> Cells:
 def nearest_in(
     cell: NDArray[np.int32], distance: NDArray[np.float32], sensor: Sensor
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """(H, W) range and (H, W) point of the nearest of the points in each cell, the first among equals.
+    """Range (H, W) and index (H, W) of the nearest point in each cell; of points at equal range, the first.
 
     Args:
         cell: (N,) row * W + column, -1 = none.
         distance: (N,) metres.
-        sensor: whose grid.
+        sensor: the sensor that defines the grid.
     """
     image, index = np.empty(sensor.shape, np.float32), np.empty(sensor.shape, np.int32)
     nearest_in_cells(cell, distance, image.reshape(-1), index.reshape(-1))
@@ -117,7 +117,7 @@ def project(scan: Scan, sensor: Sensor | None = None, channels: Iterable[str] | 
 
 
 def carry(scan: Scan, index: NDArray[np.int32], channels: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
-    """The fields of a scan on the cells that show its points.
+    """Transfer the fields of a scan from its points to the cells that show them.
 
     Args:
         scan: N points.
@@ -125,7 +125,10 @@ def carry(scan: Scan, index: NDArray[np.int32], channels: Iterable[str] | None =
         channels: names of the fields; by default all that the scan has.
 
     Returns:
-        {name: (H, W)} with 0 (``label``: 255 = ignore) where there is no return.
+        {name: (H, W)} with 0 (``label``: 255 = ignore) in cells without a return.
+
+    Raises:
+        ConfigError: on a field that the scan does not have.
     """
     fields = scan.fields()
     names = list(fields) if channels is None else list(channels)

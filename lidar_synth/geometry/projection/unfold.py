@@ -1,8 +1,8 @@
-"""Scan unfolding: rows from the order in which the laser rings were recorded, not from elevation.
+"""Scan unfolding: one row per laser, from the order of the points instead of their elevation.
 
-KITTI and KITTI-360 store a scan ring by ring from the top, each ring counter-clockwise from straight
-ahead; rings.py finds where each begins. Elevation would merge rings where the lasers are closer than the
-rows (HDL-64E's upper half) and leave rows empty where they are not.
+KITTI and KITTI-360 store a scan ring by ring from the top, each ring counter-clockwise from straight ahead; rings.py
+finds where each ring starts. Projection by elevation would merge rings where the lasers are closer together than the
+rows (the upper half of an HDL-64E), and leave rows empty where they are further apart.
 """
 
 from typing import Literal
@@ -17,12 +17,12 @@ from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 Anchor = Literal["elevation", "last"]
-"""How rings find their rows: each on the beam of its elevation, or, as the public code of R2Flow does,
-counted from the last ring up (which displaces a scan whose lower rings are cut off)."""
+"""How rings are assigned to rows: "elevation" uses the nearest laser beams; "last" counts up from the last ring, as
+the public code of R2Flow does (this shifts a scan whose lower rings are cut off)."""
 
 
 def _rows_by_elevation(elevations: NDArray[np.float64], beams: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The rows, one per ring and rising, whose beams are nearest to the rings' elevations in sum."""
+    """(R,) increasing rows of R rings that minimise the sum of distances between elevations and beams, radians."""
     distance = np.abs(elevations[:, None] - beams[None].astype(np.float64))
     total = np.full((len(elevations) + 1, len(beams) + 1), np.inf)
     total[0] = 0
@@ -31,7 +31,7 @@ def _rows_by_elevation(elevations: NDArray[np.float64], beams: NDArray[np.float3
     rows = np.empty(len(elevations), np.int64)
     end = len(beams)
     for ring in reversed(range(len(elevations))):
-        end = int(np.argmin(total[ring + 1, : end + 1])) - 1  # the first of equals: the row that was taken
+        end = int(np.argmin(total[ring + 1, : end + 1])) - 1  # the first minimum is the row that was assigned
         rows[ring] = end
     return rows
 
@@ -74,9 +74,9 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
     return RangeImage(image, lasers, carry(scan, index))
 
 
-def _not_in_rings(scan: Scan, found: str) -> DataError:
+def _not_in_rings(scan: Scan, reason: str) -> DataError:
     return DataError(
-        f"scan {scan.id!r}: {found}",
+        f"scan {scan.id!r}: {reason}",
         "points ring by ring, as KITTI stores them",
         "Use project() for a scan in another order, or set scan.ring.",
     )
@@ -85,7 +85,7 @@ def _not_in_rings(scan: Scan, found: str) -> DataError:
 def _rows_of_rings(
     scan: Scan, ring: NDArray[np.int16], distance: NDArray[np.float32], lasers: Sensor, anchor: Anchor
 ) -> NDArray[np.int64]:
-    """The row of each ring."""
+    """(R,) the row of each ring."""
     bounds = np.flatnonzero(np.diff(ring)) + 1
     count = len(bounds) + 1
     if anchor == "last":
