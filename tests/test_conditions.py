@@ -22,9 +22,10 @@ from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.models import NETWORKS, build_network
-from lidar_synth.models.encoders.camera import SightEncoder
-from lidar_synth.models.encoders.maps import CLIP_VARIABLE, CLIP_WIDTH, cut, frozen_clip
+from lidar_synth.models import NETWORKS, build_network, encoders_of
+from lidar_synth.models.encoders.calibrated_camera import SightEncoder
+from lidar_synth.models.encoders.camera_views import split_views
+from lidar_synth.models.encoders.clip_views import CLIP_VARIABLE, CLIP_WIDTH, frozen_clip
 from lidar_synth.town.camera import CAMERA
 from lidar_synth.train import Batches, Conditioning, Other, cache_scans
 
@@ -63,7 +64,7 @@ def test_every_condition_reads_scans_and_its_encoders_take_what_it_reads(name: s
     encoded = encoder(given)
     assert encoded.shape == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5)}[name]
     assert (blank(name, given) == condition.blank).all()
-    assert set(condition.encoders) <= set(NETWORKS)
+    assert set(encoders_of(name)) <= set(NETWORKS)
 
 
 def test_the_label_map_of_a_scan_of_another_sensor_lies_on_the_models_grid() -> None:
@@ -96,7 +97,7 @@ def test_all_train_ids_are_told_apart() -> None:
 
 def test_an_image_is_cut_into_views_from_left_to_right() -> None:
     image = torch.arange(2 * 3 * 4 * 12).reshape(2, 3, 4, 12)
-    views = cut(image, 3)
+    views = split_views(image, 3)
     assert torch.equal(views[4], image[1, :, :, 4:8])
     left = one_view(image, 3)
     assert torch.equal(left[..., 4:8], image[..., 4:8])

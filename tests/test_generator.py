@@ -35,7 +35,7 @@ from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import AUTOENCODERS, build_network
+from lidar_synth.models import NETWORKS, build_network
 from lidar_synth.noise import gaussian
 from lidar_synth.town import Town
 
@@ -232,8 +232,8 @@ def write_latent(path: Path, architecture: str) -> Path:
     given = {"resolution": SENSOR.shape, "channels": 7}
     codec = NetworkSpec(architecture, given | CODECS[architecture])
     torch.manual_seed(0)
-    looks = {"angles": torch.from_numpy(SENSOR.ray_angles())} if architecture == "autoencoder" else {}
-    autoencoder = build_network(architecture, codec.arguments | looks)
+    needed = {"angles": torch.from_numpy(SENSOR.ray_angles())} if NETWORKS[architecture].needs_ray_angles else {}
+    autoencoder = build_network(architecture, codec.arguments | needed)
     channels, *resolution = autoencoder.latent_shape
     arguments = {"resolution": resolution, "channels": channels, "width": 16, "time_width": 16, "depths": (1,),
                  "heads": (2,), "patch": (1, 1), "window": (1, 1)}  # fmt: skip
@@ -247,7 +247,7 @@ def write_latent(path: Path, architecture: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("architecture", AUTOENCODERS)
+@pytest.mark.parametrize("architecture", [name for name, cls in NETWORKS.items() if cls.is_autoencoder])
 def test_compile_compiles_the_decoder_too(architecture: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a backend that counts graphs and convolutions; the default one would need a C++ compiler."""
     graphs: list[int] = []

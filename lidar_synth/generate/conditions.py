@@ -34,14 +34,12 @@ class Condition(Protocol):
     Attributes:
         name: in ``CONDITIONS``, in a checkpoint's header and in a user's dictionary.
         field: of ``train.ImageCache`` that holds it.
-        encoders: architectures that take it, the default first.
         turns: whether it turns with the scan about the vertical.
         blank: its value where nothing is known.
     """
 
     name: str
     field: str
-    encoders: tuple[str, ...]
     turns: bool
     blank: int
 
@@ -63,7 +61,6 @@ class SemanticMap:
 
     name = "semantic"
     field = "label"
-    encoders: tuple[str, ...] = ("semantic_map",)
     turns = True
     blank = IGNORE
 
@@ -102,7 +99,6 @@ class CameraImage:
 
     name = "camera"
     field = "camera"
-    encoders: tuple[str, ...] = ("views", "clip_views", "sight")
     turns = False
     blank = 0
 

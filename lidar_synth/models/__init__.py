@@ -1,7 +1,8 @@
-"""Networks, one file per architecture; they know tensors and, as plain angles, rays, but no sensors.
+"""Networks, one file per architecture. They work on tensors and ray angles and depend on no sensor class.
 
-To add one: write its file, enter its class in ``NETWORKS``. Its arguments have to be plain values, since they
-stand in the checkpoint.
+To add one: write its file with a subclass of ``Network`` (or ``Encoder``), and enter the class in ``NETWORKS``. Its
+arguments have to be plain values, since a checkpoint stores them; its class attributes state what a training run
+provides beyond them.
 """
 
 from collections.abc import Mapping
@@ -11,16 +12,19 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.models.encoders.camera import SightEncoder
-from lidar_synth.models.encoders.maps import ClipViewEncoder, SemanticMapEncoder, ViewEncoder
+from lidar_synth.models.encoders.calibrated_camera import SightEncoder
+from lidar_synth.models.encoders.camera_views import ViewEncoder
+from lidar_synth.models.encoders.clip_views import ClipViewEncoder
+from lidar_synth.models.encoders.label_maps import SemanticMapEncoder
 from lidar_synth.models.hdit.denoiser import Denoiser
 from lidar_synth.models.hdit.hdit import HDiT
 from lidar_synth.models.lidm.diffusion import DiffusionUNet
 from lidar_synth.models.lidm.unet import UNet
 from lidar_synth.models.lidm.vqvae import VQVAE
+from lidar_synth.models.network import Encoder, Network
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
 
-NETWORKS: dict[str, type[nn.Module]] = {
+NETWORKS: dict[str, type[Network]] = {
     "hdit": HDiT,
     "denoiser": Denoiser,
     "unet": UNet,
@@ -32,26 +36,38 @@ NETWORKS: dict[str, type[nn.Module]] = {
     "clip_views": ClipViewEncoder,
     "sight": SightEncoder,
 }
-"""Architectures by the name that a checkpoint holds: velocity networks, autoencoders, encoders of conditions."""
-
-AUTOENCODERS = ("vqvae", "autoencoder")
-"""Those of them that make latents of range images."""
+"""Architectures by the name that a checkpoint stores: velocity networks, autoencoders, encoders of conditions."""
 
 
-def build_network(architecture: str, arguments: dict[str, Any]) -> nn.Module:
-    """A network with fresh weights; the one place where a name and arguments become a network.
-
-    Args:
-        architecture: a name of ``NETWORKS``.
-        arguments: of its class.
+def network_class(architecture: str) -> type[Network]:
+    """The class of an architecture.
 
     Raises:
-        ConfigError: on an unknown name or argument, or values that do not fit.
+        ConfigError: on a name that is not in ``NETWORKS``.
     """
     if architecture not in NETWORKS:
         raise ConfigError(f"architecture {architecture!r}", f"one of {', '.join(NETWORKS)}")
+    return NETWORKS[architecture]
+
+
+def encoders_of(condition: str) -> tuple[str, ...]:
+    """The architectures that encode a kind of condition, in the order of ``NETWORKS``; the first is the default."""
+    return tuple(k for k, cls in NETWORKS.items() if issubclass(cls, Encoder) and cls.condition == condition)
+
+
+def build_network(architecture: str, arguments: dict[str, Any]) -> Network:
+    """Build a network with fresh weights from its name and arguments.
+
+    Args:
+        architecture: a key of ``NETWORKS``.
+        arguments: keyword arguments of its class.
+
+    Raises:
+        ConfigError: on an unknown name or argument, or on values that do not fit together.
+    """
+    cls = network_class(architecture)
     try:
-        return NETWORKS[architecture](**arguments)
+        return cls(**arguments)
     except ConfigError:
         raise
     except (TypeError, ValueError, ArithmeticError, RuntimeError) as error:

@@ -1,1 +1,1 @@
-"""Encoders of conditions: label maps and camera images."""
+"""Encoders of conditions, each of which becomes maps beside the state or tokens that the state attends to."""

@@ -15,6 +15,7 @@ tokens are attended to by those of the coarsest level (``context_channels``). Bo
 """
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +26,7 @@ from lidar_synth.models.attention import Grid, NeighbourhoodAttention
 from lidar_synth.models.convolution import check_condition
 from lidar_synth.models.hdit.transformer import Block, Expand, Level, Merge, from_patches, to_patches
 from lidar_synth.models.layers import RMSNorm
+from lidar_synth.models.network import Network
 from lidar_synth.models.positions import (
     LEARNED,
     POSITIONS,
@@ -36,7 +38,7 @@ from lidar_synth.models.positions import (
 )
 
 
-class HDiT(nn.Module):
+class HDiT(Network):
     """Velocity network v(y, t, c) in the paper's convention: t = 1 noise, t = 0 data, v = y1 - y0.
 
     All arguments but ``angles`` are plain values, which stand in the checkpoint. It computes in the dtype of
@@ -62,6 +64,8 @@ class HDiT(nn.Module):
     Raises:
         ConfigError: on values that do not fit together.
     """
+
+    needs_ray_angles: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -34,6 +34,7 @@ from lidar_synth.models.convolution import (
     run,
     unfold,
 )
+from lidar_synth.models.network import Network
 
 TIME_SCALE = 1000.0
 """Times in [0, 1] become the peers' numbers of steps before their sines are taken."""
@@ -51,7 +52,7 @@ class _Row(NamedTuple):
     resample: bool = False
 
 
-class UNet(nn.Module):
+class UNet(Network):
     """Velocity network v(y, t, c) in the paper's convention: t = 1 noise, t = 0 data, v = y1 - y0.
 
     All arguments are plain values, which stand in the checkpoint. It computes in the dtype of its weights (or of

@@ -10,7 +10,7 @@ The first and the last channels are those of the image, whatever they hold: labe
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -33,6 +33,7 @@ from lidar_synth.models.convolution import (
     run,
     unfold,
 )
+from lidar_synth.models.network import Network
 
 CURVE = (1, 4)
 """Kernel of the decoder's levels whose rows are those of the image."""
@@ -69,7 +70,7 @@ class Encoding(NamedTuple):
     code_gap: Tensor
 
 
-class VQVAE(nn.Module):
+class VQVAE(Network):
     """Autoencoder of range images; the defaults are LiDM's, which takes 64 x 1024 to 8 x 16 x 128.
 
     Args:
@@ -92,6 +93,8 @@ class VQVAE(nn.Module):
     Raises:
         ConfigError: on values that do not fit together.
     """
+
+    is_autoencoder: ClassVar[bool] = True
 
     shift: Tensor
     scale: Tensor

@@ -1,6 +1,7 @@
 """An encoder that knows where the camera looks: every cell of the state gets the image's features along its rays."""
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -8,10 +9,11 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.models.convolution import check_shape, pair, reduced
+from lidar_synth.models.network import Encoder
 from lidar_synth.models.positions import RayAngles
 
 
-class SightEncoder(nn.Module):
+class SightEncoder(Encoder):
     """A camera image as maps on the grid of the state, by the camera's calibration.
 
     Convolutions make features of the image; a cell takes those of the pixel that sees a point ``distance`` metres away
@@ -37,7 +39,10 @@ class SightEncoder(nn.Module):
         ConfigError: on values that do not fit together.
     """
 
-    argument = "condition_channels"
+    derived_arguments: ClassVar[tuple[str, ...]] = ("target", "image")
+    needs_ray_angles: ClassVar[bool] = True
+    condition: ClassVar[str] = "camera"
+    argument: ClassVar[str] = "condition_channels"
 
     def __init__(
         self,
