@@ -124,7 +124,7 @@ def test_every_cell_looks_where_the_calibration_says() -> None:
     points = unproject(RangeImage(np.full(TOWN.shape, 15, np.float32), TOWN, {})).points
     pixels, depth = CAMERA.pixels(points)
     inside = (depth > 1) & (pixels > -0.5).all(1) & (pixels < np.array([1407.5, 375.5])).all(1)
-    places = sight(distance=15.0).places().reshape(-1, 2).numpy()
+    places = sight(distance=15.0).pixel_coordinates().reshape(-1, 2).numpy()
     assert np.array_equal((np.abs(places) <= 1).all(1), inside) and 0.1 < inside.mean() < 0.3
     assert np.allclose(((places + 1) * [1408, 376] - 1)[inside] / 2, pixels[inside], atol=0.01)
 
@@ -135,7 +135,7 @@ def test_a_cell_sees_its_own_part_of_the_image_only() -> None:
     before = encoder(image)
     image[..., :8] = 255  # the left eighth
     changed = (encoder(image) != before).any(1)[0]
-    place, seen = encoder.places()[..., 0], (encoder.places().abs() <= 1).all(-1)
+    place, seen = encoder.pixel_coordinates()[..., 0], (encoder.pixel_coordinates().abs() <= 1).all(-1)
     assert before.shape == (1, 5, *TOWN.shape)
     assert changed[seen & (place < -0.8)].all() and not changed[place > -0.4].any()
     assert torch.equal(before[0, -1] == 1, seen) and not before[0, :, ~seen].any()

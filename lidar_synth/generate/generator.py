@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
+from typing_extensions import Unpack
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
@@ -38,6 +39,21 @@ SHIPPED = {
     "town-semantic": "36d110505d2108346c82a70092b1f112474d105c34e577e546d9ad36cd11e993",
 }
 """Hashes of the shipped checkpoints whose format is the one that has no checksum of its header."""
+
+
+class SamplingOptions(TypedDict, total=False):
+    """Options of ``Generator.range_images``, ``scans`` and ``samples``.
+
+    Attributes:
+        steps: number of steps of a uniform time grid; None, the default, uses the checkpoint's own grid.
+        solver: a key of ``SOLVERS``, by default "euler".
+        guidance: scale of classifier-free guidance; 1, the default, is no guidance. A larger scale follows the
+            condition more closely; any scale but 1 doubles the computation.
+    """
+
+    steps: int | None
+    solver: str
+    guidance: float
 
 
 @dataclass(frozen=True)
@@ -102,13 +118,7 @@ class Generator:
         return next(self.network.parameters()).device
 
     def range_images(
-        self,
-        seed: int,
-        indices: Sequence[int],
-        condition: Any = None,
-        steps: int | None = None,
-        solver: str = "euler",
-        guidance: float = 1.0,
+        self, seed: int, indices: Sequence[int], condition: Any = None, **options: Unpack[SamplingOptions]
     ) -> list[RangeImage]:
         """Generate range images.
 
@@ -120,10 +130,7 @@ class Generator:
                 sensor; a camera image is (3, h, w) uint8. A real ``Scan``, or a list of B, provides the condition
                 itself: its projected labels, or the image at its ``image_path``. In a dictionary of conditions, the
                 one with the condition's name is used. See ``conditions``.
-            steps: number of steps of a uniform time grid; by default the checkpoint's own grid.
-            solver: a name of ``SOLVERS``.
-            guidance: scale of classifier-free guidance, 1 = none. A larger scale follows the condition more closely;
-                any scale but 1 takes twice the work.
+            options: ``steps``, ``solver`` and ``guidance``; see ``SamplingOptions``.
 
         Returns:
             B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its ``confidence`` in
@@ -138,7 +145,7 @@ class Generator:
         """
         given = self._condition(condition, len(indices))
         images = []
-        for tensor in self._solve(seed, indices, given, steps, solver, guidance):
+        for tensor in self.samples(seed, indices, given, **options):
             images += self.tensors.to_images(tensor, self.sensor)
         if self.condition == "semantic" and "label" in self.fields - set(self.header.channels) and given is not None:
             for image, labels in zip(images, given.cpu().numpy(), strict=True):
@@ -147,20 +154,14 @@ class Generator:
         return images
 
     def scans(
-        self,
-        seed: int,
-        indices: Sequence[int],
-        condition: Any = None,
-        steps: int | None = None,
-        solver: str = "euler",
-        guidance: float = 1.0,
+        self, seed: int, indices: Sequence[int], condition: Any = None, **options: Unpack[SamplingOptions]
     ) -> list[Scan]:
         """Generate scans: the returns of ``range_images`` through the centres of their cells.
 
         Arguments and errors are those of ``range_images``. The ``id`` of a scan is ``<checkpoint>/<seed>/<index>``,
         and its ``domain`` is ``SYNTHETIC``.
         """
-        images = self.range_images(seed, indices, condition, steps, solver, guidance)
+        images = self.range_images(seed, indices, condition, **options)
         return [
             replace(unproject(image), id=f"{self.name}/{seed}/{index}", domain=SYNTHETIC)
             for index, image in zip(indices, images, strict=True)
@@ -171,32 +172,26 @@ class Generator:
         seed: int,
         indices: Sequence[int],
         condition: Any = None,
+        *,
         steps: int | None = None,
         solver: str = "euler",
         guidance: float = 1.0,
     ) -> Iterator[Tensor]:
-        """Yield the normalised tensors behind ``range_images``: (b, C, H, W) each, with b at most ``batch``."""
-        return self._solve(seed, indices, self._condition(condition, len(indices)), steps, solver, guidance)
+        """Yield the normalised tensors behind ``range_images``: (b, C, H, W) each, with b at most ``batch``.
 
-    def _solve(
-        self,
-        seed: int,
-        indices: Sequence[int],
-        condition: Tensor | None,
-        steps: int | None,
-        solver: str,
-        guidance: float,
-    ) -> Iterator[Tensor]:
+        Arguments and errors are those of ``range_images``.
+        """
         _refuse_worker(self.device)
+        given = self._condition(condition, len(indices))
         codec = self.codec
-        drawn = (codec.draws, *self.sensor.shape)
+        noise_shape = (codec.draws, *self.sensor.shape)
         grid = self.header.time_grid if steps is None else uniform_grid(steps)
         for first in range(0, len(indices), self.batch):
             part = slice(first, first + self.batch)
             noise = gaussian(seed, indices[part], codec.shape, self.device)
-            uniform_noise = uniform(seed, indices[part], drawn, self.device) if codec.draws else None
+            uniform_noise = uniform(seed, indices[part], noise_shape, self.device) if codec.draws else None
             with torch.inference_mode():
-                velocity, cond = self._flow(None if condition is None else condition[part], guidance)
+                velocity, cond = self._flow(None if given is None else given[part], guidance)
                 yield codec.decode(solve(velocity, noise, grid, solver, cond), uniform_noise)
 
     def _flow(self, condition: Tensor | None, guidance: float) -> tuple[Velocity, Tensor | None]:

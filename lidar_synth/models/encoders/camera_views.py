@@ -11,12 +11,12 @@ from lidar_synth.models.network import Encoder
 
 
 class ViewEncoder(Encoder):
-    """A camera image, cut into views side by side, as tokens; small, and trained with the velocity network.
+    """Encodes a camera image, cut into views side by side, as tokens; a small network for training from scratch.
 
     Args:
-        resolution: h, w of the image; w is a multiple of 16 times the views, h of 16.
-        views: how many side by side.
-        channels: of a token.
+        resolution: h, w of the image; with four convolutions, h is a multiple of 16 and w of 16 times ``views``.
+        views: number of views.
+        channels: channels of a token.
         widths: channels of the convolutions, each of which halves rows and columns.
     """
 
@@ -59,6 +59,6 @@ class ViewEncoder(Encoder):
 
 
 def split_views(image: Tensor, views: int) -> Tensor:
-    """(B, 3, h, w) to (B views, 3, h, w / views): strips side by side, left to right."""
+    """(B, 3, h, w) to (B views, 3, h, w / views), views from left to right."""
     batch, channels, rows, columns = image.shape
     return image.reshape(batch, channels, rows, views, columns // views).movedim(3, 1).flatten(0, 1)

@@ -20,12 +20,12 @@ _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.2613
 
 
 class ClipViewEncoder(Encoder):
-    """A camera image as one token per view, by the frozen vision tower of CLIP ViT-L/14, as LiDM has it; unlike there,
-    the embedding of the view and the projection are trained.
+    """Encodes a camera image as one token per view with the frozen vision tower of CLIP ViT-L/14, as in LiDM. Unlike
+    in LiDM, the view embedding and the projection are trained.
 
     Args:
-        views: how many side by side; each is resized to 224 x 224.
-        channels: of a token.
+        views: number of views side by side, each of 224 x 224 pixels.
+        channels: channels of a token.
     """
 
     condition: ClassVar[str] = "camera"
@@ -43,7 +43,7 @@ class ClipViewEncoder(Encoder):
 
         Raises:
             DataError: on another size.
-            FileError, LibraryError: where CLIP or its weights are not there.
+            FileError, LibraryError: if CLIP or its weights are missing.
         """
         check_shape(image, (3, *self.resolution), "a camera image")
         with torch.no_grad():
@@ -56,7 +56,7 @@ class ClipViewEncoder(Encoder):
 
 
 class _Tower(nn.Module):
-    """(B, 3, 224, 224) normalised images to (B, 768), whichever library holds the weights."""
+    """(B, 3, 224, 224) normalised images to (B, 768), with the weights of either library."""
 
     def __init__(self, model: Any, transformers: bool) -> None:
         super().__init__()
@@ -68,39 +68,39 @@ class _Tower(nn.Module):
 
 
 @lru_cache(maxsize=1)
-def frozen_clip(place: str, device: str) -> nn.Module:
-    """CLIP's vision tower from files that are on this machine; nothing is ever downloaded.
+def frozen_clip(location: str, device: str) -> nn.Module:
+    """Load CLIP's vision tower from local files; nothing is ever downloaded.
 
     Args:
-        place: a folder in the format of transformers, or a file of open_clip.
-        device: where it shall be.
+        location: a folder in the format of transformers, or a ``.safetensors`` file of open_clip.
+        device: the device of the weights.
 
     Raises:
-        FileError: where there is nothing.
-        LibraryError: where the library that reads it is not installed.
+        FileError: if the files are missing or cannot be read.
+        LibraryError: if the library that reads them is not installed.
     """
-    path = Path(place)
+    path = Path(location)
     hint = (
         f"Save CLIP ViT-L/14 as a folder (transformers: openai/clip-vit-large-patch14) or as open_clip's .safetensors "
         f"file, and set {CLIP_VARIABLE} to it; or train with the encoder 'views', which needs neither."
     )
-    if not place or not path.exists():
-        given = f"{CLIP_VARIABLE}={place}" if place else f"{CLIP_VARIABLE} is not set"
+    if not location or not path.exists():
+        given = f"{CLIP_VARIABLE}={location}" if location else f"{CLIP_VARIABLE} is not set"
         raise FileError(f"CLIP's weights: {given}", "an existing folder or file", hint)
     try:
         if path.is_dir():
             from transformers import CLIPVisionModelWithProjection
 
-            model = CLIPVisionModelWithProjection.from_pretrained(place, local_files_only=True, use_safetensors=True)
+            model = CLIPVisionModelWithProjection.from_pretrained(location, local_files_only=True, use_safetensors=True)
         elif path.suffix == ".safetensors":
             import open_clip
 
-            model = open_clip.create_model("ViT-L-14-quickgelu", pretrained=place)
+            model = open_clip.create_model("ViT-L-14-quickgelu", pretrained=location)
         else:
             raise FileError(f"CLIP's weights in {path}", "a folder, or a .safetensors file", hint)
     except ImportError as error:
         library = "transformers" if path.is_dir() else "open_clip_torch"
         raise LibraryError(f"{library} is not installed", library, f"pip install {library}") from error
     except OSError as error:
-        raise FileError(f"CLIP's weights in {path} cannot be read ({error})", "a whole copy", hint) from error
+        raise FileError(f"CLIP's weights in {path} cannot be read ({error})", "a complete copy", hint) from error
     return _Tower(model, path.is_dir()).to(device).eval().requires_grad_(False)

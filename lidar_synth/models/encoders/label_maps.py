@@ -17,18 +17,18 @@ METHODS = ("rescale", "patches")
 
 
 class SemanticMapEncoder(Encoder):
-    """A label map as maps on the grid of the state.
+    """Encodes a label map as feature maps on the grid of the state.
 
     Args:
         resolution: H, W of the label map.
         target: h, w of the state; they divide H and W, for "rescale" into powers of two.
         channels: of the maps.
-        method: one of ``METHODS``. "rescale" is LiDM's: the one-hot classes are halved bilinearly, the columns at
-            every halving, the rows at the last ones, and mixed by a 1 x 1 convolution. It looks at a few cells of
-            each patch only; "patches" looks at all.
+        method: one of ``METHODS``. "rescale" is LiDM's: the one-hot classes are halved bilinearly (the columns at
+            every step, the rows at the last steps) and mixed by a 1 x 1 convolution. It uses only a few cells of each
+            patch; "patches" uses all of them.
 
     Raises:
-        ConfigError: on sizes that cannot be reached, or an unknown method.
+        ConfigError: on a label map whose size is not a multiple of the state's, or an unknown method.
     """
 
     derived_arguments: ClassVar[tuple[str, ...]] = ("resolution", "target")
@@ -61,8 +61,8 @@ class SemanticMapEncoder(Encoder):
             DataError: on another size.
         """
         check_shape(labels, self.resolution, "a label map")
-        code = torch.where(labels == IGNORE, len(NAMES), labels.long())
-        x = F.one_hot(code, len(NAMES) + 1).movedim(-1, 1).to(self.mix.weight.dtype)  # channels last in memory
+        codes = torch.where(labels == IGNORE, len(NAMES), labels.long())
+        x = F.one_hot(codes, len(NAMES) + 1).movedim(-1, 1).to(self.mix.weight.dtype)  # channels last in memory
         if self.method == "rescale":
             for rows, columns in self.halvings:
                 x = F.interpolate(x, scale_factor=(1 / rows, 1 / columns), mode="bilinear", align_corners=True)
