@@ -47,9 +47,8 @@ class NeighbourhoodAttention(nn.Module):
             raise ConfigError(f"window {window} on a grid of {grid} tokens", "odd, and within the grid")
         tile = (_divisor(grid[0], TILE[0]), _divisor(grid[1], TILE[1]))
         span = (tile[0] + window[0] - 1, tile[1] + window[1] - 1)
-        numbers = torch.arange(grid[0] * grid[1], device="cpu").view(
-            grid
-        )  # a real tensor, even under the "meta" device
+        # a real tensor, even under the "meta" device
+        numbers = torch.arange(grid[0] * grid[1], device="cpu").view(grid)
         tokens = _tiles(numbers, tile, tile)
         buffers = {
             "tokens": tokens,  # (tiles, n) tokens whose queries are in each tile; each token once
