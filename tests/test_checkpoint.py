@@ -150,7 +150,7 @@ def test_a_truncated_file(saved: Path, share: float) -> None:
     content = saved.read_bytes()
     saved.write_bytes(content[: int(share * len(content))])
     for read in (load_checkpoint, read_header):
-        with pytest.raises(DataError, match=r"model.safetensors is cut, damaged or no .safetensors file"):
+        with pytest.raises(DataError, match=r"model.safetensors is truncated, damaged or no .safetensors file"):
             read(saved)
 
 
@@ -158,7 +158,7 @@ def test_a_flipped_bit_in_a_weight(saved: Path) -> None:
     content = bytearray(saved.read_bytes())
     content[-1000] ^= 1
     saved.write_bytes(content)
-    with pytest.raises(DataError, match="do not have the sum in the header"):
+    with pytest.raises(DataError, match="do not match their checksum in the header"):
         load_checkpoint(saved)
 
 
@@ -186,7 +186,7 @@ def test_a_flipped_bit_in_a_weight(saved: Path) -> None:
         ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"width": 32}}}}, "other shapes"),
         ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"depths": [1, 2]}}}}, "missing"),
         ({"networks": [1]}, "header that does not fit"),
-        ({"weights": None}, "do not have the sum"),
+        ({"weights": None}, "do not match their checksum"),
     ],
     ids=str,
 )
@@ -228,7 +228,7 @@ def test_another_time_or_range_limit_is_noticed(saved: Path, tmp_path: Path, old
     assert old in content
     saved.write_bytes(content.replace(old, new))
     for read in (load_checkpoint, read_header):
-        with pytest.raises(DataError, match="the header does not have its checksum"):
+        with pytest.raises(DataError, match="a header that does not match its checksum"):
             read(saved)
 
 
@@ -252,7 +252,7 @@ def test_a_deeply_nested_header(saved: Path) -> None:
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta", "cpu:1"])
 def test_a_device_that_is_not_there(saved: Path, device: str) -> None:
-    with pytest.raises(ConfigError, match=rf"device '{device}'; expected one that torch finds here: cpu"):
+    with pytest.raises(ConfigError, match=rf"device '{device}'; expected an available one: cpu"):
         load_checkpoint(saved, device)
 
 

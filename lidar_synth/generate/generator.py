@@ -1,7 +1,7 @@
-"""From a checkpoint to scans: geometry, network and flow together.
+"""Generation of scans from a checkpoint.
 
-A scan is a function of (checkpoint, condition, time grid and solver, seed, index). The other scans of its batch, the
-order and the device change float rounding only.
+A scan is a function of (checkpoint, condition, time grid and solver, seed, index). The other scans of its batch,
+their order and the device change only float rounding.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -31,14 +31,14 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.noise import gaussian, uniform
 
 BATCH = {"cpu": 1, "cuda": 16}
-"""Scans at a time, by device: what fits a CPU's cache, what fills a GPU."""
+"""Default batch size by device: few enough for a CPU's cache, enough to fill a GPU."""
 
 SHIPPED = {
     "town": "2d8d08119dc4a1c0002040ff47e66dea71bf87c7ae82d667c0ccfff15778202b",
     "town-camera": "5d96b6af7d5479f45e8ece7120bc5cf0493e639d783c0725f5f87581a6a1dc78",
     "town-semantic": "36d110505d2108346c82a70092b1f112474d105c34e577e546d9ad36cd11e993",
 }
-"""Hashes of the shipped checkpoints whose format is the one that has no checksum of its header."""
+"""Hashes of the shipped checkpoints, whose older format has no checksum of the header."""
 
 
 class SamplingOptions(TypedDict, total=False):
@@ -195,22 +195,22 @@ class Generator:
                 yield codec.decode(solve(velocity, noise, grid, solver, cond), uniform_noise)
 
     def _flow(self, condition: Tensor | None, guidance: float) -> tuple[Velocity, Tensor | None]:
-        """The flow to solve and what to give it: a condition is encoded once, not at every step."""
+        """The velocity to solve, and its encoded condition: a condition is encoded once, not at every step."""
         options = self.header.conditioning.get(str(self.condition), {})
         if guidance != 1 and (condition is None or not options.get("dropout")):
             raise ConfigError(
                 f"guidance {guidance} for {self.name!r}",
-                "1: its training never met a blank condition, which guidance starts from",
+                "1: it was trained without blank conditions, which guidance needs",
                 "Train it with condition.dropout=0.1.",
             )
         if condition is None or not isinstance(self.network, Conditioned):
             return self.network, condition
         encode: Callable[[Tensor], Tensor] = self.network.encoder
-        nothing = encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
-        return guided(self.network.velocity, guidance, nothing), encode(condition)
+        unconditional = encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
+        return guided(self.network.velocity, guidance, unconditional), encode(condition)
 
     def _condition(self, given: Any, count: int) -> Tensor | None:
-        """(B, ...) on the device, as the network takes it."""
+        """The conditions (B, ...) as the network takes them, on its device."""
         if given is None and self.condition is None:
             return None
         if self.condition is None:
@@ -218,7 +218,7 @@ class Generator:
         if given is None:
             raise DataError(f"no condition for {self.name!r}", f"condition=... ({self.condition}), or real scans")
         if not isinstance(self.network, Conditioned):
-            raise ConfigError(f"{self.name!r} without the encoder of its condition", "a whole checkpoint")
+            raise ConfigError(f"{self.name!r} without the encoder of its condition", "a checkpoint with all its parts")
         options = self.header.conditioning[self.condition]
         shape = CONDITIONS[self.condition].shape(self.network.encoder)
         return batch_of(self.condition, given, count, self.sensor, shape, options).to(self.device)
@@ -236,14 +236,15 @@ def load_generator(
 
     Args:
         model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
-        device: "cpu", "cuda" or "cuda:1"; a device of ``available_devices``.
-        dtype: what the network computes in; states stay float32.
-        compile: the flow's network and the decoder of a latent model, by ``torch.compile``; the first scan takes long.
-        batch: scans at a time; by default what suits the device.
+        device: an available device such as "cpu", "cuda" or "cuda:1"; see ``available_devices``.
+        dtype: dtype of the network's computations; states stay float32.
+        compile: whether to compile the velocity network and the decoder of a latent model with ``torch.compile``; the
+            first scan then takes long.
+        batch: number of scans computed at a time; by default it depends on the device.
 
     Raises:
-        ConfigError: on an unknown name, a device that is not there, or CUDA in a DataLoader worker.
-        FileError, DataError: where the checkpoint cannot be read, or a shipped one is damaged.
+        ConfigError: on an unknown name, an unavailable device, or CUDA in a DataLoader worker.
+        FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
 
     Example:
         >>> from lidar_synth import load_generator
@@ -268,10 +269,10 @@ def load_generator(
 
 
 def _compile(networks: dict[str, nn.Module]) -> None:
-    """Compile, in place, what runs for every scan: the velocity and the decoder."""
+    """Compile the velocity network and the decoder, in place."""
     networks[VELOCITY].compile()
     if (autoencoder := networks.get(CODEC)) is not None:
-        # ``Module.compile`` is for what ``forward`` does; a codec is asked to decode.
+        # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``.
         codec: Any = autoencoder
         codec.decode = torch.compile(codec.decode)
 
@@ -287,12 +288,14 @@ def find_model(model: str | Path) -> Path:
 
     Raises:
         ConfigError: on an unknown name.
-        FileError, DataError: where the shipped file cannot be read, or is not the one that was shipped.
+        FileError, DataError: if the shipped file cannot be read or is damaged.
     """
     shipped = shipped_models()
     if (name := str(model)) in shipped:
         if not has_checksum(shipped[name]) and read_header(shipped[name])[1] != SHIPPED.get(name):
-            raise DataError(f"{shipped[name]} is not the {name!r} of this version", "a whole file", "Install it again.")
+            raise DataError(
+                f"{shipped[name]} is not the {name!r} of this version", "an intact file", "Install it again."
+            )
         return shipped[name]
     path = Path(model)
     if path.suffix != ".safetensors":
@@ -302,7 +305,7 @@ def find_model(model: str | Path) -> Path:
 
 
 def _refuse_worker(device: torch.device | str) -> None:
-    """No CUDA in DataLoader workers: a forked process cannot use it, a spawned one pays for a context each."""
+    """Refuse CUDA in DataLoader workers: a forked process cannot use it, and each spawned one would need a context."""
     if str(device).startswith("cuda") and get_worker_info() is not None:
         raise ConfigError(
             "a generator on the GPU inside a DataLoader worker",

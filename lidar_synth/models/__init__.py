@@ -82,18 +82,19 @@ def assemble(
     what: str,
     device: torch.device | str = "cpu",
 ) -> nn.Module:
-    """A network with given weights, float32 and in evaluation mode.
+    """Build a network with given weights, in float32 and in evaluation mode.
 
     Args:
-        architecture, arguments: as ``build_network`` takes them.
-        state: the weights by name; used as they are where they are float32 on ``device``.
-        what: to name in an error.
+        architecture, arguments: arguments of ``build_network``.
+        state: the weights by name. Tensors that are float32 on ``device`` are used without a copy.
+        what: name of the weights in an error.
+        device: device of the network.
 
     Raises:
-        DataError: on arguments that give no network, missing or unexpected keys, and other shapes.
+        DataError: on invalid arguments, missing or unexpected keys, or weights of other shapes.
     """
     try:
-        with torch.device("meta"):  # neither time nor memory for weights that will be replaced
+        with torch.device("meta"):  # saves time and memory for weights that will be replaced
             network = build_network(architecture, arguments)
     except ConfigError as error:
         raise DataError(f"{what}: {error}") from error
@@ -105,5 +106,5 @@ def assemble(
         shapes = ", ".join(f"{key} {shape} for {expected[key]}" for key, shape in wrong.items())
         raise DataError(f"{what} has weights of other shapes: {shapes}", "the shapes that its arguments give")
     network.load_state_dict({key: v.to(device, torch.float32) for key, v in state.items()}, assign=True)
-    # What is no image has no such layout; convolutions would arrange their weights anew at every call.
+    # Convolutions would otherwise convert their weights at every call; other weights have no such layout.
     return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload, no-any-return]
