@@ -83,7 +83,7 @@ def test_scans_are_the_returns_of_the_images(generator: Generator) -> None:
     assert len(scan) == image.mask.sum()
     assert np.array_equal(scan.label, image.label[image.mask])
     assert np.array_equal(scan.confidence, image.channels["confidence"][image.mask])
-    assert np.array_equal(project(scan).mask, image.mask)  # every return goes back to its own cell
+    assert np.array_equal(project(scan).mask, image.mask)  # every return is projected into its own cell
 
 
 def test_an_unknown_sampling_option_is_refused(generator: Generator) -> None:
@@ -203,7 +203,7 @@ CODECS = {
 
 
 def write_latent(path: Path, architecture: str) -> Path:
-    """A latent model with random weights."""
+    """Write a latent model with random weights."""
     given = {"resolution": SENSOR.shape, "channels": 7}
     codec = NetworkSpec(architecture, given | CODECS[architecture])
     torch.manual_seed(0)
@@ -240,7 +240,7 @@ def test_compile_compiles_the_decoder_too(architecture: str, tmp_path: Path, mon
     assert sum(graphs) >= 5
     before = len(graphs)
     compiled.scans(0, [0])
-    assert len(graphs) > before  # the flow
+    assert len(graphs) > before  # those of the flow
 
 
 def test_a_damaged_shipped_checkpoint_is_detected_by_its_hash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -285,7 +285,7 @@ def _read(path: Path, tensors: bool = True) -> _Content:
         raise DataError(
             f"{path} is a PyTorch pickle",
             "a .safetensors checkpoint",
-            f"A pickle can run code and is never loaded as a checkpoint. To convert released weights of R2Flow or LiDM: "
+            f"A pickle can run code and is never loaded as a checkpoint. To convert weights of R2Flow or LiDM: "
             f"lidar-synth import {path} OUT.safetensors (--peer lidm for LiDM's)",
         )
     try:
