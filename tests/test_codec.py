@@ -73,7 +73,7 @@ def test_a_mask_is_trained_and_removes_returns() -> None:
         optimizer.zero_grad()
         training(x).backward()
         optimizer.step()
-    assert right() > before + 0.2  # the small codebook limits what can be learned
+    assert right() > before + 0.2  # a small codebook cannot reconstruct random scans much better
     with torch.no_grad():
         image = net.eval().decode(net.encode(x))
         bits = net._decode(net.codebook(net._encode(x))[0])[:, 7:]
@@ -83,7 +83,7 @@ def test_a_mask_is_trained_and_removes_returns() -> None:
 
 
 def test_the_adversarial_weight_balances_two_gradients() -> None:
-    """Esser et al., Eq. 7: at the decoder's last layer, the adversarial gradient is as large as that of the reconstruction."""
+    """Esser et al., Eq. 7: at the decoder's last layer, the adversarial gradient equals that of the reconstruction."""
     x = tensors()
     plain, balanced = (autoencoding(adversarial=0.6, adaptive=a).eval() for a in (False, True))
     balanced.load_state_dict(plain.state_dict())

@@ -58,15 +58,15 @@ class SamplingOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Generator:
-    """A generative model that makes scans by (seed, index); ``load_generator`` makes one.
+    """A generative model; a scan is a function of (seed, index). ``load_generator`` loads one.
 
     Args:
-        name: of the checkpoint; part of the scans' ids.
+        name: name of the checkpoint, which is part of the scans' ids.
         network: the flow, ``checkpoint.join`` of the checkpoint's networks, in evaluation mode.
-        header: of the checkpoint.
-        hash: of the checkpoint; "" for weights that come from none.
-        batch: number of scans computed at a time; it limits the memory and changes nothing else.
-        autoencoder: of a latent model; None for a pixel model.
+        header: the checkpoint's header.
+        hash: the checkpoint's hash; "" for weights without a checkpoint.
+        batch: number of scans computed at a time; it affects only memory and speed.
+        autoencoder: the autoencoder of a latent model; None for a pixel model.
 
     Example:
         >>> from lidar_synth import Generator, load_generator
@@ -123,8 +123,8 @@ class Generator:
         """Generate range images.
 
         Args:
-            seed: of the noise, 0 <= seed < 2^64.
-            indices: B numbers of scans, 0 <= index < 2^63, in any order.
+            seed: seed of the noise, 0 <= seed < 2^64.
+            indices: indices of B scans, 0 <= index < 2^63, in any order.
             condition: one condition for all scans, or B of them; None for an unconditional model. A semantic map is a
                 (H, W) uint8 array of train ids, 255 = unknown, such as the ``label`` of a range image on the model's
                 sensor; a camera image is (3, h, w) uint8. A real ``Scan``, or a list of B, provides the condition
@@ -135,7 +135,7 @@ class Generator:
         Returns:
             B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its ``confidence`` in
             [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0) where there is no return. If a
-            model conditioned on semantic maps makes no labels of its own, ``label`` is the map's where there is a
+            model conditioned on semantic maps does not generate labels, ``label`` is the map's where there is a
             return, with confidence 1 where the map's label is known.
 
         Raises:

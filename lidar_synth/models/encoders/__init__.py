@@ -1,1 +1,1 @@
-"""Encoders of conditions, each of which becomes maps beside the state or tokens that the state attends to."""
+"""Encoders of conditions: each produces maps on the grid of the state, or tokens to which the state attends."""
