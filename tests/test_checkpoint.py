@@ -1,4 +1,4 @@
-"""Checkpoints: what is written comes back, and nothing else is taken for one."""
+"""Checkpoints: saving and loading, and refusal of everything else."""
 
 import hashlib
 import json
@@ -68,14 +68,14 @@ def saved(tmp_path: Path) -> Path:
 
 
 def checksummed(values: dict[str, Any]) -> str:
-    """A header's text, with the checksum that belongs to it."""
+    """The text of a header with its checksum."""
     values = {k: v for k, v in values.items() if k != "checksum"}
     checksum = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
     return json.dumps({**values, "checksum": checksum})
 
 
 def rewrite(path: Path, **changes: Any) -> None:
-    """Change keys of the header (None = take out) and its checksum without touching anything else."""
+    """Change keys of the header (None = remove) and update its checksum; the weights stay unchanged."""
     content = path.read_bytes()
     size = struct.unpack("<Q", content[:8])[0]
     outer = json.loads(content[8 : 8 + size])
@@ -86,14 +86,14 @@ def rewrite(path: Path, **changes: Any) -> None:
 
 
 def replace_weights(path: Path, change: Any) -> None:
-    """Save other weights under a header that knows nothing of it but their sum, as a careless tool would."""
+    """Replace the weights and their checksum, but not the rest of the header, as a careless tool would."""
     tensors = load_file(path)
     change(tensors)
     save_file(tensors, path, {"lidar_synth": checksummed({**HEADER.to_dict(), "weights": weights_hash(tensors)})})
 
 
 def save_version_1(path: Path, header: Header = HEADER) -> str:
-    """A checkpoint as version 0.1.0 wrote it; returns its hash."""
+    """Write a checkpoint like version 0.1.0; returns its hash."""
     tensors = {f"{VELOCITY}.{k}": v.detach() for k, v in network().state_dict().items()}
     values = {**header.to_dict(), "format": WITHOUT_CHECKSUM, "weights": weights_hash(tensors)}
     text = json.dumps(values, sort_keys=True, allow_nan=False)
@@ -101,7 +101,7 @@ def save_version_1(path: Path, header: Header = HEADER) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def test_everything_comes_back(saved: Path) -> None:
+def test_loading_restores_everything_that_was_saved(saved: Path) -> None:
     header, networks, digest = load_checkpoint(saved)
     assert header == HEADER
     original = network()
@@ -114,7 +114,7 @@ def test_everything_comes_back(saved: Path) -> None:
     assert [p.name for p in saved.parent.iterdir()] == [saved.name]
 
 
-def test_the_same_content_is_the_same_bytes_and_hash(saved: Path, tmp_path: Path) -> None:
+def test_the_same_content_gives_the_same_bytes_and_hash(saved: Path, tmp_path: Path) -> None:
     again = tmp_path / "again.safetensors"
     digest = save_checkpoint(again, HEADER, {VELOCITY: network()})
     assert again.read_bytes() == saved.read_bytes()
@@ -131,7 +131,7 @@ def test_a_loaded_checkpoint_saves_to_the_same_bytes(saved: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_halves_the_parameters_only(saved: Path, tmp_path: Path, dtype: torch.dtype) -> None:
+def test_half_precision_is_used_only_for_parameters(saved: Path, tmp_path: Path, dtype: torch.dtype) -> None:
     path = tmp_path / "half.safetensors"
     save_checkpoint(path, HEADER, {VELOCITY: network()}, dtype)
     assert path.stat().st_size < 0.7 * saved.stat().st_size
@@ -142,23 +142,23 @@ def test_half_precision_halves_the_parameters_only(saved: Path, tmp_path: Path, 
     assert all(torch.equal(a, b) for a, b in zip(half.buffers(), whole.buffers(), strict=True))
 
 
-# --- files that are no checkpoint of this version ----------------------------------------------------------------
+# --- invalid files -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.999])
-def test_a_truncated_file(saved: Path, share: float) -> None:
+def test_a_truncated_file_is_refused(saved: Path, share: float) -> None:
     content = saved.read_bytes()
     saved.write_bytes(content[: int(share * len(content))])
     for read in (load_checkpoint, read_header):
-        with pytest.raises(DataError, match=r"model.safetensors is cut, damaged or no .safetensors file"):
+        with pytest.raises(DataError, match=r"model.safetensors is truncated, damaged or no .safetensors file"):
             read(saved)
 
 
-def test_a_flipped_bit_in_a_weight(saved: Path) -> None:
+def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
     content = bytearray(saved.read_bytes())
     content[-1000] ^= 1
     saved.write_bytes(content)
-    with pytest.raises(DataError, match="do not have the sum in the header"):
+    with pytest.raises(DataError, match="do not match their checksum in the header"):
         load_checkpoint(saved)
 
 
@@ -186,11 +186,11 @@ def test_a_flipped_bit_in_a_weight(saved: Path) -> None:
         ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"width": 32}}}}, "other shapes"),
         ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"depths": [1, 2]}}}}, "missing"),
         ({"networks": [1]}, "header that does not fit"),
-        ({"weights": None}, "do not have the sum"),
+        ({"weights": None}, "do not match their checksum"),
     ],
     ids=str,
 )
-def test_a_header_that_is_not_ours(saved: Path, changes: dict[str, Any], message: str) -> None:
+def test_an_invalid_header_is_refused(saved: Path, changes: dict[str, Any], message: str) -> None:
     rewrite(saved, **changes)
     with pytest.raises(DataError, match=message) as caught:
         load_checkpoint(saved)
@@ -198,7 +198,7 @@ def test_a_header_that_is_not_ours(saved: Path, changes: dict[str, Any], message
 
 
 def same(a: Checkpoint, b: Checkpoint) -> bool:
-    """Whether two checkpoints say the same and hold the same numbers."""
+    """Whether two checkpoints have equal headers and weights."""
     states = [{p: n.state_dict() for p, n in c.networks.items()} for c in (a, b)]
     return (a.header, a.hash) == (b.header, b.hash) and all(
         torch.equal(value, states[1][part][key]) for part, state in states[0].items() for key, value in state.items()
@@ -206,7 +206,7 @@ def same(a: Checkpoint, b: Checkpoint) -> bool:
 
 
 def test_one_changed_byte_is_refused_or_changes_nothing(saved: Path) -> None:
-    """Every byte of the header in turn, and some of the weights."""
+    """Changes every byte of the header in turn, and some bytes of the weights."""
     content, whole = saved.read_bytes(), load_checkpoint(saved)
     header = 8 + struct.unpack("<Q", content[:8])[0]
     random = Random(0)
@@ -223,17 +223,17 @@ def test_one_changed_byte_is_refused_or_changes_nothing(saved: Path) -> None:
 
 
 @pytest.mark.parametrize(("old", "new"), [(b"0.86", b"0.76"), (b'range_max\\": 80.0', b'range_max\\": 90.0')])
-def test_another_time_or_range_limit_is_noticed(saved: Path, tmp_path: Path, old: bytes, new: bytes) -> None:
+def test_a_changed_time_or_range_limit_is_refused(saved: Path, tmp_path: Path, old: bytes, new: bytes) -> None:
     content = saved.read_bytes()
     assert old in content
     saved.write_bytes(content.replace(old, new))
     for read in (load_checkpoint, read_header):
-        with pytest.raises(DataError, match="the header does not have its checksum"):
+        with pytest.raises(DataError, match="a header that does not match its checksum"):
             read(saved)
 
 
-def test_version_1_is_read(tmp_path: Path) -> None:
-    """With the hash that it always had: students, banks and resumed runs tell their checkpoints by it."""
+def test_version_1_can_be_read(tmp_path: Path) -> None:
+    """Its hash stays the same, since students, banks and resumed runs identify checkpoints by it."""
     path, copy = tmp_path / "old.safetensors", tmp_path / "new.safetensors"
     digest = save_version_1(path)
     header, networks, found = load_checkpoint(path)
@@ -243,7 +243,7 @@ def test_version_1_is_read(tmp_path: Path) -> None:
     assert load_checkpoint(copy).header == HEADER
 
 
-def test_a_deeply_nested_header(saved: Path) -> None:
+def test_a_deeply_nested_header_is_refused(saved: Path) -> None:
     tensors = load_file(saved)
     save_file(tensors, saved, {"lidar_synth": '{"format": ' + "[" * 100_000 + "]" * 100_000 + "}"})
     with pytest.raises(DataError):
@@ -251,12 +251,12 @@ def test_a_deeply_nested_header(saved: Path) -> None:
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta", "cpu:1"])
-def test_a_device_that_is_not_there(saved: Path, device: str) -> None:
-    with pytest.raises(ConfigError, match=rf"device '{device}'; expected one that torch finds here: cpu"):
+def test_an_unavailable_device_is_refused(saved: Path, device: str) -> None:
+    with pytest.raises(ConfigError, match=rf"device '{device}'; expected an available one: cpu"):
         load_checkpoint(saved, device)
 
 
-def test_weights_without_a_header(tmp_path: Path) -> None:
+def test_weights_without_a_header_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "weights.safetensors"
     save_file({"a": torch.zeros(2)}, path)
     with pytest.raises(DataError, match="no header of lidar_synth"):
@@ -274,7 +274,7 @@ def test_a_pickle_is_never_loaded(tmp_path: Path) -> None:
 
 
 class Evil:
-    """Leaves a trace where it is unpickled."""
+    """An object that creates a folder when it is unpickled."""
 
     def __init__(self, trace: Path) -> None:
         self.trace = trace
@@ -283,7 +283,7 @@ class Evil:
         return os.mkdir, (str(self.trace),)
 
 
-def test_keys_and_shapes_have_to_fit_exactly(saved: Path) -> None:
+def test_missing_or_unexpected_keys_and_other_shapes_are_refused(saved: Path) -> None:
     def rename(tensors: dict[str, Tensor]) -> None:
         tensors[f"{VELOCITY}.spare"] = tensors.pop(f"{VELOCITY}.norm.weight")
 
@@ -313,13 +313,13 @@ def test_keys_and_shapes_have_to_fit_exactly(saved: Path) -> None:
             load_checkpoint(saved)
 
 
-def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.safetensors", tmp_path):
         with pytest.raises(FileError, match="cannot be read"):
             load_checkpoint(path)
 
 
-# --- what is not written -----------------------------------------------------------------------------------------
+# --- refusal to write --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,7 @@ def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
     ],
     ids=["none", "too many", "another", "nan", "path"],
 )
-def test_what_does_not_fit_is_not_written(
+def test_networks_that_do_not_match_the_header_are_not_written(
     tmp_path: Path, header: Header, networks: dict[str, nn.Module], message: str
 ) -> None:
     with pytest.raises(LidarSynthError, match=message):
@@ -341,7 +341,7 @@ def test_what_does_not_fit_is_not_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_weights_that_are_not_finite_do_not_replace_good_ones(saved: Path) -> None:
+def test_weights_that_are_not_finite_do_not_overwrite_a_checkpoint(saved: Path) -> None:
     before, broken = saved.read_bytes(), network()
     next(broken.parameters()).data[0] = torch.inf
     with pytest.raises(DataError, match="NaN or infinity"):
@@ -349,12 +349,12 @@ def test_weights_that_are_not_finite_do_not_replace_good_ones(saved: Path) -> No
     assert saved.read_bytes() == before
 
 
-def test_a_forgotten_sensor_is_not_written(tmp_path: Path) -> None:
+def test_missing_ray_angles_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"NaN or infinity in \['velocity.angles.cells'\]"):
         save_checkpoint(tmp_path / "model.safetensors", HEADER, {VELOCITY: build_network("hdit", ARGUMENTS)})
 
 
-def test_a_place_that_cannot_be_written(tmp_path: Path, saved: Path) -> None:
+def test_a_path_that_cannot_be_written_is_reported(tmp_path: Path, saved: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "taken.safetensors").mkdir()
     for path in (tmp_path / "file" / "model.safetensors", tmp_path / "taken.safetensors"):
@@ -363,7 +363,7 @@ def test_a_place_that_cannot_be_written(tmp_path: Path, saved: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", saved.name, "taken.safetensors"]
 
 
-def test_a_full_disk_leaves_the_old_checkpoint(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_the_old_checkpoint(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -375,13 +375,13 @@ def test_a_full_disk_leaves_the_old_checkpoint(saved: Path, monkeypatch: pytest.
     assert [p.name for p in saved.parent.iterdir()] == [saved.name]
 
 
-def test_other_names_are_refused(tmp_path: Path) -> None:
+def test_other_file_suffixes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"ends in \.safetensors"):
         save_checkpoint(tmp_path / "model.pth", HEADER, {VELOCITY: network()})
 
 
 @pytest.mark.parametrize("change", [lambda t: t.double() * 1e300, lambda t: t.to(torch.complex64)])
-def test_weights_that_no_float32_holds_are_refused(saved: Path, change: Any) -> None:
+def test_weights_outside_the_range_of_float32_are_refused(saved: Path, change: Any) -> None:
     def one(tensors: dict[str, Tensor]) -> None:
         name = next(key for key, tensor in tensors.items() if tensor.ndim == 2)
         tensors[name] = change(tensors[name])

@@ -1,4 +1,4 @@
-"""The codec between range images and states, and how an autoencoder is trained and judged."""
+"""The codec between range images and states, and training and evaluation of an autoencoder."""
 
 from typing import Any
 
@@ -57,7 +57,7 @@ def autoencoding(metric: str = "l1", weights: dict[str, float] | None = None, **
     return Autoencoding(network(), TENSORS, SENSOR, Losses(**losses), METRICS[metric], weights or {})  # type: ignore[arg-type]
 
 
-def test_a_mask_is_trained_and_empties_cells() -> None:
+def test_a_mask_is_trained_and_removes_returns() -> None:
     x = tensors()
     net = network(mask=True)
     assert net(x).output.shape == (4, 8, 8, 32)
@@ -73,7 +73,7 @@ def test_a_mask_is_trained_and_empties_cells() -> None:
         optimizer.zero_grad()
         training(x).backward()
         optimizer.step()
-    assert right() > before + 0.2  # from random points, a codebook keeps no more
+    assert right() > before + 0.2  # a small codebook cannot reconstruct random scans much better
     with torch.no_grad():
         image = net.eval().decode(net.encode(x))
         bits = net._decode(net.codebook(net._encode(x))[0])[:, 7:]
@@ -83,7 +83,7 @@ def test_a_mask_is_trained_and_empties_cells() -> None:
 
 
 def test_the_adversarial_weight_balances_two_gradients() -> None:
-    """Esser et al., Eq. 7: what the verdict adds at the decoder's last layer is as large as the reconstruction's."""
+    """Esser et al., Eq. 7: at the decoder's last layer, the adversarial gradient equals that of the reconstruction."""
     x = tensors()
     plain, balanced = (autoencoding(adversarial=0.6, adaptive=a).eval() for a in (False, True))
     balanced.load_state_dict(plain.state_dict())
@@ -101,7 +101,7 @@ def test_the_adversarial_weight_balances_two_gradients() -> None:
         assert torch.isfinite(balanced(x))
 
 
-def test_the_codec_of_a_pixel_model_does_nothing() -> None:
+def test_the_codec_of_a_pixel_model_is_the_identity() -> None:
     codec, x = make_codec(None, TENSORS, SENSOR.shape), tensors()
     assert isinstance(codec, Identity)
     assert codec.shape == (7, 8, 32) == x.shape[1:]
@@ -119,17 +119,17 @@ def test_the_codec_of_a_latent_model_is_its_autoencoder() -> None:
     assert out.shape == x.shape
     with torch.no_grad():
         assert torch.equal(out[:, :2], net.decode(y)[:, :2])
-    assert out[:, 2:].abs().max() < 1  # bits are expectations of -1 and 1
+    assert out[:, 2:].abs().max() < 1  # expected values of bits that are -1 or 1
     with pytest.raises(DataError, match="a latent of shape"):
         codec.decode(y[:, :, :4])
 
 
-def test_an_autoencoder_of_other_images_is_refused() -> None:
+def test_an_autoencoder_for_other_images_is_refused() -> None:
     with pytest.raises(DataError, match=r"images of shape \(7, 8, 32\); expected \(2, 8, 32\)"):
         make_codec(network(), TensorFormat(("range", "reflectance"), NORMALISATIONS["r2flow"]), SENSOR.shape)
 
 
-def test_label_bits_are_expected_values_of_their_logits() -> None:
+def test_label_bits_are_the_expected_values_of_their_logits() -> None:
     logits = torch.randn(2, 7, 3, 4)
     said = expected(logits, TENSORS)
     assert torch.equal(said[:, :2], logits[:, :2])
@@ -155,7 +155,7 @@ def test_the_loss_is_the_sum_of_its_terms() -> None:
 
 
 def logits_of(x: Tensor) -> Tensor:
-    """What a perfect decoder gives."""
+    """The output of a perfect decoder."""
     return torch.cat((x[:, :2], 20 * x[:, 2:]), 1)
 
 
@@ -180,11 +180,13 @@ def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
     (own / 2).backward()
     for name, parameter in judge.named_parameters():
         assert parameter.grad is not None
-        assert torch.allclose(by_both[name], parameter.grad, atol=1e-6), name  # the verdict's alone
+        assert torch.allclose(by_both[name], parameter.grad, atol=1e-6), (
+            name
+        )  # the gradient of the adversarial term alone
 
 
 @pytest.mark.parametrize("losses", [{}, {"geometric": 1.0, "adversarial": 0.05}], ids=["plain", "all terms"])
-def test_training_in_the_common_loop_lowers_the_loss_and_the_figures(losses: dict[str, float]) -> None:
+def test_training_reduces_the_loss_and_the_reconstruction_error(losses: dict[str, float]) -> None:
     batches = Batches(cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False), TENSORS, seed=1)
     trained = autoencoding(**losses)
     recipe = Recipe(iterations=50, batch=4, rate=3e-3, warmup=5, metric="l1", ema_every=1)
@@ -193,7 +195,7 @@ def test_training_in_the_common_loop_lowers_the_loss_and_the_figures(losses: dic
     records = list(steps(training, reconstruction_task, batches, Accelerator(cpu=True), autoencoder_loss))
     assert sum(r.loss for r in records[-5:]) < 0.75 * sum(r.loss for r in records[:5])
     average: Any = training.average
-    assert torch.equal(average.network.scale, trained.network.scale)  # what is counted is taken over
+    assert torch.equal(average.network.scale, trained.network.scale)  # buffers are copied, not averaged
     after = reconstruction_figures(Latent(average.network, TENSORS), tensors(), SENSOR)
     assert set(after) == {"mae", "within_5cm", "drop_accuracy", "chamfer", "label_accuracy"}
     assert after["mae"] < before["mae"]
@@ -202,7 +204,7 @@ def test_training_in_the_common_loop_lowers_the_loss_and_the_figures(losses: dic
 
 
 class Offset(VQVAE):
-    """Gives images back, farther by a factor, as a latent of one channel per channel."""
+    """An autoencoder that returns images with a known error of the range, and drops rows of returns."""
 
     def __init__(self, metres: float, drop: int) -> None:
         super().__init__((8, 32), 7, 7, 0, width=8, multipliers=(1,), strides=(), blocks=1, groups=1)
@@ -219,10 +221,10 @@ class Offset(VQVAE):
 
 
 @pytest.mark.parametrize(("metres", "drop"), [(0.0, 0), (0.03, 0), (0.2, 0), (0.0, 4)])
-def test_figures_are_what_they_are_called(metres: float, drop: int) -> None:
+def test_reconstruction_figures_measure_known_errors(metres: float, drop: int) -> None:
     codec = Latent(Offset(metres, drop), TENSORS)
     images = [project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS]
-    for image in images:  # not so far that what is added leaves the range of the sensor
+    for image in images:  # so that the added error stays within the range of the sensor
         image.range[image.range > 75] = 0
     figures = reconstruction_figures(codec, TENSORS.from_images(images), SENSOR)
     masks = np.stack([image.mask for image in images])

@@ -1,4 +1,4 @@
-"""Conditions: what users give, what real scans have, how encoders see it, and what is refused."""
+"""Conditions: from users and from real scans, their encoders, training, and invalid input."""
 
 import sys
 from collections.abc import Iterator
@@ -22,9 +22,10 @@ from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.models import NETWORKS, build_network
-from lidar_synth.models.encoders.camera import SightEncoder
-from lidar_synth.models.encoders.maps import CLIP_VARIABLE, CLIP_WIDTH, cut, frozen_clip
+from lidar_synth.models import NETWORKS, build_network, encoders_of
+from lidar_synth.models.encoders.calibrated_camera import SightEncoder
+from lidar_synth.models.encoders.camera_views import split_views
+from lidar_synth.models.encoders.clip_views import CLIP_VARIABLE, CLIP_WIDTH, frozen_clip
 from lidar_synth.town.camera import CAMERA
 from lidar_synth.train import Batches, Conditioning, Other, cache_scans
 
@@ -39,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def picture(path: Path, size: tuple[int, int] = (40, 80), seed: int = 0) -> Path:
-    """A PNG of so many rows and columns."""
+    """Write a PNG of the given rows and columns."""
     Image.fromarray(np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)).save(path)
     return path
 
@@ -49,7 +50,7 @@ def some_scan(tmp_path: Path, seed: int = 0) -> Scan:
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
-def test_every_condition_reads_scans_and_its_encoders_take_what_it_reads(name: str, tmp_path: Path) -> None:
+def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_path: Path) -> None:
     condition, scan = CONDITIONS[name], some_scan(tmp_path)
     encoder = {
         "semantic": lambda: build_network("semantic_map", {"resolution": (8, 32), "target": (4, 16)}),
@@ -63,10 +64,10 @@ def test_every_condition_reads_scans_and_its_encoders_take_what_it_reads(name: s
     encoded = encoder(given)
     assert encoded.shape == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5)}[name]
     assert (blank(name, given) == condition.blank).all()
-    assert set(condition.encoders) <= set(NETWORKS)
+    assert set(encoders_of(name)) <= set(NETWORKS)
 
 
-def test_the_label_map_of_a_scan_of_another_sensor_lies_on_the_models_grid() -> None:
+def test_labels_of_another_sensor_are_projected_onto_the_grid_of_the_model() -> None:
     other = replace(SENSOR, name="other", columns=64, rows=16)
     scan = random_scan(other, 3000)
     labels = CONDITIONS["semantic"].read(scan, SENSOR, SENSOR.shape, {})
@@ -74,7 +75,7 @@ def test_the_label_map_of_a_scan_of_another_sensor_lies_on_the_models_grid() -> 
 
 
 @pytest.mark.parametrize("method", ["rescale", "patches"])
-def test_label_maps_are_seen_as_classes_where_they_are(method: str) -> None:
+def test_label_maps_are_encoded_by_class_and_place(method: str) -> None:
     net = build_network("semantic_map", {"resolution": (8, 32), "target": (4, 8), "channels": 6, "method": method})
     labels = torch.full((1, 8, 32), 3, dtype=torch.uint8)
     same = net(labels)
@@ -87,16 +88,16 @@ def test_label_maps_are_seen_as_classes_where_they_are(method: str) -> None:
         assert changed.sum() == 1
 
 
-def test_all_train_ids_are_told_apart() -> None:
+def test_all_train_ids_are_encoded_differently() -> None:
     net = build_network("semantic_map", {"resolution": (4, 5), "target": (4, 5), "channels": 20})
     ids = torch.tensor([*range(len(NAMES)), IGNORE], dtype=torch.uint8).view(1, 4, 5)
     net.mix.weight.data.copy_(torch.eye(20)[..., None, None])
     assert torch.equal(net(ids)[0].flatten(1), torch.eye(20))
 
 
-def test_an_image_is_cut_into_views_from_left_to_right() -> None:
+def test_an_image_is_split_into_views_from_left_to_right() -> None:
     image = torch.arange(2 * 3 * 4 * 12).reshape(2, 3, 4, 12)
-    views = cut(image, 3)
+    views = split_views(image, 3)
     assert torch.equal(views[4], image[1, :, :, 4:8])
     left = one_view(image, 3)
     assert torch.equal(left[..., 4:8], image[..., 4:8])
@@ -119,28 +120,28 @@ def sight(sensor: Sensor = TOWN, **arguments: Any) -> SightEncoder:
     ).eval()
 
 
-def test_every_cell_looks_where_the_calibration_says() -> None:
+def test_the_calibration_gives_the_pixel_of_every_cell() -> None:
     points = unproject(RangeImage(np.full(TOWN.shape, 15, np.float32), TOWN, {})).points
     pixels, depth = CAMERA.pixels(points)
     inside = (depth > 1) & (pixels > -0.5).all(1) & (pixels < np.array([1407.5, 375.5])).all(1)
-    places = sight(distance=15.0).places().reshape(-1, 2).numpy()
+    places = sight(distance=15.0).pixel_coordinates().reshape(-1, 2).numpy()
     assert np.array_equal((np.abs(places) <= 1).all(1), inside) and 0.1 < inside.mean() < 0.3
     assert np.allclose(((places + 1) * [1408, 376] - 1)[inside] / 2, pixels[inside], atol=0.01)
 
 
 @torch.no_grad()
-def test_a_cell_sees_its_own_part_of_the_image_only() -> None:
+def test_a_cell_depends_only_on_its_part_of_the_image() -> None:
     encoder, image = sight(), torch.zeros(1, 3, 32, 64, dtype=torch.uint8)
     before = encoder(image)
     image[..., :8] = 255  # the left eighth
     changed = (encoder(image) != before).any(1)[0]
-    place, seen = encoder.places()[..., 0], (encoder.places().abs() <= 1).all(-1)
+    place, seen = encoder.pixel_coordinates()[..., 0], (encoder.pixel_coordinates().abs() <= 1).all(-1)
     assert before.shape == (1, 5, *TOWN.shape)
     assert changed[seen & (place < -0.8)].all() and not changed[place > -0.4].any()
     assert torch.equal(before[0, -1] == 1, seen) and not before[0, :, ~seen].any()
 
 
-def test_the_place_of_a_view_and_of_a_cell_counts_and_trains() -> None:
+def test_the_position_embeddings_of_views_and_cells_are_used_and_trained() -> None:
     net = build_network("views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)})
     image = torch.randint(0, 256, (2, 3, 32, 64), dtype=torch.uint8)
     swapped = torch.cat((image[..., 32:], image[..., :32]), -1)
@@ -152,7 +153,7 @@ def test_the_place_of_a_view_and_of_a_cell_counts_and_trains() -> None:
         assert parameter.grad is not None and parameter.grad.any(), name
 
 
-# --- what users give -------------------------------------------------------------------------------------------------
+# --- conditions of users ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -169,13 +170,13 @@ def test_the_place_of_a_view_and_of_a_cell_counts_and_trains() -> None:
         ("camera", np.zeros((3, 32, 60), np.uint8), DataError, r"camera condition of shape \(3, 32, 60\)"),
     ],
 )
-def test_what_is_no_condition(name: str, given: Any, error: type[Exception], message: str) -> None:
+def test_invalid_conditions_are_refused(name: str, given: Any, error: type[Exception], message: str) -> None:
     shape = SENSOR.shape if name == "semantic" else CAMERA_SHAPE
     with pytest.raises(error, match=message):
         batch_of(name, given, 3, SENSOR, shape, OPTIONS)
 
 
-def test_scans_that_lack_what_is_needed(tmp_path: Path) -> None:
+def test_scans_without_the_condition_are_refused(tmp_path: Path) -> None:
     scan = some_scan(tmp_path)
     with pytest.raises(DataError, match="'random-0' has no labels"):
         batch_of("semantic", replace(scan, label=None), 1, SENSOR, SENSOR.shape, {})
@@ -202,12 +203,12 @@ def test_scans_that_lack_what_is_needed(tmp_path: Path) -> None:
         ({"resolution": (12, 32), "target": (4, 16)}, "powers of two"),
     ],
 )
-def test_sizes_that_an_encoder_cannot_reach(arguments: dict[str, Any], message: str) -> None:
+def test_sizes_that_do_not_divide_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build_network("semantic_map", {"resolution": (8, 32)} | arguments)
 
 
-def test_an_encoder_without_a_calibration() -> None:
+def test_an_invalid_calibration_is_refused() -> None:
     with pytest.raises(ConfigError, match="expected 3 rows of 4 numbers"):
         sight(image_from_sensor=[[1.0, 2.0]])
     with pytest.raises(ConfigError, match="an image of"):
@@ -232,13 +233,13 @@ def test_conditions_stay_with_their_scans(tmp_path: Path) -> None:
         y0, _, _, cond = batches(range(8))
         assert cond is not None and cond.shape == (8, 8, 32)
         empty = TENSORS.decode(y0)["range"] == 0
-        assert (cond[empty] == IGNORE).all()  # no return, no label, wherever the scan was turned to
+        assert (cond[empty] == IGNORE).all()  # cells without a return have no label, also after a rotation
     whole = plain.conditions(range(8))
     assert whole is not None and torch.equal(whole, plain(range(8)).cond)  # type: ignore[arg-type]
     assert not torch.equal(whole, moved(range(8)).cond)  # type: ignore[arg-type]
 
 
-def test_camera_images_are_mirrored_with_the_scan_and_cannot_turn(tmp_path: Path) -> None:
+def test_camera_images_are_mirrored_with_the_scan_but_not_rotated(tmp_path: Path) -> None:
     plain, flipped = (conditioned_batches(tmp_path, "camera", flip=flip) for flip in (False, True))
     a, b = plain(range(16)), flipped(range(16))
     assert a.cond is not None and b.cond is not None
@@ -251,7 +252,7 @@ def test_camera_images_are_mirrored_with_the_scan_and_cannot_turn(tmp_path: Path
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
-def test_dropout_blanks_its_share_and_nothing_else(name: str, tmp_path: Path) -> None:
+def test_dropout_blanks_only_its_share_of_the_conditions(name: str, tmp_path: Path) -> None:
     plain, dropped = conditioned_batches(tmp_path, name), conditioned_batches(tmp_path, name, dropout=0.25)
     a, b = plain(range(200)), dropped(range(200))
     assert torch.equal(a.y0, b.y0) and torch.equal(a.y1, b.y1)
@@ -261,7 +262,7 @@ def test_dropout_blanks_its_share_and_nothing_else(name: str, tmp_path: Path) ->
     assert torch.equal(a.cond[~is_blank], b.cond[~is_blank])
 
 
-def test_view_dropout_leaves_one_view(tmp_path: Path) -> None:
+def test_view_dropout_keeps_one_view(tmp_path: Path) -> None:
     cond = conditioned_batches(tmp_path, "camera", view_dropout=0.5)(range(60)).cond
     assert cond is not None
     left, right = (cond[..., :32] == 0).flatten(1).all(1), (cond[..., 32:] == 0).flatten(1).all(1)
@@ -269,7 +270,7 @@ def test_view_dropout_leaves_one_view(tmp_path: Path) -> None:
     assert not right.any()
 
 
-def test_a_cache_with_images_goes_on_and_refuses_others(tmp_path: Path) -> None:
+def test_a_cache_with_images_resumes_and_refuses_other_images(tmp_path: Path) -> None:
     scans = [some_scan(tmp_path, seed) for seed in range(3)]
     others = {"camera": Other(CAMERA_SHAPE, lambda s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS))}
     cache = cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others)
@@ -309,7 +310,7 @@ def test_guidance_extrapolates_from_the_blank_condition() -> None:
 
 
 class Tower(nn.Module):
-    """What CLIP's vision tower looks like from outside: the mean colour of an image, 768 channels."""
+    """A stand-in for CLIP's vision tower: the mean colour of an image in 768 channels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -325,7 +326,7 @@ class Tower(nn.Module):
 
 @pytest.fixture
 def clip_libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """transformers and open_clip with a small tower; which one was asked, and for what."""
+    """transformers and open_clip with the stand-in; the list records the loaded files."""
     asked: list[str] = []
 
     def from_pretrained(place: str, local_files_only: bool, use_safetensors: bool) -> Tower:
@@ -346,7 +347,7 @@ def clip_libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("form", ["folder", "file"])
-def test_frozen_clip_tells_views_apart_and_only_the_rest_trains(
+def test_frozen_clip_encodes_each_view_and_only_other_layers_are_trained(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clip_libraries: list[str]
 ) -> None:
     place = tmp_path / ("clip" if form == "folder" else "clip.safetensors")
@@ -361,10 +362,10 @@ def test_frozen_clip_tells_views_apart_and_only_the_rest_trains(
     assert all(p.grad is not None and p.grad.any() for p in net.parameters())
     assert frozen_clip(str(place), "cpu").training is False
     assert not any(p.requires_grad for p in frozen_clip(str(place), "cpu").parameters())
-    assert len(clip_libraries) == 1  # read once
+    assert len(clip_libraries) == 1  # loaded once
 
 
-def test_without_clips_weights_or_library_it_is_said_what_to_do(
+def test_missing_clip_weights_or_libraries_are_reported_with_a_hint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frozen_clip.cache_clear()

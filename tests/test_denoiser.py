@@ -1,4 +1,4 @@
-"""The network that estimates the data: its velocity follows from the estimate at every time."""
+"""The network that predicts the data: at every time, its velocity follows from the prediction."""
 
 import pytest
 import torch
@@ -28,8 +28,8 @@ def states() -> torch.Tensor:
     return torch.randn(len(TIMES), 2, 8, 16, generator=torch.Generator().manual_seed(1))
 
 
-def test_the_velocity_leads_from_the_state_to_the_estimate() -> None:
-    """y - t v = (1 - t) s^2 / d y - t / sqrt(d) F, the equation of the module."""
+def test_the_velocity_points_from_the_state_to_the_data_estimate() -> None:
+    """y - t v = (1 - t) s^2 / d y - t / sqrt(d) F, the equation in the module's docstring."""
     detail, y = 0.2, states()
     net, t = network(detail, std=0.3), TIMES.view(-1, 1, 1, 1)
     spread = (1 - t) ** 2 * detail**2 + t**2
@@ -38,7 +38,7 @@ def test_the_velocity_leads_from_the_state_to_the_estimate() -> None:
         assert torch.allclose(y - t * net(y, TIMES), estimate, atol=1e-5)
 
 
-def test_a_fresh_network_trusts_the_state_at_the_end_and_knows_nothing_at_the_start() -> None:
+def test_a_fresh_network_gives_the_best_linear_estimate() -> None:
     """F = 0: the best linear estimate for data of standard deviation s around zero."""
     y = states()
     with torch.no_grad():
@@ -47,7 +47,7 @@ def test_a_fresh_network_trusts_the_state_at_the_end_and_knows_nothing_at_the_st
     assert torch.allclose(y[0] - 1e-3 * v[0], y[0], atol=5e-3)  # t near 0: the state itself
 
 
-def test_it_is_finite_and_of_bounded_slope_everywhere() -> None:
+def test_the_velocity_is_finite_and_has_a_bounded_slope_at_all_times() -> None:
     net = network(0.1, std=0.3)
     t = torch.linspace(0, 1, 21)
     y = torch.randn(21, 2, 8, 16)
@@ -59,7 +59,7 @@ def test_it_is_finite_and_of_bounded_slope_everywhere() -> None:
         assert torch.allclose(net(y[:1], 0.5), net(y[:1], torch.tensor([0.5])))
 
 
-def test_low_precision_stays_close() -> None:
+def test_bfloat16_stays_close_to_float32() -> None:
     net, y = network(std=0.3), states()
     with torch.no_grad():
         exact = net(y, TIMES)
@@ -68,7 +68,7 @@ def test_low_precision_stays_close() -> None:
     assert (rough - exact).abs().mean() < 0.05 * exact.abs().mean()
 
 
-def test_what_cannot_be_is_refused() -> None:
+def test_an_invalid_detail_is_refused() -> None:
     with pytest.raises(ConfigError, match="detail 0"):
         network(0.0)
     with pytest.raises(ConfigError, match="denoiser"):

@@ -1,4 +1,4 @@
-"""Distillation: where each strategy trains, towards what, and at which price."""
+"""Distillation: states, times, targets and teacher evaluations of each strategy."""
 
 import math
 from itertools import pairwise
@@ -32,22 +32,22 @@ def grid_of(name: str) -> tuple[float, ...]:
 
 
 def bounds(t: Tensor, grid: tuple[float, ...]) -> tuple[Tensor, Tensor]:
-    """Start and end of the interval that holds t, by searching one after the other."""
+    """Start and end of the interval that contains t, by linear search."""
     which = [next(i for i in range(len(grid) - 1) if grid[i + 1] < x <= grid[i] + 1e-12) for x in t.tolist()]
     return torch.tensor([grid[i] for i in which]).double(), torch.tensor([grid[i + 1] for i in which]).double()
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_a_straight_teacher_is_its_own_student(name: str) -> None:
-    """A teacher whose trajectories are straight lines with a velocity of their own is learned as it is."""
+    """The targets of a teacher with straight trajectories are its own velocities."""
     direction = gaussian(3, range(COUNT), (2, 3), dtype=torch.float64)
     example = STRATEGIES[name](lambda y, t, c: direction, DATA, NOISE, U, grid_of(name), 3, None)
     assert torch.allclose(example.velocity, direction)
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
-def test_targets_of_a_gaussian_teacher(name: str) -> None:
-    """They converge to the exact ones at Euler's first order in the number of steps."""
+def test_targets_converge_to_those_of_an_exact_gaussian_teacher(name: str) -> None:
+    """The targets converge at Euler's first order in the number of steps."""
     grid, errors = grid_of(name), []
     for steps in (50, 100, 200):
         example = STRATEGIES[name](gaussian_velocity, DATA, NOISE, U, grid, steps, None)
@@ -61,7 +61,7 @@ def test_targets_of_a_gaussian_teacher(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
-def test_where_they_train(name: str) -> None:
+def test_the_states_and_times_of_training_of_each_strategy(name: str) -> None:
     grid = grid_of(name)
     u = uniform(4, range(8000))
     y = torch.zeros(8000, 1)
@@ -76,7 +76,7 @@ def test_where_they_train(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
-def test_what_the_teacher_is_asked_and_what_is_counted(name: str) -> None:
+def test_the_times_and_the_number_of_teacher_evaluations(name: str) -> None:
     weight = torch.ones((), dtype=torch.float64, requires_grad=True)
     calls: list[Tensor] = []
 
@@ -94,7 +94,7 @@ def test_what_the_teacher_is_asked_and_what_is_counted(name: str) -> None:
     assert all((b < a).all() for a, b in pairwise(calls))
 
 
-def test_four_steps_of_the_student_end_where_the_teacher_ends() -> None:
+def test_four_steps_of_the_student_reach_the_end_of_the_teacher() -> None:
     """A student that has learned its targets exactly retraces the teacher's many steps in four: its targets at
     each start are an affine function of y here, found by least squares from Algorithm 1's examples."""
     count, steps = 4000, 25
@@ -123,8 +123,8 @@ def test_four_steps_of_the_student_end_where_the_teacher_ends() -> None:
 
 @pytest.mark.parametrize("k", [1, 2, 4])
 @pytest.mark.parametrize("name", ["uniform", "u_shaped", "logit_normal"])
-def test_times_snap_as_r2flows_do(golden: Path, name: str, k: int) -> None:
-    """Their time (0 = noise) goes down to floor(t k) / k: the time at which a sampler of k steps evaluates."""
+def test_times_are_rounded_as_in_r2flow(golden: Path, name: str, k: int) -> None:
+    """R2Flow rounds its time (0 = noise) down to floor(t k) / k, where a sampler of k steps evaluates."""
     vectors = load_file(golden / "r2flow_losses.safetensors")
     theirs = vectors[f"timesteps/{name}/first_64"]
     grid = uniform_grid(k)
@@ -140,20 +140,20 @@ def test_intervals_are_closed_at_their_noisier_end() -> None:
 
 
 @pytest.mark.parametrize("name", ["uniform_piecewise", "timestep_distillation"])
-def test_a_grid_that_is_not_uniform(name: str) -> None:
+def test_a_grid_that_is_not_uniform_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=r"time grid \(1.0, 0.86.* which is uniform"):
         STRATEGIES[name](gaussian_velocity, DATA, NOISE, U, ADAPTIVE, 2, None)
 
 
 @pytest.mark.parametrize("name", sorted(set(STRATEGIES) - {"reflow"}))
 @pytest.mark.parametrize("grid", [(0.0, 0.5, 1.0), (1.0, 0.5, 0.1), (0.9, 0.45, 0.0), (1.0,)])
-def test_grids_that_no_student_has(name: str, grid: tuple[float, ...]) -> None:
+def test_invalid_student_grids_are_refused(name: str, grid: tuple[float, ...]) -> None:
     expected = "at least two descending times|one that runs from 1 down to 0|which is uniform"
     with pytest.raises(ConfigError, match=rf"time grid [\[(].*; expected .*({expected})"):
         STRATEGIES[name](gaussian_velocity, DATA, NOISE, U, grid, 2, None)
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
-def test_no_steps_of_the_teacher(name: str) -> None:
+def test_zero_teacher_steps_are_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="0 steps of the teacher; expected at least 1"):
         STRATEGIES[name](gaussian_velocity, DATA, NOISE, U, grid_of(name), 0, None)

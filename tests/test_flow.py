@@ -40,8 +40,8 @@ def test_the_path_runs_from_data_to_noise_at_its_velocity() -> None:
     assert torch.equal(example.t, t) and example.teacher_evaluations == 0
 
 
-def test_flow_matching_is_least_at_the_true_velocity() -> None:
-    """For Gaussian data the best velocity E[y1 - y0 | y_t] is known: what is left over does not depend on y_t."""
+def test_the_flow_matching_loss_is_minimal_at_the_true_velocity() -> None:
+    """For Gaussian data, the optimal velocity E[y1 - y0 | y_t] is known, and its residual is independent of y_t."""
     count = 20000
     y0 = 0.5 + 0.1 * gaussian(0, range(count), (1,), dtype=torch.float64)
     example = flow_matching(y0, gaussian(1, range(count), (1,), dtype=torch.float64), uniform(2, range(count)))
@@ -61,8 +61,8 @@ def test_the_loss_passes_the_condition_on() -> None:
     assert loss.item() == 2.0
 
 
-def test_autoguidance_leads_away_from_the_mistake_of_both() -> None:
-    """Data of deviation 0.1, a model that takes it for 0.15, a weaker one that takes it for 0.2."""
+def test_autoguidance_reduces_the_error_that_both_models_share() -> None:
+    """Data of standard deviation 0.1, a model fitted to 0.15, and a weaker one fitted to 0.2."""
     model, weaker = (partial(gaussian_velocity, spread=spread) for spread in (1.5 * STD, 2 * STD))
     noise, grid = gaussian(0, range(4000), (1,), dtype=torch.float64), uniform_grid(50)
 
@@ -81,11 +81,11 @@ def test_autoguidance_passes_the_condition_on() -> None:
     y, t, cond = torch.randn(3, 2), torch.rand(3), torch.randn(3, 2)
     out = autoguided(lambda y, t, c: y + c, lambda y, t, c: y - c, 3.0)(y, t, cond)
     assert torch.allclose(out, y + 5 * cond)
-    halves = (lambda y, t, c: (y + c).bfloat16(), lambda y, t, c: (y - c).bfloat16())  # as autocast leaves them
+    halves = (lambda y, t, c: (y + c).bfloat16(), lambda y, t, c: (y - c).bfloat16())  # dtype under autocast
     assert torch.allclose(autoguided(*halves, 3.0)(y, t, cond), y + 5 * cond, atol=0.2)
 
 
-def test_autoguidance_leads_within_its_times() -> None:
+def test_autoguidance_is_limited_to_its_time_interval() -> None:
     y, t = torch.ones(5, 2), torch.tensor([0.05, 0.1, 0.5, 0.9, 0.95])
     out = autoguided(lambda y, t, c: 3 * y, lambda y, t, c: y, 2.0, within=(0.1, 0.9))(y, t, None)
     assert out[:, 0].tolist() == [3, 5, 5, 5, 3] and torch.equal(out[:, 0], out[:, 1])
@@ -105,7 +105,7 @@ def test_metrics_are_distances_per_sample(name: str) -> None:
         METRICS[name](a, b.flatten(1))
 
 
-def test_metrics_by_hand() -> None:
+def test_metrics_equal_values_computed_by_hand() -> None:
     a, b = torch.tensor([[3.0, 0.0, 0.0, 0.0]]), torch.tensor([[0.0, -4.0, 0.0, 0.0]])
     assert METRICS["squared_l2"](a, b).item() == 25 / 4
     assert METRICS["l1"](a, b).item() == 7 / 4
@@ -114,7 +114,7 @@ def test_metrics_by_hand() -> None:
 
 
 @pytest.mark.parametrize("case", range(3))
-def test_pseudo_huber_is_r2flows(golden: Path, case: int) -> None:
+def test_pseudo_huber_equals_that_of_r2flow(golden: Path, case: int) -> None:
     stored = load_file(golden / "r2flow_losses.safetensors")
     vectors = {k.split("/")[1]: v for k, v in stored.items() if f"_{case}/" in k}
     v = vectors["v"].requires_grad_()
@@ -122,15 +122,15 @@ def test_pseudo_huber_is_r2flows(golden: Path, case: int) -> None:
     assert loss.item() == pytest.approx(vectors["loss"].item(), rel=1e-6)
     loss.backward()
     assert torch.allclose(v.grad, vectors["grad_v"], rtol=1e-5, atol=1e-12)
-    # What sqrt(e^2 + c^2) - c keeps of small errors in float32 depends on the machine: up to its rounding of c.
+    # In float32, sqrt(e^2 + c^2) - c loses small errors to rounding, by an amount that depends on the machine.
     c = 0.03 * math.sqrt(v[0].numel())
     other = pseudo_huber(v, vectors["u"], 0.03).mean()
     assert other.item() == pytest.approx(vectors["loss_coef_0.03"].item(), rel=1e-6, abs=2**-24 * c)
 
 
 @pytest.mark.parametrize("name", ["uniform", "u_shaped", "logit_normal"])
-def test_distributions_of_t_are_r2flows(golden: Path, name: str) -> None:
-    """Their time runs the other way; all three are symmetric, and so are tested both ways."""
+def test_distributions_of_t_equal_those_of_r2flow(golden: Path, name: str) -> None:
+    """R2Flow's time runs the other way; all three distributions are symmetric and are compared both ways."""
     vectors = load_file(golden / "r2flow_losses.safetensors")
     t = TIMESTEPS[name](uniform(0, range(10000))).double()
     for ours in (t, 1 - t):
@@ -160,7 +160,9 @@ def test_distributions_of_t_are_quantile_functions_within_0_and_1(name: str) -> 
         (logit_normal, lambda t: torch.exp(-(torch.logit(t) ** 2) / 2) / (math.sqrt(2 * math.pi) * t * (1 - t))),
     ],
 )
-def test_densities(quantile: Callable[[Tensor], Tensor], density: Callable[[Tensor], Tensor]) -> None:
+def test_quantile_functions_have_the_documented_densities(
+    quantile: Callable[[Tensor], Tensor], density: Callable[[Tensor], Tensor]
+) -> None:
     u = torch.linspace(0.05, 0.95, 19, dtype=torch.float64, requires_grad=True)
     t = quantile(u)
     (slope,) = torch.autograd.grad(t.sum(), u)

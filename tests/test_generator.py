@@ -1,4 +1,4 @@
-"""The generator: a scan is a function of (checkpoint, condition, grid, seed, index); what cannot be is refused."""
+"""The generator: a scan is a function of (checkpoint, condition, grid, seed, index); invalid requests are refused."""
 
 from dataclasses import replace
 from functools import partial
@@ -11,18 +11,15 @@ import pytest
 import torch
 from conftest import random_scan
 from hypothesis import given, settings
-from layouts import write_all
 from PIL import Image
-from typer.testing import CliRunner
+from small_models import GRID, SENSOR, write
 
 import lidar_synth.generate.generator as module
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.flow.solvers import solve, uniform_grid
-from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.checkpoint import (
     CODEC,
-    ENCODER,
     VELOCITY,
     Header,
     NetworkSpec,
@@ -34,39 +31,9 @@ from lidar_synth.generate.generator import Generator, load_generator, shipped_mo
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC
-from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import AUTOENCODERS, build_network
+from lidar_synth.models import NETWORKS, build_network
 from lidar_synth.noise import gaussian
 from lidar_synth.town import Town
-
-SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
-GRID = (1.0, 0.8, 0.5, 0.0)
-
-
-def write(path: Path, channels: tuple[str, ...] = tuple(CHANNELS), dropout: float | None = None) -> Path:
-    """A checkpoint with random weights; with a ``dropout`` a semantic map is its condition."""
-    condition_channels = 0 if dropout is None else 3
-    arguments = {
-        "resolution": SENSOR.shape, "channels": sum(CHANNELS[c] for c in channels), "width": 16, "time_width": 16,
-        "depths": (1, 1), "heads": (2, 2), "patch": (2, 2), "window": (3, 3), "condition_channels": condition_channels,
-    }  # fmt: skip
-    torch.manual_seed(0)
-    network = build_network("hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())})
-    for parameter in network.parameters():
-        torch.nn.init.normal_(parameter, std=0.2)  # a fresh network answers zero
-    header = Header(
-        networks={VELOCITY: NetworkSpec("hdit", arguments)}, sensor=SENSOR, normalisation=NORMALISATIONS["r2flow"],
-        channels=channels, time_grid=GRID, provenance={"data": "none", "data_licence": "none", "licence": "MIT"},
-    )  # fmt: skip
-    networks = {VELOCITY: network}
-    if dropout is not None:
-        encoder = NetworkSpec("semantic_map", {"resolution": SENSOR.shape, "target": SENSOR.shape, "channels": 3})
-        networks[ENCODER] = build_network(*encoder)
-        torch.nn.init.normal_(networks[ENCODER].mix.weight, std=2.0)
-        conditioning = {"semantic": {"dropout": dropout}}
-        header = replace(header, networks=header.networks | {ENCODER: encoder}, conditioning=conditioning)
-    save_checkpoint(path, header, networks)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +46,7 @@ def generator(path: Path) -> Generator:
     return load_generator(path)
 
 
-def test_images_are_the_flow_from_the_contracts_noise(generator: Generator) -> None:
+def test_images_are_the_solution_of_the_flow_from_the_documented_noise(generator: Generator) -> None:
     noise = gaussian(5, [3, 9], (generator.tensors.size, *SENSOR.shape))
     with torch.inference_mode():
         expected = generator.tensors.to_images(solve(generator.network, noise, GRID), SENSOR)
@@ -95,7 +62,7 @@ def test_images_are_the_flow_from_the_contracts_noise(generator: Generator) -> N
 
 @settings(max_examples=10)
 @given(indices=st.lists(st.integers(0, 2**62), min_size=1, max_size=5), batch=st.integers(1, 3))
-def test_what_is_sampled_along_with_a_scan_does_not_matter(
+def test_a_scan_does_not_depend_on_the_others_of_its_batch(
     generator: Generator, indices: list[int], batch: int
 ) -> None:
     together = torch.cat(list(replace(generator, batch=batch).samples(7, indices)))
@@ -104,7 +71,7 @@ def test_what_is_sampled_along_with_a_scan_does_not_matter(
         assert (together[i] - alone[0]).abs().max() <= 1e-4
 
 
-def test_the_inner_batch_bounds_what_is_solved_at_once(generator: Generator) -> None:
+def test_the_batch_size_limits_the_scans_solved_at_once(generator: Generator) -> None:
     sizes = [len(tensor) for tensor in replace(generator, batch=3).samples(0, range(7))]
     assert sizes == [3, 3, 1]
     assert generator.range_images(0, []) == []
@@ -116,7 +83,13 @@ def test_scans_are_the_returns_of_the_images(generator: Generator) -> None:
     assert len(scan) == image.mask.sum()
     assert np.array_equal(scan.label, image.label[image.mask])
     assert np.array_equal(scan.confidence, image.channels["confidence"][image.mask])
-    assert np.array_equal(project(scan).mask, image.mask)  # every return goes back to its own cell
+    assert np.array_equal(project(scan).mask, image.mask)  # every return is projected into its own cell
+
+
+def test_an_unknown_sampling_option_is_refused(generator: Generator) -> None:
+    for call in (generator.scans, generator.range_images):
+        with pytest.raises(TypeError, match="unexpected keyword argument 'step'"):
+            call(0, [0], step=2)
 
 
 def test_steps_and_solver_replace_the_checkpoints_own_grid(generator: Generator) -> None:
@@ -132,7 +105,7 @@ def test_steps_and_solver_replace_the_checkpoints_own_grid(generator: Generator)
 
 
 @pytest.mark.parametrize("channels", [("range",), ("range", "reflectance")])
-def test_a_model_gives_what_its_checkpoint_has(channels: tuple[str, ...], tmp_path: Path) -> None:
+def test_scans_have_the_channels_of_the_checkpoint(channels: tuple[str, ...], tmp_path: Path) -> None:
     generator = load_generator(write(tmp_path / "few.safetensors", channels))
     [image], [scan] = generator.range_images(0, [0]), generator.scans(0, [0])
     assert set(image.channels) == set(channels) - {"range"}
@@ -150,7 +123,7 @@ def label_maps(count: int) -> np.ndarray:
     return np.random.default_rng(0).choice([0, 8, 18, IGNORE], (count, *SENSOR.shape)).astype(np.uint8)
 
 
-def test_conditions(tmp_path: Path, generator: Generator) -> None:
+def test_arrays_tensors_and_dictionaries_are_accepted_as_conditions(tmp_path: Path, generator: Generator) -> None:
     conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
     many = label_maps(3)
     same = conditioned.range_images(0, [4, 4], many[0])
@@ -168,7 +141,7 @@ def test_conditions(tmp_path: Path, generator: Generator) -> None:
     assert (generator.condition, conditioned.condition) == (None, "semantic")
 
 
-def test_the_map_labels_the_scan_that_was_made_of_it(tmp_path: Path, generator: Generator) -> None:
+def test_a_label_map_also_labels_the_generated_scan(tmp_path: Path, generator: Generator) -> None:
     conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range", "reflectance"), 0.0))
     assert conditioned.fields == {"reflectance", "label", "confidence"} == generator.fields
     [labels] = label_maps(1)
@@ -179,7 +152,7 @@ def test_the_map_labels_the_scan_that_was_made_of_it(tmp_path: Path, generator: 
     assert np.array_equal(scan.label, labels[image.mask])
 
 
-def test_real_scans_are_conditions(tmp_path: Path) -> None:
+def test_real_scans_provide_their_labels_as_conditions(tmp_path: Path) -> None:
     conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
     scans = [random_scan(SENSOR, 400, seed) for seed in range(2)]
     maps = np.stack([project(scan, SENSOR, ["label"]).label for scan in scans])
@@ -189,7 +162,7 @@ def test_real_scans_are_conditions(tmp_path: Path) -> None:
     assert np.array_equal(a.points, b.points)
 
 
-def test_guidance(tmp_path: Path) -> None:
+def test_guidance_interpolates_between_blank_and_given_condition(tmp_path: Path) -> None:
     guided = load_generator(write(tmp_path / "guided.safetensors", ("range",), 0.1))
     maps = label_maps(2)
     [plain] = guided.samples(0, [1], maps[0], guidance=1.0)
@@ -201,11 +174,13 @@ def test_guidance(tmp_path: Path) -> None:
     many = torch.cat(list(replace(guided, batch=2).samples(0, [1, 5], maps, guidance=2.0)))
     assert torch.allclose(many[0], more[0], atol=1e-4)
     never = load_generator(write(tmp_path / "never.safetensors", ("range",), 0.0))
-    with pytest.raises(ConfigError, match="guidance 2.0 for 'never'; expected 1: .*never met a blank condition"):
+    with pytest.raises(ConfigError, match="guidance 2.0 for 'never'; expected 1: .*trained without blank conditions"):
         never.scans(0, [1], maps[0], guidance=2.0)
 
 
-def test_names_and_paths(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_models_are_found_by_shipped_name_or_by_path(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "weights").mkdir()
     monkeypatch.setattr(module, "files", lambda package: tmp_path)
     with pytest.raises(ConfigError, match=r"model 'town'; expected a shipped one \(none in this installation\)"):
@@ -228,12 +203,12 @@ CODECS = {
 
 
 def write_latent(path: Path, architecture: str) -> Path:
-    """A latent model with random weights."""
+    """Write a latent model with random weights."""
     given = {"resolution": SENSOR.shape, "channels": 7}
     codec = NetworkSpec(architecture, given | CODECS[architecture])
     torch.manual_seed(0)
-    looks = {"angles": torch.from_numpy(SENSOR.ray_angles())} if architecture == "autoencoder" else {}
-    autoencoder = build_network(architecture, codec.arguments | looks)
+    needed = {"angles": torch.from_numpy(SENSOR.ray_angles())} if NETWORKS[architecture].needs_ray_angles else {}
+    autoencoder = build_network(architecture, codec.arguments | needed)
     channels, *resolution = autoencoder.latent_shape
     arguments = {"resolution": resolution, "channels": channels, "width": 16, "time_width": 16, "depths": (1,),
                  "heads": (2,), "patch": (1, 1), "window": (1, 1)}  # fmt: skip
@@ -247,9 +222,9 @@ def write_latent(path: Path, architecture: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("architecture", AUTOENCODERS)
+@pytest.mark.parametrize("architecture", [name for name, cls in NETWORKS.items() if cls.is_autoencoder])
 def test_compile_compiles_the_decoder_too(architecture: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a backend that counts graphs and convolutions; the default one would need a C++ compiler."""
+    """Uses a backend that counts graphs and convolutions; the default backend needs a C++ compiler."""
     graphs: list[int] = []
 
     def counting(graph: torch.fx.GraphModule, inputs: object) -> object:
@@ -259,16 +234,16 @@ def test_compile_compiles_the_decoder_too(architecture: str, tmp_path: Path, mon
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=counting))
     path = write_latent(tmp_path / "latent.safetensors", architecture)
     compiled, eager = load_generator(path, compile=True), load_generator(path)
-    z, chance = torch.randn(1, *eager.codec.shape), torch.full((1, eager.codec.draws, *SENSOR.shape), 0.4)
-    given = chance if eager.codec.draws else None
+    z, uniform_noise = torch.randn(1, *eager.codec.shape), torch.full((1, eager.codec.draws, *SENSOR.shape), 0.4)
+    given = uniform_noise if eager.codec.draws else None
     torch.testing.assert_close(compiled.codec.decode(z, given), eager.codec.decode(z, given))
     assert sum(graphs) >= 5
     before = len(graphs)
     compiled.scans(0, [0])
-    assert len(graphs) > before  # the flow
+    assert len(graphs) > before  # those of the flow
 
 
-def test_what_ships_is_known_by_its_hash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_damaged_shipped_checkpoint_is_detected_by_its_hash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A header of the older format has no checksum: one byte could change the time grid or the range limit."""
     for name, file in shipped_models().items():
         assert has_checksum(file) or read_header(file)[1] == module.SHIPPED[name]
@@ -284,18 +259,18 @@ def test_what_ships_is_known_by_its_hash(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta", "cpu:1"])
-def test_a_device_that_is_not_there(path: Path, device: str) -> None:
-    with pytest.raises(ConfigError, match=rf"device '{device}'; expected one that torch finds here: cpu"):
+def test_an_unavailable_device_is_refused(path: Path, device: str) -> None:
+    with pytest.raises(ConfigError, match=rf"device '{device}'; expected an available one: cpu"):
         load_generator(path, device=device)
 
 
-def test_mps_is_refused_where_there_is_none(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mps_is_refused_if_it_is_unavailable(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    with pytest.raises(ConfigError, match="device 'mps'; expected one that torch finds here: cpu"):
+    with pytest.raises(ConfigError, match="device 'mps'; expected an available one: cpu"):
         load_generator(path, device="mps")
 
 
-def test_what_ships_can_be_loaded(tmp_path: Path) -> None:
+def test_the_shipped_models_generate_scans(tmp_path: Path) -> None:
     town = Town(1, scans=1)
     Image.fromarray(town.image(0)).save(tmp_path / "seen.png")
     real = replace(town[0], image_path=tmp_path / "seen.png")
@@ -307,11 +282,11 @@ def test_what_ships_can_be_loaded(tmp_path: Path) -> None:
         assert len(scan) > 10_000
 
 
-def test_a_gpu_is_refused_where_there_is_none_and_in_a_worker(
+def test_a_gpu_is_refused_if_it_is_unavailable_and_in_dataloader_workers(
     path: Path, generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not torch.cuda.is_available():
-        with pytest.raises(ConfigError, match="device 'cuda'; expected one that torch finds here: cpu"):
+        with pytest.raises(ConfigError, match="device 'cuda'; expected an available one: cpu"):
             load_generator(path, device="cuda")
     monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=0))
     three_ways = r"\(A\) bake .*\(B\) a rolling .*\(C\) mix in"
@@ -322,89 +297,3 @@ def test_a_gpu_is_refused_where_there_is_none_and_in_a_worker(
         generator.scans(0, [0])
     monkeypatch.setattr(Generator, "device", torch.device("cpu"))
     assert generator.scans(0, [0])
-
-
-@pytest.mark.parametrize("form", [name for name in WRITERS if name != "kitti_object"])  # no model gives boxes
-def test_sample_writes_every_format_and_goes_on(form: str, path: Path, tmp_path: Path) -> None:
-    from lidar_synth.cli import app
-
-    def sample(*options: str) -> str:
-        result = CliRunner().invoke(
-            app, ["sample", str(tmp_path / "out"), "--model", str(path), "--to", form, *options]
-        )
-        assert result.exception is None, result.exception
-        return result.output
-
-    assert "2 scans written, 0 were there already" in sample("--count", "2", "--seed", "4")
-    assert "1 scans written, 2 were there already" in sample("--count", "3", "--seed", "4")
-    if form in ("npz", "semantic_kitti", "kitti", "webdataset"):
-        written = open_scans(tmp_path / "out", sensor=SENSOR)
-        expected = load_generator(path).scans(4, range(3))
-        assert len(written) == 3
-        for a, b in zip(written, expected, strict=True):
-            assert np.allclose(a.points, b.points, atol=1e-4)
-            assert np.array_equal(a.label, b.label)
-
-
-def test_samples_of_another_seed_do_not_pass_for_those_that_are_there(path: Path, tmp_path: Path) -> None:
-    from lidar_synth.cli import app
-
-    call = ["sample", str(tmp_path / "out"), "--model", str(path), "--count", "1"]
-    assert CliRunner().invoke(app, [*call, "--seed", "4"]).exception is None
-    before = (tmp_path / "out" / "000000.npz").read_bytes()
-    with pytest.raises(ConfigError, match=r"'seed': 4.*'seed': 5"):
-        CliRunner().invoke(app, [*call, "--seed", "5"], catch_exceptions=False)
-    assert (tmp_path / "out" / "000000.npz").read_bytes() == before
-
-
-def test_sample_takes_its_conditions_from_a_dataset(tmp_path: Path) -> None:
-    from lidar_synth.cli import app
-
-    guided = write(tmp_path / "guided.safetensors", ("range",), 0.1)
-    real = [random_scan(SENSOR, 400, seed) for seed in range(2)]
-    write_all("semantic_kitti", tmp_path / "real", real)
-    call = ["sample", str(tmp_path / "out"), "--model", str(guided), "--seed", "3", "--guidance", "2"]
-    given = [
-        "--condition",
-        str(tmp_path / "real"),
-        "--condition-split",
-        "train",
-        "--condition-layout",
-        "semantic_kitti",
-    ]
-    result = CliRunner().invoke(app, [*call, *given, "--count", "1"])
-    assert result.exception is None, result.exception
-    result = CliRunner().invoke(app, [*call, *given, "--count", "3"])
-    assert result.exception is None and "2 scans written, 1 were there already" in result.output
-    expected = load_generator(guided).scans(3, range(3), [real[0], real[1], real[0]], guidance=2.0)
-    for a, b in zip(open_scans(tmp_path / "out"), expected, strict=True):
-        assert a.id == f"{int(b.id.rpartition('/')[2]):06d}"
-        assert np.allclose(a.points, b.points, atol=1e-3)
-        assert np.array_equal(a.label, b.label) and len(np.unique(a.label)) > 2
-    for change, message in (
-        (["--guidance", "1"], r"'guidance': 2.0.*'guidance': 1.0"),
-        (["--condition", str(tmp_path)], "no scan in a layout|no sequence"),
-    ):
-        with pytest.raises((ConfigError, DataError), match=message):
-            CliRunner().invoke(app, [*call, *given, *change], catch_exceptions=False)
-
-
-@pytest.mark.parametrize(
-    ("conditional", "options", "error", "message"),
-    [
-        (True, [], ConfigError, "condition None for model 'model', which takes semantic conditions; expected a data"),
-        (False, ["--condition", "real"], ConfigError, "condition real for model 'model', which takes no condition"),
-        (True, ["--condition", "nowhere"], FileError, "nowhere does not exist"),
-        (False, ["--condition-split", "train"], ConfigError, "split train, but no dataset; expected --condition PATH"),
-    ],
-)
-def test_sample_refuses_conditions_that_do_not_fit(
-    conditional: bool, options: list[str], error: type[Exception], message: str, tmp_path: Path
-) -> None:
-    from lidar_synth.cli import app
-
-    model = write(tmp_path / "model.safetensors", ("range",), 0.1 if conditional else None)
-    call = ["sample", str(tmp_path / "out"), "--model", str(model), *options]
-    with pytest.raises(error, match=message):
-        CliRunner().invoke(app, call, catch_exceptions=False)
-    assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""HDiT against the numbers that R2Flow's own code gave for the same weights."""
+"""HDiT against golden results of R2Flow's own code with the same weights."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def distance(a: Tensor, b: Tensor) -> float:
-    """Relative in the l2 norm."""
+    """Relative distance in the l2 norm."""
     return float((a - b).detach().norm() / b.norm())
 
 
@@ -28,7 +28,7 @@ def read_golden(folder: Path, name: str) -> tuple[dict[str, Any], dict[str, Tens
 
 
 def golden_network(folder: Path, name: str) -> tuple[HDiT, dict[str, Tensor], float]:
-    """A golden network through the importer, its tensors, and the tolerance of its numbers."""
+    """An imported golden network, its golden tensors, and their tolerance."""
     about, tensors = read_golden(folder, name)
     config = about["config"]
     arguments = {
@@ -52,8 +52,8 @@ TINY = ("r2flow_hdit_tiny_learnable", "r2flow_hdit_tiny_fourier")
 
 @pytest.mark.parametrize("grad", [False, True], ids=["inference", "training"])
 @pytest.mark.parametrize("name", TINY)
-def test_golden_velocities(golden: Path, name: str, grad: bool) -> None:
-    """v(y, t) = -u(1 - t, y): the peer's t = 0 is noise and its velocity points to the data."""
+def test_velocities_equal_those_of_r2flow(golden: Path, name: str, grad: bool) -> None:
+    """v(y, t) = -u(1 - t, y): R2Flow's t = 0 is noise, and its velocity points to the data."""
     net, tensors, tolerance = golden_network(golden, name)
     with torch.set_grad_enabled(grad):
         assert distance(-net(tensors["input.x"], 1 - tensors["input.t"]), tensors["output"]) < tolerance
@@ -63,7 +63,7 @@ def test_golden_velocities(golden: Path, name: str, grad: bool) -> None:
 
 @pytest.mark.parametrize("name", TINY)
 @torch.no_grad()
-def test_golden_intermediate_results(golden: Path, name: str) -> None:
+def test_intermediate_results_equal_those_of_r2flow(golden: Path, name: str) -> None:
     net, tensors, tolerance = golden_network(golden, name)
     taps = {}
     net.down[0][-1].register_forward_hook(lambda _, __, out: taps.update(down_level_0=out))
@@ -80,8 +80,8 @@ def test_golden_intermediate_results(golden: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", TINY)
 @torch.no_grad()
-def test_golden_sampling(golden: Path, name: str) -> None:
-    """Euler steps in our time, downwards, pass through the peer's states."""
+def test_sampled_states_equal_those_of_r2flow(golden: Path, name: str) -> None:
+    """Euler steps in our descending time reach the same states as R2Flow's."""
     net = golden_network(golden, name)[0]
     about, tensors = read_golden(golden, "r2flow_sampling")
     tolerance = max(1e-5, 20 * about["models"][name]["f32_vs_f64"]["rel_l2"])
@@ -99,7 +99,7 @@ def test_golden_sampling(golden: Path, name: str) -> None:
 @pytest.mark.parametrize("grid", ["polar", "hdl64e"])
 @pytest.mark.parametrize("basis", sorted(BASES))
 @torch.no_grad()
-def test_golden_positions(golden: Path, basis: str, grid: str) -> None:
+def test_position_encodings_equal_those_of_r2flow(golden: Path, basis: str, grid: str) -> None:
     about, tensors = read_golden(golden, "r2flow_positions")
     config, coords = about["config"], tensors[f"input.coords_{grid}"][0]
     expected = tensors[f"basis.{basis}/{grid}"][0].movedim(0, -1)

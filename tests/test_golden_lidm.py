@@ -1,4 +1,4 @@
-"""U-Net, autoencoder and label maps against the numbers that LiDM's own code gave for the same weights."""
+"""U-Net, autoencoder and label maps against golden results of LiDM's own code with the same weights."""
 
 import json
 from pathlib import Path
@@ -21,12 +21,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def distance(a: Tensor, b: Tensor) -> float:
-    """Relative in the l2 norm."""
+    """Relative distance in the l2 norm."""
     return float((a - b).detach().norm() / b.norm())
 
 
 def read_golden(folder: Path, name: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
-    """What is known about it, its tensors, its weights."""
+    """The description, the golden tensors and the weights of a network."""
     tensors = load_file(folder / f"{name}.safetensors")
     weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}
     return json.loads((folder / f"{name}.json").read_text()), tensors, weights
@@ -38,7 +38,7 @@ def tolerance(figures: dict[str, float]) -> float:
 
 @pytest.mark.parametrize("grad", [False, True], ids=["inference", "training"])
 @pytest.mark.parametrize("name", ["lidm_unet_tiny_uncond", "lidm_unet_tiny_context"])
-def test_golden_unet(golden: Path, name: str, grad: bool) -> None:
+def test_the_unet_equals_that_of_lidm(golden: Path, name: str, grad: bool) -> None:
     about, tensors, weights = read_golden(golden, name)
     parts = {VELOCITY: unet_part(about["config"], name)}
     net = cast(DiffusionUNet, convert({UNET + k: v for k, v in weights.items()}, parts)[VELOCITY])
@@ -55,7 +55,7 @@ def test_golden_unet(golden: Path, name: str, grad: bool) -> None:
 
 
 @torch.no_grad()
-def test_golden_autoencoder(golden: Path) -> None:
+def test_the_autoencoder_equals_that_of_lidm(golden: Path) -> None:
     about, tensors, weights = read_golden(golden, "lidm_vqvae_tiny")
     net = cast(VQVAE, convert(weights, {CODEC: codec_part(about["config"], about["size"], "")})[CODEC])
     assert sum(p.numel() for p in net.parameters()) == about["parameters"]
@@ -74,12 +74,12 @@ def test_golden_autoencoder(golden: Path) -> None:
 
 HERE = Path(__file__).parent / "golden"
 SPREAD = {"quantize": 0.5, "quant_conv": 4.0, "post_quant_conv": 1.0, "decoder": 0.12}
-"""Standard deviations of random weights, by the first word of their names; 0.1 of all others."""
+"""Standard deviations of random weights, by the first component of their names; 0.1 for all others."""
 
 
 @torch.no_grad()
-def test_golden_mask() -> None:
-    """An autoencoder with ``use_mask`` and attention in a level, by the peer's code in float64."""
+def test_the_masked_autoencoder_equals_that_of_lidm() -> None:
+    """An autoencoder with ``use_mask`` and attention in a level, against LiDM's code in float64."""
     with np.load(HERE / "lidm_vqvae_mask.npz") as file:
         values = dict(file)
     config, shapes = json.loads(str(values.pop("config"))), json.loads(str(values.pop("shapes")))
@@ -100,15 +100,15 @@ def test_golden_mask() -> None:
     raw, output = net._decode(quantised), net.decode(latent)
     assert raw.shape == expected["raw"].shape == (2, 2, *size)
     assert distance(raw, expected["raw"]) < 1e-5
-    sure = expected["raw"][:, 1:].abs() > 1e-3  # rounding can move the others over 0
+    sure = expected["raw"][:, 1:].abs() > 1e-3  # rounding can change the sign of the others
     assert output.shape == (2, 1, *size)
     assert distance(output[sure], expected["output"][sure]) < 1e-5
     assert 0.3 < (output == -1).float().mean() < 0.7
 
 
 @torch.no_grad()
-def test_golden_label_map(golden: Path) -> None:
-    """Their unlabelled is 0 and their classes begin at 1; ours are 255 and 0."""
+def test_encoded_label_maps_equal_those_of_lidm(golden: Path) -> None:
+    """LiDM uses 0 for unlabelled and classes from 1; we use 255 and classes from 0."""
     about, tensors, weights = read_golden(golden, "lidm_spatial_rescaler")
     theirs = tensors["input.labels"]
     assert len(theirs.unique()) == about["config"]["in_channels"]

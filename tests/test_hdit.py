@@ -23,13 +23,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def angles(rows: int, columns: int) -> Tensor:
-    """Elevation falling and azimuth rising over a grid."""
+    """Ray angles of a grid: descending elevation, ascending azimuth."""
     grid = torch.meshgrid(torch.linspace(0.05, -0.4, rows), torch.linspace(-3.1, 3.1, columns), indexing="ij")
     return torch.stack(grid)
 
 
 def network(seed: int = 0, **arguments: Any) -> HDiT:
-    """A small network all of whose weights count (fresh ones leave every residual layer at zero)."""
+    """A small network with random weights (in a fresh one, every residual layer is zero)."""
     torch.manual_seed(seed)
     net = HDiT(**{**SMALL, "angles": angles(*arguments.get("resolution", SMALL["resolution"])), **arguments})
     for parameter in net.parameters():
@@ -38,12 +38,12 @@ def network(seed: int = 0, **arguments: Any) -> HDiT:
 
 
 def distance(a: Tensor, b: Tensor) -> float:
-    """Relative in the l2 norm."""
+    """Relative distance in the l2 norm."""
     return float((a - b).detach().norm() / b.norm())
 
 
 def by_definition(q: Tensor, k: Tensor, v: Tensor, grid: tuple[int, int], window: tuple[int, int]) -> Tensor:
-    """Neighbourhood attention, one token after the other."""
+    """Neighbourhood attention by its definition, token by token."""
     out = torch.empty_like(v)
     for row in range(grid[0]):
         top = min(max(row - window[0] // 2, 0), grid[0] - window[0])
@@ -77,7 +77,7 @@ def test_neighbourhood_attention_is_exact(
         torch.testing.assert_close(attend(q, k, v), by_definition(q, k, v, grid, window))
 
 
-def test_every_query_sees_its_whole_window() -> None:
+def test_every_query_attends_to_its_full_window() -> None:
     attend = NeighbourhoodAttention((4, 12), (3, 9))
     assert (attend.mask.sum(1) == 27).all()
     assert attend.tokens.flatten().sort().values.tolist() == list(range(48))
@@ -85,7 +85,7 @@ def test_every_query_sees_its_whole_window() -> None:
 
 @settings(max_examples=30)
 @given(rows=st.integers(1, 4), columns=st.integers(1, 4), patch=st.tuples(st.integers(1, 3), st.integers(1, 4)))
-def test_patches_come_back(rows: int, columns: int, patch: tuple[int, int]) -> None:
+def test_from_patches_inverts_to_patches(rows: int, columns: int, patch: tuple[int, int]) -> None:
     resolution = (rows * patch[0], columns * patch[1])
     x = torch.randn(2, *resolution, 3)
     assert torch.equal(from_patches(to_patches(x, patch), patch, resolution), x)
@@ -100,7 +100,7 @@ def test_the_full_network_has_the_published_size() -> None:
 @pytest.mark.parametrize("position", POSITIONS)
 @pytest.mark.parametrize("resolution", [(8, 64), (24, 96), (12, 80)])
 @torch.no_grad()
-def test_any_resolution_and_position(position: str, resolution: tuple[int, int]) -> None:
+def test_every_position_encoding_works_at_several_resolutions(position: str, resolution: tuple[int, int]) -> None:
     net = network(resolution=resolution, position=position, channels=7)
     y = torch.randn(2, 7, *resolution)
     v = net(y, torch.tensor([0.2, 0.9]))
@@ -111,10 +111,10 @@ def test_any_resolution_and_position(position: str, resolution: tuple[int, int])
 
 
 @torch.no_grad()
-def test_a_turned_scene_gives_a_turned_velocity() -> None:
-    """There is no seam: with the angles turned along, the network does not know where the image begins."""
+def test_the_network_is_equivariant_to_rotations_about_the_vertical() -> None:
+    """If the angles are rotated with the image, the network has no seam at the first column."""
     net = network(position="polar_coordinates")
-    y, shift = torch.randn(1, 2, 8, 64), 16  # a coarsest token has 16 columns
+    y, shift = torch.randn(1, 2, 8, 64), 16  # a token of the coarsest level has 16 columns
     turned = copy.deepcopy(net)
     turned.angles.cells = net.angles.cells.roll(shift, -1)
     torch.testing.assert_close(turned(y.roll(shift, -1), 0.5), net(y, 0.5).roll(shift, -1), rtol=1e-4, atol=1e-4)
@@ -122,7 +122,7 @@ def test_a_turned_scene_gives_a_turned_velocity() -> None:
 
 
 @torch.no_grad()
-def test_pieces_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_computing_in_pieces_gives_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
     net, y = network(), torch.randn(3, 2, 8, 64)
     whole = net(y, 0.5)
     monkeypatch.setattr(layers, "PIECE", 2000)
@@ -131,7 +131,7 @@ def test_pieces_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @torch.no_grad()
-def test_conditions_are_further_channels() -> None:
+def test_condition_maps_change_the_velocity() -> None:
     net = network(condition_channels=3)
     y, cond = torch.randn(2, 2, 8, 64), torch.randn(2, 3, 8, 64)
     v = net(y, 0.5, cond)
@@ -145,12 +145,14 @@ def test_conditions_are_further_channels() -> None:
 
 
 @torch.no_grad()
-def test_tokens_of_a_condition_are_attended_to() -> None:
+def test_condition_tokens_change_the_velocity() -> None:
     net = network(context_channels=5)
     y, cond = torch.randn(2, 2, 8, 64), torch.randn(2, 7, 5)
     v = net(y, 0.5, cond)
     assert v.shape == y.shape
-    torch.testing.assert_close(net(y, 0.5, cond[:, torch.randperm(7)]), v, rtol=1e-4, atol=1e-4)  # they have no order
+    torch.testing.assert_close(
+        net(y, 0.5, cond[:, torch.randperm(7)]), v, rtol=1e-4, atol=1e-4
+    )  # the order of tokens does not matter
     other = net(y, 0.5, torch.stack([cond[0], -cond[1]]))
     torch.testing.assert_close(other[0], v[0], rtol=1e-5, atol=1e-5)
     assert distance(other[1], v[1]) > 1e-3
@@ -185,7 +187,7 @@ def test_states_and_times_of_another_shape_are_refused() -> None:
     ],
     ids=str,
 )
-def test_impossible_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build_network("hdit", SMALL | arguments)
 
@@ -196,7 +198,7 @@ def test_unknown_architectures_are_refused() -> None:
 
 
 @torch.no_grad()
-def test_a_forgotten_sensor_cannot_pass() -> None:
+def test_missing_ray_angles_give_nan() -> None:
     assert network(angles=None)(torch.randn(1, 2, 8, 64), 0.5).isnan().all()
 
 
@@ -212,8 +214,8 @@ def test_gradient_checkpointing_gives_the_same_gradients() -> None:
 
 
 @torch.no_grad()
-def test_half_precision_keeps_the_angles() -> None:
-    """In bfloat16 the velocity is near, and comes in the state's type; angles and harmonics are not rounded."""
+def test_half_precision_keeps_the_angles_in_float32() -> None:
+    """In bfloat16, the velocity stays close and has the state's dtype; angles and harmonics are not rounded."""
     net, y = network(), torch.randn(2, 2, 8, 64)
     expected = net(y, 0.4)
     with torch.autocast("cpu", torch.bfloat16):

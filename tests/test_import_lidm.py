@@ -1,4 +1,4 @@
-"""LiDM's released files as checkpoints: small ones end to end, the published ones by all their keys."""
+"""Import of LiDM's releases: small models end to end, the published ones by all their keys."""
 
 import copy
 import json
@@ -66,7 +66,7 @@ def schedule(start: float = 0.0015, end: float = 0.0195) -> dict[str, Tensor]:
 
 
 def random_weights(model: dict[str, Any], folder: Path) -> dict[str, Tensor]:
-    """Of random numbers, in the shapes that the peer has; its attention's projections are convolutions."""
+    """Random weights in LiDM's shapes; the projections of its attention are convolutions."""
     from lidar_synth.generate.importers.lidm import _parts
 
     torch.manual_seed(0)
@@ -88,12 +88,12 @@ def random_weights(model: dict[str, Any], folder: Path) -> dict[str, Tensor]:
             weights[UNET_EMA + key.removeprefix("model.").replace(".", "")] = torch.randn_like(weights[key]) * 0.1
         weights |= {f"{UNET_EMA}decay": torch.tensor(0.9999), f"{UNET_EMA}num_updates": torch.tensor(7)}
     if model is CAMERA:
-        weights["cond_stage_model.model.visual.proj"] = torch.zeros(3, 3)  # frozen CLIP, which is not ours to keep
+        weights["cond_stage_model.model.visual.proj"] = torch.zeros(3, 3)  # frozen CLIP, which is not imported
     return weights
 
 
 def release(folder: Path, config: dict[str, Any], weights: dict[str, Tensor]) -> Path:
-    """A release as a user downloads it, with what training left in it."""
+    """Write a release as a user downloads it, including values that only training needs."""
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     optimizer = {"state": {0: {"step": 1, "exp_avg": torch.zeros(3)}}, "param_groups": [{"lr": 1e-6}]}
     torch.save(
@@ -131,8 +131,8 @@ def test_a_release_becomes_a_checkpoint(name: str, tmp_path: Path) -> None:
     assert header.provenance["data"] == "KITTI-360"
     seen = {part["dataset"]: part["drives"] for part in header.provenance["seen"]}
     assert "2013_05_28_drive_0002_sync" in seen["KITTI-360"]
-    assert ("odometry 21" in seen.get("KITTI", {})) == (VELOCITY in networks)  # the autoencoder's, within a flow's file
-    if VELOCITY in networks:  # the averaged weights are taken, not the last ones
+    assert ("odometry 21" in seen.get("KITTI", {})) == (VELOCITY in networks)  # by the autoencoder inside a flow's file
+    if VELOCITY in networks:  # the averaged weights are imported, not the last ones
         head = networks[VELOCITY].state_dict()["head.bias"]
         assert torch.equal(head, weights[f"{UNET_EMA}diffusion_modelout2bias"])
 
@@ -150,7 +150,7 @@ def test_imported_models_generate(tmp_path: Path) -> None:
         assert (scan.label is None) == (condition is None)
 
 
-def test_other_configurations(tmp_path: Path) -> None:
+def test_other_configurations_are_imported(tmp_path: Path) -> None:
     config = config_of(FIRST, "lidm.data.kitti.SemanticKITTITrain", log_scale=True, depth_scale=5.84)
     header, _ = read_lidm(release(tmp_path, config, random_weights(FIRST, tmp_path)))
     assert header.provenance["data"] == "SemanticKITTI"
@@ -162,15 +162,15 @@ def test_other_configurations(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("scale", "kind"), [(5.84, "log"), (56, "linear")])
-def test_an_older_configuration_names_no_scale(scale: float, kind: str, tmp_path: Path) -> None:
-    """The published autoencoders with a mask are of a time when there was the logarithm only."""
+def test_an_older_configuration_without_a_scale_is_imported(scale: float, kind: str, tmp_path: Path) -> None:
+    """The published autoencoders with a mask date from a time when the scale was always logarithmic."""
     config = config_of(MASKED, depth_scale=scale)
     del config["data"]["params"]["dataset"]["log_scale"]
     header, _ = read_lidm(release(tmp_path, config, random_weights(MASKED, tmp_path)))
     assert (header.normalisation.kind, header.normalisation.divisor) == (kind, scale)
 
 
-def test_weights_without_an_average_are_taken_as_they_are(tmp_path: Path) -> None:
+def test_weights_without_an_average_are_imported_unchanged(tmp_path: Path) -> None:
     weights = {k: v for k, v in random_weights(UNCONDITIONAL, tmp_path).items() if not k.startswith(UNET_EMA)}
     _, networks = read_lidm(release(tmp_path, config_of(UNCONDITIONAL), weights))
     assert torch.equal(networks[VELOCITY].state_dict()["head.bias"], weights[f"{UNET}out.2.bias"])
@@ -180,8 +180,8 @@ def test_weights_without_an_average_are_taken_as_they_are(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["vqvae", "uncond", "sem2lidar", "cam2lidar"])
-def test_all_keys_of_the_published_networks(name: str, golden: Path, tmp_path: Path) -> None:
-    """Up to 395 M parameters by name and shape; one number stands for each tensor."""
+def test_all_keys_of_the_published_networks_are_imported(name: str, golden: Path, tmp_path: Path) -> None:
+    """Up to 395 M parameters by name and shape; each tensor is one expanded number."""
     published = json.loads((golden / f"lidm_{name}_full_keys.json").read_text())
     zero = torch.zeros(())
     weights = {key: zero.expand(shape) for key, shape, *_ in published["keys"] if not key.startswith(UNET_EMA)}
@@ -203,7 +203,7 @@ def test_all_keys_of_the_published_networks(name: str, golden: Path, tmp_path: P
     assert header.sensor.shape == (64, 1024)
 
 
-# --- files that do not fit -------------------------------------------------------------------------------------------
+# --- invalid files ---------------------------------------------------------------------------------------------------
 
 
 def drop(weights: dict[str, Tensor]) -> None:
@@ -238,10 +238,12 @@ def reschedule(weights: dict[str, Tensor]) -> None:
         (add, r"missing keys \[\], unexpected keys \['model.extra.weight'\]"),
         (reshape, r"other shapes: codebook.codes \(8, 4\) for \(16, 4\)"),
         (rescale, r"latents scaled by 0.18"),
-        (reschedule, r"another schedule of noise than its config.yaml"),
+        (reschedule, r"another noise schedule than in its config.yaml"),
     ],
 )
-def test_weights_that_do_not_fit(spoil: Callable[[dict[str, Tensor]], None], message: str, tmp_path: Path) -> None:
+def test_weights_that_do_not_fit_are_refused(
+    spoil: Callable[[dict[str, Tensor]], None], message: str, tmp_path: Path
+) -> None:
     weights = random_weights(UNCONDITIONAL, tmp_path)
     spoil(weights)
     with pytest.raises(DataError, match=message) as caught:
@@ -259,12 +261,12 @@ def test_weights_that_do_not_fit(spoil: Callable[[dict[str, Tensor]], None], mes
         ({"linear_start": 1}, "KeyError.'first_stage_config'"),
     ],
 )
-def test_configurations_that_do_not_fit(model: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_configurations_that_do_not_fit_are_refused(model: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=message):
         read_lidm(release(tmp_path, config_of(model), {}))
 
 
-def test_the_configuration_has_to_lie_beside(tmp_path: Path) -> None:
+def test_a_missing_config_yaml_is_reported(tmp_path: Path) -> None:
     path = release(tmp_path, config_of(FIRST), random_weights(FIRST, tmp_path))
     (tmp_path / "config.yaml").write_text("[")
     with pytest.raises(DataError, match=r"config.yaml is not YAML"):
@@ -275,7 +277,7 @@ def test_the_configuration_has_to_lie_beside(tmp_path: Path) -> None:
 
 
 class Evil:
-    """Leaves a trace where it is unpickled."""
+    """An object that creates a folder when it is unpickled."""
 
     def __init__(self, trace: Path) -> None:
         self.trace = trace
@@ -287,7 +289,7 @@ class Evil:
 def test_code_in_a_pickle_does_not_run(tmp_path: Path) -> None:
     path = release(tmp_path, config_of(FIRST), {})
     torch.save({"state_dict": {}, "callbacks": Evil(tmp_path / "ran")}, path)
-    with pytest.raises(DataError, match=r"calls for \w+\.mkdir .*was not loaded"):
+    with pytest.raises(DataError, match=r"would call \w+\.mkdir .*was not loaded"):
         read_lidm(path)
     assert not (tmp_path / "ran").exists()
     torch.save([1], path)
@@ -295,8 +297,8 @@ def test_code_in_a_pickle_does_not_run(tmp_path: Path) -> None:
         read_lidm(path)
 
 
-def test_golden_through_file_and_checkpoint(golden: Path, tmp_path: Path) -> None:
-    """.ckpt -> import -> checkpoint -> autoencoder gives the peer's own numbers."""
+def test_an_imported_checkpoint_gives_the_results_of_lidm(golden: Path, tmp_path: Path) -> None:
+    """.ckpt -> import -> checkpoint -> autoencoder gives LiDM's own results."""
     about = json.loads((golden / "lidm_vqvae_tiny.json").read_text())
     tensors = load_file(golden / "lidm_vqvae_tiny.safetensors")
     weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}

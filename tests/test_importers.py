@@ -1,4 +1,4 @@
-"""R2Flow's checkpoints: their keys, their convention, and files that are not what they seem."""
+"""Import of R2Flow's checkpoints: keys, conventions, and invalid files."""
 
 import copy
 import json
@@ -45,7 +45,7 @@ CFG: dict[str, Any] = {
 
 
 def peer_weights(position: str = "learned") -> dict[str, Tensor]:
-    """Random weights by the peer's names and in its shapes."""
+    """Random weights with R2Flow's names and shapes."""
     torch.manual_seed(0)
     net = build_network(
         "hdit",
@@ -66,7 +66,7 @@ def peer_weights(position: str = "learned") -> dict[str, Tensor]:
 
 
 def write(path: Path, weights: dict[str, Tensor], cfg: dict[str, Any] = CFG) -> Path:
-    """A file as the peer's training writes it, with what a sampler does not need."""
+    """Write a file like R2Flow's training, including values that sampling does not need."""
     optimizer = {"state": {0: {"step": 1, "exp_avg": torch.zeros(3)}}, "param_groups": [{"lr": 1e-4}]}
     torch.save({"cfg": cfg, "weights": weights, "optimizer": optimizer, "lr_scheduler": {}, "num_images": 96}, path)
     return path
@@ -85,7 +85,7 @@ def change(**groups: dict[str, Any]) -> dict[str, Any]:
     return cfg
 
 
-def test_the_header_says_what_the_peer_does(released: Path) -> None:
+def test_the_header_describes_the_model_of_r2flow(released: Path) -> None:
     header, _ = read_r2flow(released)
     assert header.channels == ("range", "reflectance")
     assert (header.normalisation.kind, header.normalisation.range_min, header.normalisation.range_max) == (
@@ -115,7 +115,7 @@ def test_the_header_says_what_the_peer_does(released: Path) -> None:
     ],
     ids=["distilled", "kitti raw", "metric", "unfolded"],
 )
-def test_other_configurations(tmp_path: Path, cfg: dict[str, Any], expected: dict[str, Any]) -> None:
+def test_other_configurations_are_imported(tmp_path: Path, cfg: dict[str, Any], expected: dict[str, Any]) -> None:
     header, _ = read_r2flow(write(tmp_path / "other.pth", peer_weights(), cfg))
     for name, value in expected.items():
         found: Any = header
@@ -137,8 +137,8 @@ def test_time_and_sign_are_folded_into_the_weights(released: Path) -> None:
     assert torch.equal(net.detokenize.weight, -weights["detokenizer.1.weight"])
 
 
-def test_all_keys_of_the_released_network(golden: Path, tmp_path: Path) -> None:
-    """80.9 M parameters by name and shape; one number stands for each tensor, so that the file stays small."""
+def test_all_keys_of_the_released_network_are_imported(golden: Path, tmp_path: Path) -> None:
+    """80.9 M parameters by name and shape; each tensor is one expanded number, so that the file stays small."""
     published = json.loads((golden / "r2flow_hdit_full_keys.json").read_text())
     weights = {key: torch.zeros(1).expand(shape) for key, shape, _, _ in published["keys"]}
     path = write(tmp_path / "full.pth", weights, published["checkpoint"]["cfg_defaults"])
@@ -149,8 +149,8 @@ def test_all_keys_of_the_released_network(golden: Path, tmp_path: Path) -> None:
     assert header.sensor.shape == (64, 1024)
 
 
-def test_golden_through_file_and_checkpoint(golden: Path, tmp_path: Path) -> None:
-    """.pth -> import -> checkpoint -> network gives the peer's own numbers."""
+def test_an_imported_checkpoint_gives_the_results_of_r2flow(golden: Path, tmp_path: Path) -> None:
+    """.pth -> import -> checkpoint -> network gives R2Flow's own results."""
     name = "r2flow_hdit_tiny_learnable"
     about = json.loads((golden / f"{name}.json").read_text())
     tensors, config = load_file(golden / f"{name}.safetensors"), about["config"]
@@ -186,7 +186,7 @@ def test_the_command_refuses_unknown_peers(released: Path, tmp_path: Path) -> No
     assert not (tmp_path / "out.safetensors").exists()
 
 
-# --- files that do not fit -----------------------------------------------------------------------------------------
+# --- invalid files -------------------------------------------------------------------------------------------------
 
 
 def drop(weights: dict[str, Tensor]) -> None:
@@ -214,7 +214,9 @@ def retune(weights: dict[str, Tensor]) -> None:
         (retune, "up_levels.level_0.0 has other rotary harmonics"),
     ],
 )
-def test_weights_that_do_not_fit(tmp_path: Path, spoil: Callable[[dict[str, Tensor]], None], message: str) -> None:
+def test_weights_that_do_not_fit_are_refused(
+    tmp_path: Path, spoil: Callable[[dict[str, Tensor]], None], message: str
+) -> None:
     weights = peer_weights()
     spoil(weights)
     path = write(tmp_path / "other.pth", weights)
@@ -236,12 +238,12 @@ def test_weights_that_do_not_fit(tmp_path: Path, spoil: Callable[[dict[str, Tens
     ],
     ids=["architecture", "position", "format", "dataset", "resolution", "groups", "limits"],
 )
-def test_configurations_that_do_not_fit(tmp_path: Path, cfg: dict[str, Any], message: str) -> None:
+def test_configurations_that_do_not_fit_are_refused(tmp_path: Path, cfg: dict[str, Any], message: str) -> None:
     with pytest.raises(DataError, match=message):
         read_r2flow(write(tmp_path / "other.pth", peer_weights(), cfg))
 
 
-def test_fourier_features_have_to_be_octaves() -> None:
+def test_fourier_features_other_than_octaves_are_refused() -> None:
     from lidar_synth.generate.checkpoint import NetworkSpec
 
     weights = peer_weights("fourier_features")
@@ -262,7 +264,7 @@ def test_fourier_features_have_to_be_octaves() -> None:
 
 
 class Evil:
-    """Leaves a trace where it is unpickled."""
+    """An object that creates a folder when it is unpickled."""
 
     def __init__(self, trace: Path) -> None:
         self.trace = trace
@@ -274,16 +276,16 @@ class Evil:
 def test_code_in_a_pickle_does_not_run(tmp_path: Path) -> None:
     trace, path = tmp_path / "ran", tmp_path / "evil.pth"
     torch.save({"cfg": CFG, "weights": Evil(trace)}, path)
-    with pytest.raises(DataError, match=r"calls for \w+\.mkdir .*was not loaded"):
+    with pytest.raises(DataError, match=r"would call \w+\.mkdir .*was not loaded"):
         read_r2flow(path)
     assert not trace.exists()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.9])
-def test_a_truncated_file(released: Path, share: float) -> None:
+def test_a_truncated_file_is_refused(released: Path, share: float) -> None:
     content = released.read_bytes()
     released.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(DataError, match="is cut, damaged or no .pth file"):
+    with pytest.raises(DataError, match="is truncated, damaged or no .pth file"):
         read_r2flow(released)
 
 
@@ -292,12 +294,12 @@ def test_a_truncated_file(released: Path, share: float) -> None:
     [[1, 2], {"state_dict": {}}, {"cfg": CFG}, {"cfg": CFG, "weights": [1]}, {"cfg": CFG, "weights": {"coords": 1}}],
     ids=["list", "other", "no weights", "list of weights", "numbers"],
 )
-def test_a_pickle_of_something_else(tmp_path: Path, content: Any) -> None:
+def test_a_pickle_of_something_else_is_refused(tmp_path: Path, content: Any) -> None:
     torch.save(content, tmp_path / "other.pth")
-    with pytest.raises(DataError, match=r"cfg and weights|no tensors by name"):
+    with pytest.raises(DataError, match=r"cfg and weights|not tensors by name"):
         read_r2flow(tmp_path / "other.pth")
 
 
-def test_a_missing_file(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="cannot be read"):
         read_r2flow(tmp_path / "none.pth")

@@ -1,4 +1,4 @@
-"""The weights that ship, as users meet them: every source and label policy, beside the town and beside real scans."""
+"""The shipped weights in use: every source and label policy, mixed with the town and with real scans."""
 
 import json
 import os
@@ -37,7 +37,7 @@ def generator() -> Generator:
 
 @pytest.fixture(scope="module")
 def sources(generator: Generator, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """The same scans from everywhere."""
+    """The same scans from every kind of source."""
     folder = tmp_path_factory.mktemp("shipped") / "bank"
     bake(folder, count=SCANS, model="town", seed=0)
     with RollingBank("town", seed=0, slots=SCANS, threads=1) as rolling:
@@ -57,19 +57,19 @@ def real(request: pytest.FixtureRequest) -> Source:
 
 
 @pytest.mark.parametrize("name", shipped_models())
-def test_weights_say_whose_they_are_and_name_no_machine(name: str) -> None:
+def test_shipped_weights_state_their_licence_and_no_local_paths(name: str) -> None:
     provenance = read_header(shipped_models()[name])[0].provenance
     assert (provenance["licence"], provenance["data_licence"][:3]) == ("MIT", "MIT")
     assert not re.search(r"[\"']/\w", json.dumps(provenance))
 
 
 def sure(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """A teacher for pseudo labels, sure of half of the points."""
+    """A teacher for pseudo labels with high confidence in half of the points."""
     return np.full(len(scan), 8, np.uint8), (np.arange(len(scan)) % 2).astype(np.float32)
 
 
 @pytest.mark.parametrize("kind", ["bank", "rolling", "list"])
-def test_a_scan_is_the_same_from_every_source(kind: str, sources: dict[str, Any], generator: Generator) -> None:
+def test_every_source_gives_the_same_scan(kind: str, sources: dict[str, Any], generator: Generator) -> None:
     encoding = Encoding(generator.sensor, FIELDS)
     for number in range(SCANS):
         scan = sources[kind][number]
@@ -83,7 +83,7 @@ def test_a_scan_is_the_same_from_every_source(kind: str, sources: dict[str, Any]
 
 @pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("kind", ["generator", "bank", "rolling", "list"])
-def test_every_source_and_policy_beside_real_scans(
+def test_every_source_and_label_policy_mixes_with_real_scans(
     kind: str, policy: str, sources: dict[str, Any], real: Source
 ) -> None:
     options = {"teacher": sure} if policy == "pseudo" else {"kind": "laser"} if policy == "mix" else {}

@@ -1,4 +1,4 @@
-"""Solvers, by flows of known solution."""
+"""Solvers on flows with known solutions."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +21,7 @@ DATA = gaussian_flow(NOISE, torch.ones(4), torch.zeros(4))
 
 @pytest.mark.parametrize("uneven", [False, True])
 @pytest.mark.parametrize("name", SOLVERS)
-def test_order_of_convergence(name: str, uneven: bool) -> None:
+def test_solvers_converge_at_their_order(name: str, uneven: bool) -> None:
     steps = np.array([64, 128, 256, 512])
     errors = []
     for count in steps:
@@ -33,14 +33,14 @@ def test_order_of_convergence(name: str, uneven: bool) -> None:
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_a_straight_flow_needs_one_step(name: str) -> None:
+def test_one_step_solves_a_straight_flow(name: str) -> None:
     direction = gaussian(1, range(4), (2, 5), dtype=torch.float64)
     straight = solve(lambda y, t, c: direction, NOISE, (1.0, 0.0), name)
     assert torch.allclose(straight, NOISE - direction)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_evaluations_and_what_they_see(name: str) -> None:
+def test_the_number_and_arguments_of_evaluations_per_step(name: str) -> None:
     seen: list[tuple[Tensor, Any]] = []
 
     def velocity(y: Tensor, t: Tensor, cond: Any) -> Tensor:
@@ -70,7 +70,7 @@ def test_trajectory_streams_states_and_the_velocities_between_them(name: str) ->
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_one_grid_per_sample(name: str) -> None:
+def test_each_sample_can_have_its_own_time_grid(name: str) -> None:
     grids = torch.tensor(
         [[1.0, 0.8, 0.6, 0.5], [0.9, 0.5, 0.2, 0.0], [0.4, 0.3, 0.2, 0.1], [1.0, 0.9, 0.1, 0.0]]
     ).double()
@@ -86,8 +86,8 @@ def test_the_state_keeps_its_dtype() -> None:
 
 
 @pytest.mark.parametrize("model", ["r2flow_hdit_tiny_learnable", "r2flow_hdit_tiny_fourier"])
-def test_euler_on_uneven_grids_is_r2flows(golden: Path, model: str) -> None:
-    """Their states from their velocities, through our time and sign: the network is tested where it lives."""
+def test_euler_on_uneven_grids_equals_that_of_r2flow(golden: Path, model: str) -> None:
+    """R2Flow's states follow from its velocities in our convention of time and sign; no network is involved."""
     vectors = {k.removeprefix(f"{model}/"): v for k, v in load_file(golden / "r2flow_sampling.safetensors").items()}
     answers = iter(vectors["velocities"])
     times = []
@@ -105,18 +105,18 @@ def test_euler_on_uneven_grids_is_r2flows(golden: Path, model: str) -> None:
 @pytest.mark.parametrize(
     "grid", [(1.0,), (0.0, 1.0), (1.0, 0.5, 0.5, 0.0), (1.1, 0.0), (1.0, -0.1), (1.0, float("nan"), 0.0)]
 )
-def test_grids_that_do_not_descend_within_0_and_1(grid: tuple[float, ...]) -> None:
+def test_grids_that_do_not_descend_within_0_and_1_are_refused(grid: tuple[float, ...]) -> None:
     with pytest.raises(ConfigError, match=r"time grid .*; expected at least two descending times"):
         solve(gaussian_velocity, NOISE, grid)
 
 
-def test_uniform_grids() -> None:
+def test_uniform_grids_are_evenly_spaced() -> None:
     assert uniform_grid(4) == (1.0, 0.75, 0.5, 0.25, 0.0)
-    assert uniform_grid(100)[70] == 0.3  # the nearest float: what a header or a configuration shows
+    assert uniform_grid(100)[70] == 0.3  # the nearest float, which headers and configurations display as 0.3
     assert uniform_grid(2, 0.58, 0.22) == pytest.approx((0.58, 0.4, 0.22))
 
 
-def test_unknown_solver_and_no_steps() -> None:
+def test_an_unknown_solver_and_zero_steps_are_refused() -> None:
     with pytest.raises(ConfigError, match="solver 'rk4'; expected one of euler, heun"):
         solve(gaussian_velocity, NOISE, (1.0, 0.0), "rk4")
     with pytest.raises(ConfigError, match="0 steps; expected at least 1"):

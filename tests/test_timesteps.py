@@ -1,4 +1,4 @@
-"""Adaptive timestep selection, by brute force and by flows whose best grid is known."""
+"""Adaptive timestep selection against brute force and on flows whose best grid is known."""
 
 import gc
 from itertools import combinations, pairwise
@@ -33,7 +33,7 @@ def by_brute_force(costs: np.ndarray, intervals: int) -> tuple[int, ...]:
 
 
 @given(data=st.data(), candidates=st.integers(1, 9), seed=st.integers(0, 2**32))
-def test_the_programme_finds_what_brute_force_finds(data: st.DataObject, candidates: int, seed: int) -> None:
+def test_dynamic_programming_equals_brute_force(data: st.DataObject, candidates: int, seed: int) -> None:
     intervals = data.draw(st.integers(1, candidates))
     costs = random_costs(candidates, seed, (2, 3))
     paths = best_path(costs, intervals)
@@ -57,7 +57,7 @@ def test_the_knots_of_a_piecewise_linear_flow_are_found(metric: str, knots: tupl
     assert np.allclose(found.per_trajectory, knots[1:-1])
 
 
-def test_costs_by_their_definition() -> None:
+def test_costs_equal_their_definition() -> None:
     times = uniform_grid(12)
     start = gaussian(0, range(3), SHAPE, dtype=torch.float64)
     costs = cost_matrix(gaussian_velocity, start, times, METRICS["pseudo_huber"])
@@ -76,8 +76,8 @@ def test_costs_by_their_definition() -> None:
             assert costs[:, i, j] == pytest.approx(expected.numpy(), rel=1e-9)
 
 
-def test_selection_of_a_curved_flow() -> None:
-    """The mean of the cost matrices decides; no single trajectory can do better than its own optimum."""
+def test_the_selection_minimises_the_mean_cost_of_a_curved_flow() -> None:
+    """The selection minimises the mean cost; each trajectory's own optimum costs at most as much."""
     found = select_timesteps(gaussian_velocity, SHAPE, 4, 40, 7, "squared_l2", seed=3, batch=3, progress=False)
     noise = gaussian(3, range(7), SHAPE)
     costs = cost_matrix(gaussian_velocity, noise, uniform_grid(40), METRICS["squared_l2"])
@@ -94,19 +94,19 @@ def test_selection_of_a_curved_flow() -> None:
     assert found.candidates == uniform_grid(40) and found.grid[0] == 1 and found.grid[-1] == 0
 
 
-def test_the_batch_changes_nothing_but_rounding() -> None:
+def test_the_batch_size_changes_only_rounding() -> None:
     one, three = (select_timesteps(gaussian_velocity, SHAPE, 3, 20, 8, batch=b, progress=False) for b in (1, 3))
     assert one.grid == three.grid
     assert np.allclose(np.triu(one.costs, 1), np.triu(three.costs, 1), rtol=1e-5, atol=1e-9)
     assert np.array_equal(one.per_trajectory, three.per_trajectory)
 
 
-def test_any_metric_and_conditions_by_trajectory() -> None:
-    asked = []
+def test_a_custom_metric_and_one_condition_per_trajectory() -> None:
+    requested = []
 
-    def condition(some: range) -> Tensor:
-        asked.append(some)
-        return torch.tensor([10.0 * k for k in some])
+    def condition(trajectories: range) -> Tensor:
+        requested.append(trajectories)
+        return torch.tensor([10.0 * k for k in trajectories])
 
     def velocity(y: Tensor, t: Tensor, cond: Tensor) -> Tensor:
         return per_sample(cond + 1, y) * per_sample(t, y).expand_as(y)
@@ -122,8 +122,8 @@ def test_any_metric_and_conditions_by_trajectory() -> None:
         condition=condition,
         progress=False,
     )
-    assert asked == [range(2), range(2, 3)]
-    # v = c t on a grid of quarters, c = 1, 11, 21: from t = 1 straight to 1/2 misses by c/16.
+    assert requested == [range(2), range(2, 3)]
+    # v = c t on a grid of quarters, c = 1, 11, 21: a straight step from t = 1 to 1/2 has an error of c/16.
     assert found.costs[0, 2] == pytest.approx(11 / 16, rel=1e-5)
 
 
@@ -145,7 +145,7 @@ def test_memory_does_not_grow_with_the_number_of_trajectories() -> None:
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_teacher_that_is_not_finite(bad: float) -> None:
+def test_a_teacher_with_nan_or_infinity_is_refused(bad: float) -> None:
     with pytest.raises(DataError, match="the teacher's trajectory is not finite"):
         select_timesteps(lambda y, t, c: torch.full_like(y, bad), SHAPE, 2, 5, 2, progress=False)
 
@@ -160,6 +160,6 @@ def test_a_teacher_that_is_not_finite(bad: float) -> None:
         ({"batch": 0}, "0 at a time"),
     ],
 )
-def test_impossible_numbers(options: dict[str, Any], message: str) -> None:
+def test_invalid_numbers_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         select_timesteps(gaussian_velocity, SHAPE, **{"candidates": 5, "trajectories": 2, "progress": False} | options)

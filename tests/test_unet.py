@@ -1,4 +1,4 @@
-"""The U-Net: what it takes, what wraps, what the table of places adds, and a diffusion network as a velocity."""
+"""The U-Net: inputs, circular columns, the position table, and a diffusion network as a velocity."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def network(kind: str = "unet", **arguments: Any) -> nn.Module:
-    """With random weights everywhere: a fresh network answers zero."""
+    """A network with random weights (a fresh one returns zero)."""
     torch.manual_seed(0)
     net = build_network(kind, {**SMALL, **arguments})
     for parameter in net.parameters():
@@ -41,13 +41,13 @@ def state(count: int = 2, shape: tuple[int, ...] = (3, 8, 32)) -> Tensor:
 T = torch.tensor([0.3, 0.8])
 
 
-def test_a_fresh_network_answers_zero() -> None:
+def test_a_fresh_network_returns_zero() -> None:
     assert not build_network("unet", SMALL)(state(), T).any()
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("arguments", [{}, {"patch": (2, 2)}, {"multipliers": (1, 2, 3), "blocks": 2}])
-def test_samples_do_not_see_each_other(arguments: dict[str, Any]) -> None:
+def test_samples_of_a_batch_are_independent(arguments: dict[str, Any]) -> None:
     net = network(**arguments)
     together = net(state(), T)
     assert together.shape == (2, 3, 8, 32)
@@ -57,15 +57,15 @@ def test_samples_do_not_see_each_other(arguments: dict[str, Any]) -> None:
 
 
 @torch.no_grad()
-def test_columns_wrap_and_rows_do_not() -> None:
+def test_columns_wrap_around_and_rows_do_not() -> None:
     net, y = network(position=False), state()
     out = net(y, T)
-    assert torch.allclose(net(y.roll(2, -1), T), out.roll(2, -1), atol=1e-4)  # as far as it halves
+    assert torch.allclose(net(y.roll(2, -1), T), out.roll(2, -1), atol=1e-4)  # by a multiple of the total stride
     assert not torch.allclose(net(y.roll(2, -2), T), out.roll(2, -2), atol=1e-2)
 
 
 @torch.no_grad()
-def test_the_table_of_places_tells_columns_apart() -> None:
+def test_the_position_table_distinguishes_columns() -> None:
     net, y = network(position=True), state()
     assert not torch.allclose(net(y.roll(2, -1), T), net(y, T).roll(2, -1), atol=1e-2)
     assert sum(p.numel() for p in net.parameters()) - sum(p.numel() for p in network(position=False).parameters()) == (
@@ -83,21 +83,21 @@ def test_every_weight_gets_a_gradient(arguments: dict[str, Any], checkpointing: 
     net(state(), T, cond.get(next(iter(arguments), ""))).square().mean().backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all(), name
-        assert parameter.grad.any() or "conv1.bias" in name, name  # a norm behind it may take a bias out
+        assert parameter.grad.any() or "conv1.bias" in name, name  # a norm after it can cancel a bias
 
 
 @torch.no_grad()
-def test_conditions_count() -> None:
+def test_conditions_change_the_velocity() -> None:
     beside, y = network(condition_channels=2), state()
     assert not torch.allclose(beside(y, T, torch.zeros(2, 2, 8, 32)), beside(y, T, torch.ones(2, 2, 8, 32)), atol=1e-3)
     context, tokens = network(context_channels=5), torch.randn(2, 4, 5)
     out = context(y, T, tokens)
     assert not torch.allclose(out, context(y, T, tokens * 2), atol=1e-3)
-    assert torch.allclose(out, context(y, T, tokens.flip(1)), atol=1e-5)  # a set of tokens
+    assert torch.allclose(out, context(y, T, tokens.flip(1)), atol=1e-5)  # the order of tokens does not matter
 
 
 @torch.no_grad()
-def test_precision_and_layout_change_rounding_only() -> None:
+def test_precision_and_memory_format_change_only_rounding() -> None:
     net, y = network(), state()
     out = net(y, T)
     assert torch.allclose(net.to(memory_format=torch.channels_last)(y, T), out, atol=1e-5)  # type: ignore[call-overload]
@@ -116,12 +116,12 @@ def test_precision_and_layout_change_rounding_only() -> None:
         ({"context_channels": 5}, None, "no condition"),
     ],
 )
-def test_conditions_that_do_not_fit(arguments: dict[str, Any], cond: Tensor | None, message: str) -> None:
+def test_conditions_of_another_shape_are_refused(arguments: dict[str, Any], cond: Tensor | None, message: str) -> None:
     with pytest.raises(DataError, match=message):
         network(**arguments)(state(), T, cond)
 
 
-def test_states_and_times_that_do_not_fit() -> None:
+def test_states_and_times_of_another_shape_are_refused() -> None:
     with pytest.raises(DataError, match=r"a state of shape \(2, 3, 8, 16\); expected \(B, 3, 8, 32\)"):
         network()(state(shape=(3, 8, 16)), T)
     with pytest.raises(DataError, match=r"times of shape \(3,\) for 2 states"):
@@ -139,7 +139,7 @@ def test_states_and_times_that_do_not_fit() -> None:
         ({"colour": 1}, "colour"),
     ],
 )
-def test_arguments_that_do_not_fit(arguments: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build_network("unet", {**SMALL, **arguments})
 
@@ -163,7 +163,7 @@ def test_unfold_is_the_inverse_of_fold(p: int, q: int, rows: int, columns: int, 
         ((3, 3), (1, 1), None, (1, 3)),
     ],
 )
-def test_a_wrapping_convolution_is_one_on_a_padded_image(kernel: Any, stride: Any, pad: Any, dilation: Any) -> None:
+def test_a_circular_convolution_equals_one_on_a_padded_image(kernel: Any, stride: Any, pad: Any, dilation: Any) -> None:
     conv, x = WrapConv(2, 3, kernel, stride, pad, dilation=dilation), torch.randn(1, 2, 4, 8)
     rows, columns = (d * (k - 1) for k, d in zip(kernel, dilation, strict=True))
     left, right, above, below = pad or (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
@@ -173,14 +173,14 @@ def test_a_wrapping_convolution_is_one_on_a_padded_image(kernel: Any, stride: An
     )
 
 
-# --- a network of denoising diffusion as a velocity ------------------------------------------------------------------
+# --- a denoising diffusion network as a velocity --------------------------------------------------------------------
 
 MEAN, SPREAD = 0.7, 0.4
 TIMES = schedule_times(0.0015, 0.0195, 1000)
 
 
 class KnownNoise(DiffusionUNet):
-    """The best answer where data are normal with ``MEAN`` and ``SPREAD``: e = -s grad log p(x), at any step."""
+    """The optimal noise prediction for normal data with ``MEAN`` and ``SPREAD``: e = -s grad log p(x), at any step."""
 
     def evaluate(self, y: Tensor, step: Tensor, cond: Tensor | None) -> Tensor:
         low = step.floor().clamp(max=998).long()
@@ -226,7 +226,7 @@ def test_the_velocity_is_exact_at_the_steps_and_close_between_them(known: Veloci
 
 
 @torch.no_grad()
-def test_beyond_the_ends_it_is_clamped_and_stays_close(known: Velocity) -> None:
+def test_the_velocity_beyond_the_schedule_is_clamped_and_stays_close(known: Velocity) -> None:
     y = normal(2)
     noisiest = known(y, torch.tensor([1.0, 0.995]), None)
     assert (noisiest - known_velocity(y, torch.tensor([1.0, 0.995]))).abs().max() < 0.02
@@ -236,19 +236,19 @@ def test_beyond_the_ends_it_is_clamped_and_stays_close(known: Velocity) -> None:
 
 
 @torch.no_grad()
-def test_its_flow_leads_from_noise_to_the_data(known: Velocity) -> None:
+def test_the_flow_of_a_diffusion_network_ends_at_the_data_distribution(known: Velocity) -> None:
     data = solve(known, normal(500).float(), uniform_grid(100))
     assert float(data.mean()) == pytest.approx(MEAN, abs=0.02)
     assert float(data.std()) == pytest.approx(SPREAD, abs=0.02)
 
 
-def test_a_schedule_that_is_none_is_refused() -> None:
+def test_an_invalid_noise_schedule_is_refused() -> None:
     with pytest.raises(ConfigError, match="0 < start <= end < 1"):
         build_network("diffusion_unet", {**SMALL, "beta_start": 0.0})
 
 
 @torch.no_grad()
-def test_the_network_is_asked_for_the_noise_of_its_step() -> None:
+def test_the_velocity_is_computed_from_the_predicted_noise() -> None:
     net = network("diffusion_unet", position=False)
     assert isinstance(net, DiffusionUNet)
     y, t = state(1), TIMES[[300]]

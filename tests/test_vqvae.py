@@ -1,4 +1,4 @@
-"""The autoencoder: shapes, what wraps, the codebook and how it follows the latents."""
+"""The autoencoder: shapes, circular columns, the codebook and its training."""
 
 from typing import Any
 
@@ -45,21 +45,21 @@ def image(count: int = 2) -> Tensor:
         ({"strides": (), "multipliers": (1,), "attention": False}, (4, 8, 32)),
     ],
 )
-def test_shapes(arguments: dict[str, Any], shape: tuple[int, ...]) -> None:
+def test_latents_and_outputs_have_the_documented_shapes(arguments: dict[str, Any], shape: tuple[int, ...]) -> None:
     net = network(**arguments)
     latent = net.encode(image())
     assert net.latent_shape == shape == latent.shape[1:]
     assert net.decode(latent).shape == image().shape
 
 
-def test_lidms_shape() -> None:
+def test_the_default_latent_has_the_shape_of_lidm() -> None:
     with torch.device("meta"):
         assert VQVAE((64, 1024)).latent_shape == (8, 16, 128)
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("patch", [(1, 1), (2, 2)])
-def test_the_encoder_wraps_columns_and_not_rows(patch: tuple[int, int]) -> None:
+def test_the_encoder_wraps_columns_but_not_rows(patch: tuple[int, int]) -> None:
     net, x = network(patch=patch), image()
     z, columns = net.encode(x), 2 * patch[1]
     assert torch.allclose(net.encode(x.roll(columns, -1)), z.roll(1, -1), atol=1e-5)
@@ -67,7 +67,7 @@ def test_the_encoder_wraps_columns_and_not_rows(patch: tuple[int, int]) -> None:
 
 
 @torch.no_grad()
-def test_vectors_go_to_their_nearest_codes() -> None:
+def test_vectors_are_quantised_to_their_nearest_codes() -> None:
     net = network()
     z = torch.randn(2, 4, 4, 16)
     quantised, index = net.codebook(z)
@@ -80,7 +80,7 @@ def test_vectors_go_to_their_nearest_codes() -> None:
 
 
 @torch.no_grad()
-def test_a_latent_that_is_missed_by_a_little_decodes_to_the_same() -> None:
+def test_a_small_error_of_the_latent_does_not_change_the_image() -> None:
     net = network()
     z = net.encode(image())
     codes = net.codebook(z)[0]
@@ -88,7 +88,7 @@ def test_a_latent_that_is_missed_by_a_little_decodes_to_the_same() -> None:
     assert torch.allclose(net(image()).output, net.decode(z), atol=1e-5)
 
 
-def test_gradients_pass_the_codebook_straight() -> None:
+def test_gradients_pass_straight_through_the_codebook() -> None:
     net = network()
     output, gap, code_gap = net(image())
     assert gap.shape == (2,) and torch.equal(gap, code_gap)
@@ -104,8 +104,8 @@ def test_gradients_pass_the_codebook_straight() -> None:
 
 
 @pytest.mark.parametrize("codebook", CODEBOOKS)
-def test_a_codebook_follows_the_latents(codebook: str) -> None:
-    """After a while, the codes are closer to the latents of the same images than they were."""
+def test_training_moves_the_codes_towards_the_latents(codebook: str) -> None:
+    """After some steps, the codes are closer to the latents of the same images than before."""
     net = network(codebook=codebook).train()
     for parameter in net.parameters():
         parameter.requires_grad_(parameter is net.codebook.codes and codebook == "gradient")
@@ -124,7 +124,7 @@ def test_a_codebook_follows_the_latents(codebook: str) -> None:
 
 
 @torch.no_grad()
-def test_dead_codes_of_moving_averages_come_back() -> None:
+def test_dead_codes_of_an_ema_codebook_are_reset() -> None:
     net = network(codebook="ema").train()
     net.codebook.codes.fill_(100.0)
     net.codebook.counts.zero_()
@@ -133,7 +133,7 @@ def test_dead_codes_of_moving_averages_come_back() -> None:
     assert (net.codebook.codes.abs() < 50).all()
     fixed = net.codebook.codes.clone()
     net.eval()(image())
-    assert torch.equal(net.codebook.codes, fixed)  # only training moves them
+    assert torch.equal(net.codebook.codes, fixed)  # only training changes them
 
 
 def test_without_a_codebook_latents_are_bounded() -> None:
@@ -146,7 +146,7 @@ def test_without_a_codebook_latents_are_bounded() -> None:
 
 
 @torch.no_grad()
-def test_latents_leave_with_mean_0_and_variance_1() -> None:
+def test_latents_have_mean_0_and_variance_1() -> None:
     net, x = network().train(), image(8)
     raw = net.encode(x)
     assert abs(float(raw.std()) - 1) > 0.2
@@ -154,7 +154,7 @@ def test_latents_leave_with_mean_0_and_variance_1() -> None:
     z = net.eval().encode(x)
     assert torch.allclose(z.mean((0, 2, 3)), torch.zeros(4), atol=1e-4)
     assert torch.allclose(z.std((0, 2, 3)), torch.ones(4), atol=1e-4)
-    assert torch.allclose(net.decode(z), net(x).output, atol=1e-5)  # the decoder sees the encoder's own scale
+    assert torch.allclose(net.decode(z), net(x).output, atol=1e-5)  # the decoder reverts the normalisation
 
 
 @pytest.mark.parametrize("checkpointing", [False, True])
@@ -167,7 +167,7 @@ def test_every_weight_gets_a_gradient(checkpointing: bool) -> None:
         assert parameter.grad is not None and parameter.grad.isfinite().all(), name
 
 
-def test_what_does_not_fit() -> None:
+def test_images_and_latents_of_another_shape_are_refused() -> None:
     with pytest.raises(DataError, match=r"a latent of shape \(1, 4, 4, 8\); expected \(B, 4, 4, 16\)"):
         network().decode(torch.zeros(1, 4, 4, 8))
     with pytest.raises(DataError, match=r"an image of shape \(1, 1, 8, 32\); expected \(B, 2, 8, 32\)"):
@@ -184,6 +184,6 @@ def test_what_does_not_fit() -> None:
         ({"colour": 1}, "colour"),
     ],
 )
-def test_arguments_that_do_not_fit(arguments: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build_network("vqvae", {**SMALL, **arguments})

@@ -1,1 +1,1 @@
-"""Rectified flow: path and losses, solvers, timestep selection, distillation. Takes any callable ``v(y, t, c)``."""
+"""Rectified flow for any velocity ``v(y, t, c)``: path and losses, solvers, timestep selection, distillation."""

@@ -1,22 +1,23 @@
 """Distillation of a few-step student from a rectified-flow teacher.
 
-Every strategy is one function that answers the same question: at which state and time is the student trained
-in this batch, and which velocity shall it answer there? They differ in where they ask and in which part of the
-teacher's trajectory they make straight::
+Every strategy is one function that gives the supervision of a batch: states, times, and the velocities that the student
+is trained to predict there. The strategies differ in the times of training and in the part of the teacher's trajectory
+that the student approximates by a straight line::
 
+    strategy               time of training                                straightened part       source
     adaptive_piecewise     starts of the intervals of the selected grid    interval's start -> end   Algorithm 1
     uniform_piecewise      starts of the intervals of a uniform grid       interval's start -> end   its ablation
     piecewise_reflow       anywhere in an interval                         interval's start -> end   PeRFlow
     reflow                 anywhere in [0, 1]                              noise -> data             2-RF
     timestep_distillation  starts of the intervals of a uniform grid       noise -> data             k-TD of R2Flow
 
-The teacher's end of a piece is found by Euler steps; what it costs is counted in the example. Sources:
-LiDAR-Flow (the paper, Eq. 6); Yan et al., "PeRFlow", NeurIPS 2024; Liu et al., "Flow Straight and Fast",
+Euler steps of the teacher give the end of each part; the example counts the evaluations. Sources: LiDAR-Flow (the
+paper, Eq. 6); Yan et al., "PeRFlow", NeurIPS 2024; Liu et al., "Flow Straight and Fast",
 ICLR 2023 (reflow and k-step distillation); Nakashima et al., "Fast LiDAR Data Generation with Rectified
-Flows", ICRA 2025. R2Flow makes its pairs of noise and data once, before training, and distils the timesteps of
-its 2-RF model; here the pairs are made online, and whichever teacher is given is distilled.
+Flows", ICRA 2025. R2Flow generates its pairs of noise and data once, before training, and distils the timesteps of
+its 2-RF model. Here the pairs are generated during training, from any teacher.
 
-To add a strategy: write its function, enter it in ``STRATEGIES``; the tests run over the dictionary.
+To add a strategy: write its function and enter it in ``STRATEGIES``; the tests run over the dictionary.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,25 +31,25 @@ from lidar_synth.flow.path import Example, Velocity, interpolate, per_sample
 from lidar_synth.flow.solvers import checked_grid, solve, uniform_grid
 
 Strategy = Callable[[Velocity, Tensor, Tensor, Tensor, Sequence[float], int, Any], Example]
-"""``strategy(teacher, y0, y1, u, grid, steps, cond)``, the same arguments for all; a ``ConfigError`` if the grid or
-the number of steps cannot be served:
+"""``strategy(teacher, y0, y1, u, grid, steps, cond)``. All strategies have the same arguments and raise a
+``ConfigError`` on a grid or a number of steps that they do not support:
 
-- teacher: the velocity to distil; it is run without gradients.
-- y0: (B, ...) data; reflow and timestep distillation make their own and take no notice of it.
+- teacher: the velocity to distil; it is evaluated without gradients.
+- y0: (B, ...) data; reflow and timestep distillation ignore it and use the teacher's data.
 - y1: (B, ...) noise.
-- u: (B,) uniform numbers in (0, 1), one per sample (``noise.uniform``): where each sample is trained. For
-  ``reflow`` they are t itself and may have passed through one of ``flow.TIMESTEPS`` (R2Flow: ``u_shaped``).
-- grid: N + 1 descending times from 1 to 0, the student's own.
-- steps: Euler steps of the teacher over the piece that it runs: an interval, or all of [1, 0].
-- cond: the condition, passed on.
+- u: (B,) uniform numbers in (0, 1) (``noise.uniform``) that select the time of training of each sample. For ``reflow``,
+  u is the time t itself, possibly after one of ``flow.TIMESTEPS`` (R2Flow: ``u_shaped``).
+- grid: N + 1 descending times from 1 to 0, the student's time grid.
+- steps: Euler steps of the teacher over the part that it integrates: an interval, or all of [1, 0].
+- cond: the condition, passed to the teacher.
 """
 
 
 def adaptive_piecewise(
     teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
 ) -> Example:
-    """Algorithm 1: at the start t_i of a random interval, y = (1 - t_i) y0 + t_i y1, the velocity that leads
-    straight to the state where the teacher leaves the interval. ``grid`` comes from ``select_timesteps``."""
+    """Algorithm 1: at the start t_i of a random interval and y = (1 - t_i) y0 + t_i y1, the target is the constant
+    velocity to the teacher's state at the end of the interval. ``grid`` comes from ``select_timesteps``."""
     interval = (u * (len(grid) - 1)).long().clamp_(max=len(grid) - 2)
     start, end = _bounds(interval, grid, u)
     y = interpolate(y0, y1, start)
@@ -58,10 +59,10 @@ def adaptive_piecewise(
 def uniform_piecewise(
     teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
 ) -> Example:
-    """Algorithm 1 without the selection: the grid has to be uniform.
+    """Algorithm 1 on a uniform grid, without timestep selection.
 
     Raises:
-        ConfigError: on another grid, on which the student would be sampled.
+        ConfigError: on a grid that is not uniform.
     """
     _check_uniform(grid)
     return adaptive_piecewise(teacher, y0, y1, u, grid, steps, cond)
@@ -70,8 +71,8 @@ def uniform_piecewise(
 def piecewise_reflow(
     teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
 ) -> Example:
-    """PeRFlow: t uniform in [0, 1]; the state lies on the straight line between the start of t's interval and
-    the state where the teacher leaves it, and the velocity is that line's."""
+    """PeRFlow: t is uniform in [0, 1]; state and velocity are those of the straight line from the start of t's interval
+    to the teacher's state at its end."""
     start, end = _bounds(interval_of(u, grid), grid, u)
     y_start = interpolate(y0, y1, start)
     slope = _slope(teacher, y_start, start, end, steps, cond)
@@ -81,15 +82,15 @@ def piecewise_reflow(
 def reflow(
     teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
 ) -> Example:
-    """Flow matching on pairs of noise and the teacher's own data, t uniform in [0, 1]."""
+    """Flow matching on pairs of noise and the data that the teacher generates from it, with t uniform in [0, 1]."""
     return _straight(teacher, y1, u, steps, cond)
 
 
 def timestep_distillation(
     teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
 ) -> Example:
-    """Reflow with t moved up to the start of its interval, so that only the N times of sampling are trained:
-    R2Flow snaps its time (0 = noise) to floor(N t) / N, which is this on a uniform grid.
+    """Reflow with t moved up to the start of its interval, so that only the N times of sampling are trained. On a
+    uniform grid, this equals R2Flow's rounding of its time (0 = noise) to floor(N t) / N.
 
     Raises:
         ConfigError: on a grid that is not uniform.
@@ -110,9 +111,9 @@ STRATEGIES: dict[str, Strategy] = {
 
 
 def interval_of(t: Tensor, grid: Sequence[float]) -> Tensor:
-    """(B,) number of the interval (t_{i+1}, t_i] of a descending grid that holds t, 0 = noisiest."""
-    rising = _times(grid, t).flip(0)
-    above = torch.searchsorted(rising, t.contiguous()).clamp_(1, len(grid) - 1)
+    """(B,) index of the interval (t_{i+1}, t_i] of a descending grid that contains t; 0 = the noisiest."""
+    ascending = _times(grid, t).flip(0)
+    above = torch.searchsorted(ascending, t.contiguous()).clamp_(1, len(grid) - 1)
     return len(grid) - 1 - above
 
 
@@ -123,20 +124,20 @@ def _bounds(interval: Tensor, grid: Sequence[float], like: Tensor) -> tuple[Tens
 
 
 def _times(grid: Sequence[float], like: Tensor) -> Tensor:
-    """(N + 1,) the student's grid, on the device and in the precision of ``like``."""
+    """(N + 1,) times of the student's grid, with the device and dtype of ``like``."""
     times = checked_grid(grid)
     if times[0] != 1 or times[-1] != 0:
-        raise ConfigError(f"time grid {times.tolist()}", "one that runs from 1 down to 0")
+        raise ConfigError(f"time grid {times.tolist()}", "one from 1 down to 0")
     return times.to(like.device, like.dtype)
 
 
 def _slope(teacher: Velocity, y: Tensor, start: Tensor, end: Tensor, steps: int, cond: Any) -> Tensor:
-    """(B, ...) the velocity that leads straight to where the teacher gets from ``start`` to ``end``."""
+    """(B, ...) constant velocity between y at ``start`` and the state that the teacher reaches at ``end``."""
     if steps < 1:
         raise ConfigError(f"{steps} steps of the teacher", "at least 1")
-    share = torch.linspace(0, 1, steps + 1, dtype=start.dtype, device=start.device)[:, None]
+    weights = torch.linspace(0, 1, steps + 1, dtype=start.dtype, device=start.device)[:, None]
     with torch.no_grad():
-        y_end = solve(teacher, y, torch.lerp(start[None], end[None], share), "euler", cond)
+        y_end = solve(teacher, y, torch.lerp(start[None], end[None], weights), "euler", cond)
         return (y_end - y) / per_sample(end - start, y)
 
 

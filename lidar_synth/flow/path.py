@@ -1,4 +1,4 @@
-"""Rectified flow: the path between noise and data, and what a velocity network is trained on.
+"""Rectified flow: the path between noise and data, and the training targets of a velocity network.
 
 With data y0, standard normal noise y1 and time t in [0, 1], t = 1 noise and t = 0 data (the paper's
 preliminaries; Liu et al., "Flow Straight and Fast", ICLR 2023)::
@@ -7,9 +7,9 @@ preliminaries; Liu et al., "Flow Straight and Fast", ICLR 2023)::
     v   = y1 - y0                                             its velocity dy/dt
     L   = E_{y0, y1, t} m(v_theta(y_t, t, c), v)              flow matching, Eq. (1) and (3)
 
-The network may be any callable ``v(y, t, cond)``. Peers' conventions of time and sign end at the importers.
+The network may be any callable ``v(y, t, cond)``. The importers translate other projects' conventions of time and sign.
 
-To add a training metric or a distribution of t: write the function, enter it in ``METRICS`` or
+To add a training metric or a distribution of t: write the function and enter it in ``METRICS`` or
 ``TIMESTEPS``; the tests run over the dictionaries.
 """
 
@@ -24,11 +24,11 @@ from torch import Tensor
 from lidar_synth.errors import DataError
 
 Velocity = Callable[[Tensor, Tensor, Any], Tensor]
-"""``v(y, t, cond)``: y (B, ...), t (B,) float32 in [0, 1], cond whatever the network takes (None =
-unconditional) -> dy/dt of y's shape. Guidance is a callable of this kind around another one."""
+"""``v(y, t, cond)``: y (B, ...), t (B,) float32 in [0, 1], cond as the network takes it (None =
+unconditional) -> dy/dt, of y's shape. Guidance wraps one velocity in another."""
 
 Metric = Callable[[Tensor, Tensor], Tensor]
-"""The paper's m: two (B, ...) tensors of one shape -> (B,) mean over the elements of each sample."""
+"""The paper's m: two (B, ...) tensors of the same shape -> (B,) means over the elements of each sample."""
 
 PSEUDO_HUBER = 0.00054
 """R2Flow's coefficient: c = 0.00054 sqrt(elements of a sample), 0.1955 for 2x64x1024."""
@@ -36,14 +36,14 @@ PSEUDO_HUBER = 0.00054
 
 @dataclass(frozen=True)
 class Example:
-    """One batch of supervision: at ``y`` and ``t`` the velocity network shall answer ``velocity``.
+    """One batch of supervision: at ``y`` and ``t``, the velocity network is trained to predict ``velocity``.
 
     Args:
         y: (B, ...) states.
         t: (B,) float32 times.
         velocity: (B, ...) targets.
-        teacher_evaluations: evaluations of a teacher that the batch took, one per sample and step.
-        cond: what the network is conditioned on, (B, ...) or None.
+        teacher_evaluations: number of teacher evaluations for the batch, one per sample and step.
+        cond: the condition, (B, ...) or None.
     """
 
     y: Tensor
@@ -54,7 +54,7 @@ class Example:
 
 
 def per_sample(t: Tensor, y: Tensor) -> Tensor:
-    """Times (B,) as (B, 1, ..., 1) in the dtype of y (B, ...), to multiply it."""
+    """Times (B,) as (B, 1, ..., 1) in the dtype of y (B, ...), for broadcasting."""
     return t.to(y.dtype).reshape(-1, *[1] * (y.ndim - 1))
 
 
@@ -65,18 +65,18 @@ def interpolate(y0: Tensor, y1: Tensor, t: Tensor) -> Tensor:
 
 
 def flow_matching(y0: Tensor, y1: Tensor, t: Tensor) -> Example:
-    """The supervision of a teacher, Eq. (1): y_t on the straight path and its velocity y1 - y0.
+    """The supervision of a teacher, Eq. (1): y_t on the straight path, and its velocity y1 - y0.
 
     Args:
         y0: (B, ...) data.
         y1: (B, ...) noise.
-        t: (B,) times, from one of ``TIMESTEPS``.
+        t: (B,) times, distributed by one of ``TIMESTEPS``.
     """
     return Example(interpolate(y0, y1, t), t, y1 - y0)
 
 
 def velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
-    """E m(v_theta(y_t, t, c), v), the scalar that training lowers; the same for teacher and student."""
+    """E m(v_theta(y_t, t, c), v), the scalar loss of teachers and students."""
     return metric(velocity(example.y, example.t, example.cond), example.velocity).mean()
 
 
@@ -84,46 +84,47 @@ def guided(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
     """Classifier-free guidance (Ho and Salimans, 2022): v(y, t, blank) + scale (v(y, t, c) - v(y, t, blank)).
 
     Args:
-        velocity: trained with conditions and, now and then, with a blank one.
-        scale: 1 = no guidance; more follows the condition more closely, at the cost of variety.
-        blank: (...) the condition of one sample that says nothing, as ``velocity`` takes it.
+        velocity: a velocity trained with conditions and, with some probability, with blank ones.
+        scale: 1 = no guidance; larger scales follow the condition more closely, with less diversity.
+        blank: (...) the blank condition of one sample, as ``velocity`` takes it.
     """
 
-    def toward(y: Tensor, t: Tensor, cond: Tensor) -> Tensor:
-        nothing = blank.expand(len(y), *blank.shape)
-        # One evaluation of twice the batch: what the network computes once is not computed twice.
-        both = velocity(torch.cat((y, y)), torch.cat((t, t)), torch.cat((cond, nothing.to(cond))))
+    def guided_velocity(y: Tensor, t: Tensor, cond: Tensor) -> Tensor:
+        blanks = blank.expand(len(y), *blank.shape)
+        # One evaluation of twice the batch, so that the network computes what does not depend on the batch once.
+        both = velocity(torch.cat((y, y)), torch.cat((t, t)), torch.cat((cond, blanks.to(cond))))
         with_condition, without = both.chunk(2)
         return torch.lerp(without, with_condition, scale)
 
-    return velocity if scale == 1 else toward
+    return velocity if scale == 1 else guided_velocity
 
 
 def autoguided(
     velocity: Velocity, weaker: Velocity, scale: float, within: tuple[float, float] = (0.0, 1.0)
 ) -> Velocity:
     """Autoguidance (Karras et al., "Guiding a Diffusion Model with a Bad Version of Itself", NeurIPS 2024):
-    v_weaker + scale (v - v_weaker), away from the mistakes that both make, with a condition or without.
+    v_weaker + scale (v - v_weaker), which reduces errors that both share, with or without a condition.
 
     Args:
-        velocity: a flow.
-        weaker: one of the same data and conditions that makes the same mistakes more: smaller, trained for less.
+        velocity: the velocity to guide.
+        weaker: a velocity for the same data and conditions with larger errors of the same kind: from a smaller network,
+            or one trained for fewer iterations.
         scale: 1 = no guidance.
-        within: least and greatest time at which it leads; out of the noise it costs variety (Kynkaanniemi et al.,
+        within: smallest and largest time with guidance; guidance at high noise reduces diversity (Kynkaanniemi et al.,
             "Applying Guidance in a Limited Interval", NeurIPS 2024).
     """
     low, high = within
 
-    def away(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
-        drawn = torch.where((t >= low) & (t <= high), scale, 1.0)
-        from_here = weaker(y, t, cond)
-        return from_here + per_sample(drawn, y) * (velocity(y, t, cond) - from_here)
+    def guided_velocity(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
+        scales = torch.where((t >= low) & (t <= high), scale, 1.0)
+        base = weaker(y, t, cond)
+        return base + per_sample(scales, y) * (velocity(y, t, cond) - base)
 
-    return velocity if scale == 1 else away
+    return velocity if scale == 1 else guided_velocity
 
 
 def squared_l2(a: Tensor, b: Tensor) -> Tensor:
-    """(B,) mean of (a - b)^2; the paper's metric for latent models and 1-RF teachers."""
+    """(B,) mean of (a - b)^2, the paper's metric for latent models and 1-RF teachers."""
     return _error(a, b).square().mean(1)
 
 
@@ -138,12 +139,12 @@ def pseudo_huber(a: Tensor, b: Tensor, coefficient: float = PSEUDO_HUBER) -> Ten
     error = _error(a, b)
     c = coefficient * math.sqrt(error.shape[1])
     square = error.square()
-    # The same as sqrt(e^2 + c^2) - c, without a difference of what is nearly alike: 0 for no error, on every processor.
+    # Equals sqrt(e^2 + c^2) - c without cancellation: exactly 0 for no error, on every processor.
     return (square / ((square + c * c).sqrt() + c)).mean(1)
 
 
 def _error(a: Tensor, b: Tensor) -> Tensor:
-    """(B, elements) a - b, at least in float32."""
+    """(B, elements) a - b in float32 or higher precision."""
     if a.shape != b.shape:
         raise DataError(f"a metric of shapes {tuple(a.shape)} and {tuple(b.shape)}", "one shape (B, ...)")
     error = a - b
@@ -155,13 +156,13 @@ METRICS: dict[str, Metric] = {"squared_l2": squared_l2, "pseudo_huber": pseudo_h
 
 
 def u_shaped(u: Tensor, sharpness: float = 4.0) -> Tensor:
-    """Density proportional to cosh(a (t - 1/2)) with a = ``sharpness``: more often near both ends, for reflow
+    """Density proportional to cosh(a (t - 1/2)) with a = ``sharpness``, which is highest at both ends; for reflow
     (Lee et al., "Improving the Training of Rectified Flows", NeurIPS 2024)."""
     return 0.5 + torch.asinh((2 * u - 1) * math.sinh(sharpness / 2)) / sharpness
 
 
 def logit_normal(u: Tensor, mean: float = 0.0, std: float = 1.0) -> Tensor:
-    """t = sigmoid(n) with n normal (Esser et al., "Scaling Rectified Flow Transformers", ICML 2024)."""
+    """t = sigmoid(n) with normally distributed n (Esser et al., "Scaling Rectified Flow Transformers", ICML 2024)."""
     return torch.sigmoid(mean + std * torch.special.ndtri(u))
 
 
@@ -171,8 +172,8 @@ TIMESTEPS: dict[str, Callable[[Tensor], Tensor]] = {
     "logit_normal": logit_normal,
     "logit_normal_shifted": lambda u: logit_normal(u, math.log(2)),
 }
-"""Distributions of t as quantile functions: uniform numbers u in (0, 1), such as ``noise.uniform`` gives, to
-times of the same shape. Feeding them numbers keyed by (seed, index) makes training repeatable.
+"""Distributions of t as quantile functions, from uniform numbers u in (0, 1) (``noise.uniform``) to times of the same
+shape. With numbers keyed by (seed, index), training is reproducible.
 
-The shifted one has twice the odds of noise, t / (1 - t) (Esser et al.'s shift of 2): neighbouring cells of a range
-image say so nearly the same that its layout is decided while there is still much noise."""
+"logit_normal_shifted" doubles the odds of noise, t / (1 - t) (Esser et al.'s shift of 2): neighbouring cells of a range
+image are so strongly correlated that its layout is already determined at high noise."""

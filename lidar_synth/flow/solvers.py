@@ -2,7 +2,7 @@
 
 The time grid is any descending sequence of times, evenly spaced or not; a distilled student has its own.
 
-To add a solver: write its step, enter it in ``SOLVERS`` with its order; the tests measure the order.
+To add a solver: write its step and enter it in ``SOLVERS`` with its order; the tests measure the order.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,16 +16,16 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.flow.path import Velocity, per_sample
 
 Grid = Sequence[float] | Tensor
-"""S + 1 descending times for S steps, the same for all samples; or a tensor (S + 1, B), one grid per sample."""
+"""S + 1 descending times for S steps, shared by all samples, or a tensor (S + 1, B) with one grid per sample."""
 
 
 class State(NamedTuple):
     """A point of a trajectory.
 
     Args:
-        t: (B,) time, in the precision of the state and at least in float32.
+        t: (B,) time, in the dtype of the state or float32, whichever is more precise.
         y: (B, ...) state.
-        velocity: (B, ...) the velocity of the step that leaves here, (y_next - y) / (t_next - t); None at the end.
+        velocity: (B, ...) mean velocity of the next step, (y_next - y) / (t_next - t); None at the end.
     """
 
     t: Tensor
@@ -46,8 +46,13 @@ def heun(velocity: Velocity, y: Tensor, t: Tensor, t_next: Tensor, cond: Any) ->
 
 
 class Solver(NamedTuple):
-    """One solver: ``slope(velocity, y, t, t_next, cond)`` is the mean velocity over a step; ``order`` of its
-    global error; ``evaluations`` of the network per step."""
+    """One solver.
+
+    Args:
+        slope: ``slope(velocity, y, t, t_next, cond)``, the mean velocity over a step.
+        order: order of the global error.
+        evaluations: evaluations of the network per step.
+    """
 
     slope: Callable[[Velocity, Tensor, Tensor, Tensor, Any], Tensor]
     order: int
@@ -62,7 +67,7 @@ def uniform_grid(steps: int, start: float = 1.0, end: float = 0.0) -> tuple[floa
     """``steps`` + 1 evenly spaced times from ``start`` down to ``end``.
 
     Raises:
-        ConfigError: on less than one step.
+        ConfigError: on fewer than one step.
     """
     if steps < 1:
         raise ConfigError(f"{steps} steps", "at least 1")
@@ -72,15 +77,15 @@ def uniform_grid(steps: int, start: float = 1.0, end: float = 0.0) -> tuple[floa
 def trajectory(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None) -> Iterator[State]:
     """Solve dy/dt = v(y, t, cond) along the grid, and yield the states one at a time.
 
-    Only the current state is in memory. It keeps its own dtype (float32 is advised), whatever dtype the network
-    computes in.
+    Only the current state is in memory. It keeps its dtype (float32 is recommended), independent of the network's
+    dtype.
 
     Args:
-        velocity: the flow.
+        velocity: the velocity of the flow.
         y: (B, ...) state at the first time of the grid.
         grid: descending times within [0, 1].
-        solver: a name of ``SOLVERS``.
-        cond: the condition that ``velocity`` is given at each step.
+        solver: a key of ``SOLVERS``.
+        cond: the condition, passed to ``velocity`` at each step.
 
     Yields:
         S + 1 states.
@@ -130,8 +135,10 @@ def checked_grid(grid: Sequence[float] | Tensor) -> Tensor:
 
 
 def _times(grid: Grid, y: Tensor) -> Tensor:
-    """(S + 1, B) times beside y."""
-    if isinstance(grid, Tensor) and grid.ndim == 2:  # made by distillation, on the device: not worth a wait
+    """(S + 1, B) times on the device of y."""
+    if (
+        isinstance(grid, Tensor) and grid.ndim == 2
+    ):  # from distillation, already on the device; a check would synchronise
         return grid
     times = checked_grid(grid).to(y.device, torch.promote_types(y.dtype, torch.float32))
     return times[:, None].expand(-1, len(y))

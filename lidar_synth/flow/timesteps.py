@@ -1,13 +1,13 @@
-"""Adaptive timestep selection: where a teacher's trajectories may be cut into N straight pieces (Eq. 5).
+"""Adaptive timestep selection: the best division of a teacher's trajectories into N straight pieces (Eq. 5).
 
-The teacher runs by Euler over M uniform steps, t_0 = 1 > ... > t_M = 0. Going straight on from t_i to t_j with
-the velocity at t_i costs ::
+The teacher is solved by Euler's method in M uniform steps, t_0 = 1 > ... > t_M = 0. The cost of one straight step from
+t_i to t_j with the velocity at t_i is ::
 
     C[i, j] = E_trajectories m(y_i + (t_j - t_i) v_i, y_j),        i < j
 
-and the timesteps of an N-step student are the path of exactly N intervals from 0 to M of least total cost,
-shared over all trajectories: C is averaged first, then one dynamic programme of O(N M^2) finds the path.
-Trajectories are streamed: C is all that is kept of them.
+and the timesteps of an N-step student are the path of exactly N intervals from 0 to M with the least total cost, shared
+by all trajectories: C is averaged first, then dynamic programming in O(N M^2) finds the path. Trajectories are
+streamed, so that only C is kept in memory.
 """
 
 from collections.abc import Callable
@@ -27,16 +27,16 @@ from lidar_synth.flow.solvers import trajectory, uniform_grid
 from lidar_synth.noise import gaussian
 
 Costs = NDArray[np.float64]
-"""(..., M + 1, M + 1) cost of going straight from candidate i to candidate j > i; inf where j <= i."""
+"""(..., M + 1, M + 1) cost of one straight step from candidate i to candidate j > i; inf where j <= i."""
 
 _CHUNK = {"cpu": 2**18, "cuda": 2**25}
-"""Elements that the cost matrix compares at a time: what stays in a CPU's cache (which is worth a factor of 5
-there), what fills a GPU."""
+"""Elements that the cost matrix compares at a time: few enough for a CPU's cache (five times faster), enough to fill a
+GPU."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What the selection found.
+    """Result of the timestep selection.
 
     Args:
         grid: N + 1 descending times from 1 to 0, the student's time grid.
@@ -44,7 +44,7 @@ class Selection:
         uniform_cost: total cost of N uniform intervals.
         candidates: M + 1 descending times.
         costs: (M + 1, M + 1) mean cost matrix.
-        per_trajectory: (trajectories, N - 1) inner times that would be best for each trajectory alone (the
+        per_trajectory: (trajectories, N - 1) inner times that are best for each trajectory alone (the
             paper's Figure 3).
     """
 
@@ -69,27 +69,27 @@ def select_timesteps(
     condition: Callable[[range], Any] | None = None,
     progress: bool = True,
 ) -> Selection:
-    """The time grid of N steps on which a teacher's trajectories are straightest.
+    """Select the time grid of N steps on which a teacher's trajectories are straightest.
 
     Peak memory is that of ``batch`` trajectories (states and velocities: 105 MB each for 2x64x1024 and
-    M = 100), whatever their number.
+    M = 100), independent of the number of trajectories.
 
     Args:
         velocity: the teacher.
-        shape: of one state, (C, H, W).
+        shape: (C, H, W), shape of one state.
         intervals: N.
         candidates: M, uniform steps of the teacher.
-        trajectories: how many to average over; trajectory k starts from the noise of (``seed``, k).
-        metric: m, a name of ``METRICS`` or a callable; the one that the student trains with.
-        seed: of the noise.
-        batch: trajectories at a time.
-        device: where the teacher is.
-        condition: the teacher's condition for a range of trajectories; None = unconditional.
-        progress: show a bar.
+        trajectories: number of trajectories to average over; trajectory k starts from the noise of (``seed``, k).
+        metric: m, a key of ``METRICS`` or a callable; the metric of the student's training.
+        seed: seed of the noise.
+        batch: number of trajectories computed at once.
+        device: device of the teacher.
+        condition: gives the conditions of a range of trajectories; None = unconditional.
+        progress: whether to show a progress bar.
 
     Raises:
         ConfigError: on an unknown metric or impossible numbers.
-        DataError: if the teacher gives NaN or infinity.
+        DataError: if the teacher returns NaN or infinity.
     """
     if not 1 <= intervals <= candidates or trajectories < 1 or batch < 1:
         raise ConfigError(
@@ -104,12 +104,12 @@ def select_timesteps(
     optima = []
     with torch.inference_mode(), tqdm(total=trajectories, desc="trajectories", disable=not progress) as bar:
         for first in range(0, trajectories, batch):
-            some = range(first, min(first + batch, trajectories))
-            start = gaussian(seed, some, shape, device)
-            costs = cost_matrix(velocity, start, times, m, condition(some) if condition else None)
+            part = range(first, min(first + batch, trajectories))
+            start = gaussian(seed, part, shape, device)
+            costs = cost_matrix(velocity, start, times, m, condition(part) if condition else None)
             total += costs.sum(0)
             optima.append(best_path(costs, intervals))
-            bar.update(len(some))
+            bar.update(len(part))
     return _selection(total / trajectories, times, intervals, np.concatenate(optima))
 
 
@@ -127,7 +127,7 @@ def _selection(costs: Costs, times: tuple[float, ...], intervals: int, optima: N
 
 
 def cost_matrix(velocity: Velocity, start: Tensor, times: tuple[float, ...], metric: Metric, cond: Any = None) -> Costs:
-    """The cost matrices of a few trajectories of Euler's method.
+    """The cost matrices of a batch of trajectories, solved by Euler's method.
 
     Args:
         velocity: the teacher.
@@ -171,7 +171,7 @@ def best_path(costs: Costs, intervals: int) -> NDArray[np.int64]:
         intervals: N, 1 <= N <= M.
 
     Returns:
-        (..., N + 1) rising candidate numbers from 0 to M.
+        (..., N + 1) ascending candidate indices from 0 to M.
     """
     best = costs[..., 0, :]  # best[j]: cheapest path of n intervals from 0 to j, n = 1
     choices = []

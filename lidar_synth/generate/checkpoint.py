@@ -1,25 +1,25 @@
-"""Checkpoints, "lidar-synth-checkpoint/2": one ``.safetensors`` with weights and a JSON header.
+"""Checkpoints, "lidar-synth-checkpoint/2": one ``.safetensors`` file with weights and a JSON header.
 
-The header stands in the file's metadata under ``lidar_synth`` and says all that generation needs::
+The header is stored in the file's metadata under ``lidar_synth`` and contains everything that generation needs::
 
-    format          "lidar-synth-checkpoint/2"; "/1" is read too, every other one is refused
-    convention      "t=1 noise, t=0 data, v=noise-data", so that nobody has to guess
+    format          "lidar-synth-checkpoint/2"; "/1" can be read too, other versions are refused
+    convention      "t=1 noise, t=0 data, v=noise-data": the convention of times and velocities
     networks        {part: {architecture, arguments}}; "velocity" is the flow, "codec" the autoencoder of a latent
-                    model (an autoencoder alone has this part only), "condition" the encoder of a condition
-    sensor          as in sensors.yaml
-    normalisation   of the range
-    channels        of the network's data, in order, each a name of ``normalize.CHANNELS``
-    label_encoding  how labels are written into channels, or null
-    conditioning    {name of conditions.CONDITIONS: its options}; empty = unconditional. Options: ``dropout``, share of
+                    model (the only part of an autoencoder's checkpoint), "condition" the encoder of a condition
+    sensor          the sensor, as in sensors.yaml
+    normalisation   the normalisation of the range
+    channels        channels of the network's data, in order, each a key of ``normalize.CHANNELS``
+    label_encoding  the encoding of labels in channels, or null
+    conditioning    {key of conditions.CONDITIONS: its options}; empty = unconditional. Options: ``dropout``, share of
                     blank conditions in training; ``image``, rows and columns of the camera's images
-    time_grid       descending from 1 to 0: the steps that the weights were made for
+    time_grid       times descending from 1 to 0: the steps that the weights were trained for
     provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher, recipe, metrics
     weights         sha256 of all tensors
     checksum        sha256 of all other keys, as JSON with sorted keys
 
 A tensor's name is its part, a dot, and its name in the network. The hash of a checkpoint is its checksum, which covers
 the header and, through ``weights``, the tensors. Version 1 has no checksum: its hash is the sha256 of the header's
-text, and a changed byte of its header can go unnoticed. Nothing is ever unpickled.
+text, so that damage to its header can go unnoticed. Nothing is ever unpickled.
 """
 
 import hashlib
@@ -45,15 +45,15 @@ from lidar_synth.models import assemble
 
 FORMAT = "lidar-synth-checkpoint/2"
 WITHOUT_CHECKSUM = "lidar-synth-checkpoint/1"
-"""The older format, whose header no checksum covers; it is read, and no longer written."""
+"""The older format, which has no checksum of the header. It can be read, but is no longer written."""
 CONVENTION = "t=1 noise, t=0 data, v=noise-data"
 LABEL_ENCODING = f"{LABEL_BITS} analog bits, most significant first, code 19 = no label"
 VELOCITY, CODEC, ENCODER = "velocity", "codec", "condition"
-"""Parts: the flow's velocity network, the autoencoder, the encoder of the condition."""
+"""Names of the parts: the flow's velocity network, the autoencoder, the encoder of the condition."""
 
 
 class NetworkSpec(NamedTuple):
-    """A network as ``nets.build_network`` takes it."""
+    """The arguments of ``models.build_network``."""
 
     architecture: str
     arguments: dict[str, Any]
@@ -61,10 +61,10 @@ class NetworkSpec(NamedTuple):
 
 @dataclass(frozen=True)
 class Header:
-    """What a checkpoint says about its weights; the fields are those of the module's docstring.
+    """The header of a checkpoint; the module's docstring describes its fields.
 
     Raises:
-        ConfigError: on channels, a time grid or a provenance that no checkpoint may have.
+        ConfigError: on invalid networks, channels, time grid, provenance or conditioning.
     """
 
     networks: dict[str, NetworkSpec]
@@ -86,7 +86,7 @@ class Header:
         if unknown := sorted(set(self.conditioning) - set(CONDITIONS)):
             raise ConfigError(f"conditioning on {unknown}", f"some of {', '.join(CONDITIONS)}")
         shape = (self.tensors.size, *self.sensor.shape)
-        # What stands next to the range image works on the sensor's own grid.
+        # The network that takes range images has the grid of the sensor.
         arguments = self.networks[CODEC if CODEC in self.networks else VELOCITY].arguments
         given = (arguments.get("channels", shape[0]), *arguments.get("resolution", shape[1:]))
         if given != shape:
@@ -97,11 +97,11 @@ class Header:
 
     @property
     def tensors(self) -> TensorFormat:
-        """Range images to the network's tensors and back."""
+        """The format of the network's tensors."""
         return TensorFormat(self.channels, self.normalisation)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as the file holds them; without ``weights`` and ``checksum``."""
+        """Plain values, as the file stores them, without ``weights`` and ``checksum``."""
         return {
             "format": FORMAT,
             "convention": CONVENTION,
@@ -120,11 +120,11 @@ class Header:
         """The inverse of ``to_dict``.
 
         Raises:
-            ConfigError: on another format, and on keys or values that do not belong into a header.
+            ConfigError: on another format, or on unknown, missing or invalid keys and values.
         """
         values = dict(values)
         if (given := values.pop("format", None)) not in (FORMAT, WITHOUT_CHECKSUM):
-            raise ConfigError(f"format {given!r}", repr(FORMAT), "Use the version of lidar_synth that wrote it.")
+            raise ConfigError(f"format {given!r}", repr(FORMAT), "Use the version of lidar_synth that wrote the file.")
         try:
             header = cls(
                 networks={name: NetworkSpec(**part) for name, part in values["networks"].items()},
@@ -138,7 +138,7 @@ class Header:
         except KeyError as error:
             raise ConfigError(f"a header without {error}", "all keys of the format") from error
         except (TypeError, AttributeError) as error:
-            raise ConfigError(f"a header that does not fit together ({error})", "the values of the format") from error
+            raise ConfigError(f"a header with invalid values ({error})", "the values of the format") from error
         expected = header.to_dict()
         if unknown := sorted(set(values) - set(expected)):
             raise ConfigError(f"header keys {unknown}", f"those of {FORMAT}")
@@ -149,7 +149,7 @@ class Header:
 
 
 def join(networks: Mapping[str, nn.Module]) -> nn.Module:
-    """The flow of a checkpoint as one v(y, t, c) that takes conditions as they are stored."""
+    """The flow of a checkpoint's networks as one v(y, t, c), which takes conditions as they are stored."""
     velocity = networks[VELOCITY]
     return Conditioned(velocity, networks[ENCODER]) if ENCODER in networks else velocity
 
@@ -162,12 +162,12 @@ def split(network: nn.Module) -> dict[str, nn.Module]:
 
 
 class Checkpoint(NamedTuple):
-    """A checkpoint that was read.
+    """A loaded checkpoint.
 
     Args:
-        header: what it says about its weights.
-        networks: by part, in evaluation mode, float32.
-        hash: sha256 in hexadecimal, of the header and, through it, of the weights.
+        header: its header.
+        networks: its networks by part, in evaluation mode, float32.
+        hash: sha256 of the header and, through it, of the weights, in hexadecimal.
     """
 
     header: Header
@@ -178,21 +178,21 @@ class Checkpoint(NamedTuple):
 def save_checkpoint(
     path: Path, header: Header, networks: Mapping[str, nn.Module], dtype: torch.dtype | None = None
 ) -> str:
-    """Write a checkpoint beside ``path``, then rename it; the same content gives the same bytes.
+    """Write a checkpoint to a temporary file, then rename it; the same content gives the same bytes.
 
     Args:
-        path: ends in ``.safetensors``.
-        header: its ``networks`` have to describe those given.
-        networks: by part.
-        dtype: store the parameters in this precision; buffers stay as they are.
+        path: path that ends in ``.safetensors``.
+        header: header whose ``networks`` describe those given.
+        networks: networks by part.
+        dtype: dtype of the stored parameters; buffers keep theirs.
 
     Returns:
         The checkpoint's hash.
 
     Raises:
-        ConfigError: on another suffix, or where header and networks differ.
+        ConfigError: on another suffix, or if header and networks differ.
         DataError: on weights that are not finite.
-        FileError: where the file cannot be written.
+        FileError: if the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".safetensors":
@@ -211,7 +211,7 @@ def save_checkpoint(
     try:
         checksum = _checksum(values)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"a header with a value that JSON does not hold ({error})", "plain, finite values") from error
+        raise ConfigError(f"a header with a value that JSON cannot store ({error})", "plain, finite values") from error
     text = json.dumps({**values, "checksum": checksum}, sort_keys=True)
     write_file(path, save(tensors, {"lidar_synth": text}), durable=True)
     return checksum
@@ -221,43 +221,51 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
     """Read a checkpoint and build its networks.
 
     Args:
-        path: a file of ``save_checkpoint``.
-        device: where the networks shall be.
+        path: file written by ``save_checkpoint``.
+        device: device of the networks.
 
     Raises:
-        ConfigError: on a device that is not there.
-        FileError: where the file cannot be read.
-        DataError: on a file that is no checkpoint of this version, is cut or damaged, or whose weights do not fit
-            its header.
+        ConfigError: on an unavailable device.
+        FileError: if the file cannot be read.
+        DataError: on a file that is not a checkpoint of this version, is truncated or damaged, or whose weights do not
+            match its header.
     """
     device = checked_device(device)
     _, header, digest, weights, tensors = _read(Path(path))
     if weights != weights_hash(tensors):
-        raise DataError(f"{path}: the weights do not have the sum in the header", "a whole file", "Copy it again.")
+        raise DataError(
+            f"{path}: the weights do not match their checksum in the header", "an intact file", "Copy it again."
+        )
     _check_finite(tensors, str(path))
     networks = {}
     for name, part in header.networks.items():
-        # Copies are aligned; the file's own memory is not, and products differ in their last bits by that.
+        # Copies are aligned in memory; the file's buffer is not, which changes the last bits of matrix products.
         state = {k.removeprefix(f"{name}."): v.clone() for k, v in tensors.items() if k.startswith(f"{name}.")}
         networks[name] = assemble(*part, state, f"{path}: the network {name!r}", device)
-    if foreign := [k for k in tensors if k.partition(".")[0] not in header.networks]:
-        raise DataError(f"{path}: tensors {foreign}", f"those of {sorted(header.networks)} only")
+    if unknown := [k for k in tensors if k.partition(".")[0] not in header.networks]:
+        raise DataError(f"{path}: tensors {unknown}", f"those of {sorted(header.networks)} only")
     return Checkpoint(header, networks, digest)
 
 
 def read_header(path: Path) -> tuple[Header, str]:
-    """The header of a checkpoint and its hash, without its weights; raises as ``load_checkpoint``."""
+    """The header of a checkpoint and its hash, without its weights.
+
+    Raises the errors of ``load_checkpoint``.
+    """
     content = _read(Path(path), tensors=False)
     return content.header, content.hash
 
 
 def has_checksum(path: Path) -> bool:
-    """Whether a damaged header of this checkpoint would be noticed; raises as ``load_checkpoint``."""
+    """Whether a checksum covers the header of this checkpoint.
+
+    Raises the errors of ``load_checkpoint``.
+    """
     return _read(Path(path), tensors=False).format == FORMAT
 
 
 class _Content(NamedTuple):
-    """What a file holds; ``weights`` is their sum as the header tells it."""
+    """The content of a checkpoint file; ``weights`` is the checksum of the tensors by the header."""
 
     format: str
     header: Header
@@ -267,7 +275,7 @@ class _Content(NamedTuple):
 
 
 def _read(path: Path, tensors: bool = True) -> _Content:
-    """The content of a checkpoint whose header is as it was written; its tensors are not checked yet."""
+    """The content of a checkpoint with a verified header; the tensors are not verified yet."""
     try:
         with path.open("rb") as file:
             start = file.read(2)
@@ -277,15 +285,17 @@ def _read(path: Path, tensors: bool = True) -> _Content:
         raise DataError(
             f"{path} is a PyTorch pickle",
             "a .safetensors checkpoint",
-            f"A pickle can run code and is never loaded as a checkpoint. Peers' released weights are converted by: "
+            f"A pickle can run code and is never loaded as a checkpoint. To convert weights of R2Flow or LiDM: "
             f"lidar-synth import {path} OUT.safetensors (--peer lidm for LiDM's)",
         )
     try:
         with safe_open(path, framework="pt") as content:
             text = (content.metadata() or {}).get("lidar_synth")
-            held = {key: content.get_tensor(key) for key in content.keys()} if tensors else {}  # noqa: SIM118
+            stored = {key: content.get_tensor(key) for key in content.keys()} if tensors else {}  # noqa: SIM118
     except SafetensorError as error:
-        raise DataError(f"{path} is cut, damaged or no .safetensors file ({error})", "a whole file") from error
+        raise DataError(
+            f"{path} is truncated, damaged or no .safetensors file ({error})", "an intact file", "Copy it again."
+        ) from error
     if text is None:
         raise DataError(f"{path} has weights but no header of lidar_synth", f"a file of {FORMAT}")
     try:
@@ -293,37 +303,37 @@ def _read(path: Path, tensors: bool = True) -> _Content:
         version = values.get("format")
         digest = _hash(text) if version == WITHOUT_CHECKSUM else _verified(values)
         weights = values.pop("weights", None)
-        return _Content(version, Header.from_dict(values), digest, weights, held)
+        return _Content(version, Header.from_dict(values), digest, weights, stored)
     except (ValueError, AttributeError, RecursionError) as error:  # a ConfigError is a ValueError
         raise DataError(f"{path}: {error}") from error
 
 
 def _verified(values: dict[str, Any]) -> str:
-    """Take the checksum out of a header's values; raise where it is not theirs."""
+    """Remove the checksum from a header's values and return it; raise a ConfigError if it does not match."""
     checksum = values.pop("checksum", None)
     if values.get("format") == FORMAT and checksum != _checksum(values):
-        raise ConfigError("the header does not have its checksum", "a whole file", "Copy it again.")
+        raise ConfigError("a header that does not match its checksum", "an intact file", "Copy it again.")
     return str(checksum)
 
 
 def _checksum(values: Mapping[str, Any]) -> str:
-    """sha256 of plain values, whatever the order of their keys."""
+    """sha256 of plain values, independent of the order of keys."""
     return _hash(json.dumps(values, sort_keys=True, allow_nan=False))
 
 
 def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
-    """Refuse values that are no finite float32, which is what a network is built from."""
+    """Raise a DataError on values that are complex, or not finite in float32."""
     if bad := [k for k, v in tensors.items() if v.is_complex() or not bool(torch.isfinite(v.float()).all())]:
         raise DataError(f"{what} has NaN or infinity in {bad}", "finite weights and ray angles")
 
 
 def network_hash(network: nn.Module) -> str:
-    """``weights_hash`` of a network's state, wherever it is."""
+    """``weights_hash`` of a network's state, on any device."""
     return weights_hash({key: value.cpu() for key, value in network.state_dict().items()})
 
 
 def weights_hash(tensors: Mapping[str, Tensor]) -> str:
-    """sha256 of the names, types, shapes and bytes of tensors on the CPU, in hexadecimal."""
+    """sha256 of the names, dtypes, shapes and bytes of tensors on the CPU, in hexadecimal."""
     digest = hashlib.sha256()
     for key in sorted(tensors):
         tensor = tensors[key]

@@ -1,7 +1,7 @@
-"""Between range images and the states of a flow: nothing for pixel models, an autoencoder for latent ones.
+"""Mapping between range images and the states of a flow: the identity for pixel models, an autoencoder for latent ones.
 
-Everything after the codec (path, solver, selection, distillation, sampling) is the same for both. A tensor is what
-``TensorFormat`` makes of range images, (B, C, H, W); a state is what the flow lives on.
+Everything after the codec (path, solver, selection, distillation, sampling) is the same for both. A tensor (B, C, H, W)
+contains range images encoded by ``TensorFormat``; a state is what the flow generates.
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,12 @@ from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
 
 
 class Codec(Protocol):
-    """``shape`` is that of a state, (channels, rows, columns); ``draws``, how many random numbers a cell of an image
-    takes; ``decode`` takes back what ``encode`` did."""
+    """A pair of mappings; ``decode`` is the approximate inverse of ``encode``.
+
+    Attributes:
+        shape: channels, rows and columns of a state.
+        draws: number of random numbers per cell for sampling an image; 0 if decoding is deterministic.
+    """
 
     @property
     def shape(self) -> tuple[int, int, int]: ...
@@ -29,18 +33,19 @@ class Codec(Protocol):
         ...
 
     def decode(self, y: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
-        """States (B, *shape) to tensors (B, C, H, W), drawn by (B, draws, H, W) numbers in (0, 1), or the likeliest."""
+        """States (B, *shape) to tensors (B, C, H, W), sampled with (B, draws, H, W) numbers in (0, 1); None = the
+        mode."""
         ...
 
 
 class Autoencoder(Protocol):
-    """What a latent codec needs of a network (``VQVAE``).
+    """The interface of an autoencoder (such as ``VQVAE``) that a latent codec needs.
 
     Attributes:
-        channels: of its images.
-        resolution: rows and columns of its images.
-        latent_shape: channels, rows and columns of its latents.
-        draws: random numbers that a cell of an image takes; 0 where a latent stands for one image.
+        channels: number of channels of an image.
+        resolution: rows and columns of an image.
+        latent_shape: channels, rows and columns of a latent.
+        draws: number of random numbers per cell for sampling an image; 0 if decoding is deterministic.
     """
 
     channels: int
@@ -49,7 +54,7 @@ class Autoencoder(Protocol):
     draws: int
 
     def encode(self, x: Tensor) -> Tensor:
-        """Images (B, C, H, W) to latents of about mean 0 and variance 1."""
+        """Images (B, C, H, W) to latents of approximate mean 0 and variance 1."""
         ...
 
     def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
@@ -69,11 +74,11 @@ class Identity:
     draws: ClassVar[int] = 0
 
     def encode(self, x: Tensor) -> Tensor:
-        """(B, C, H, W), as it is."""
+        """(B, C, H, W), unchanged."""
         return x
 
     def decode(self, y: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
-        """(B, C, H, W), as it is."""
+        """(B, C, H, W), unchanged."""
         return y
 
 
@@ -83,7 +88,7 @@ class Latent:
 
     Args:
         network: the autoencoder, in evaluation mode.
-        tensors: the layout of its images; label bits leave the network as logits.
+        tensors: the layout of its images; the network returns label bits as logits.
     """
 
     network: Autoencoder
@@ -96,7 +101,7 @@ class Latent:
 
     @property
     def draws(self) -> int:
-        """Random numbers per cell."""
+        """Number of random numbers per cell for sampling an image."""
         return self.network.draws
 
     @torch.no_grad()
@@ -106,8 +111,11 @@ class Latent:
 
     @torch.no_grad()
     def decode(self, y: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
-        """Latents (B, *shape), through the codebook, to tensors (B, C, H, W), drawn by ``uniform_noise`` (B, draws, H,
-        W) or the likeliest.
+        """Latents (B, *shape), quantised if there is a codebook, to tensors (B, C, H, W).
+
+        Args:
+            y: latents.
+            uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample with; None = the mode.
 
         Raises:
             DataError: on latents of another shape.
@@ -118,8 +126,8 @@ class Latent:
 
 
 def expected(output: Tensor, tensors: TensorFormat) -> Tensor:
-    """What a decoder's output (B, C, H, W) says: label bits, which it gives as logits, become their expected values
-    tanh(x / 2) in (-1, 1); all else is as it is."""
+    """The expected values of a decoder's output (B, C, H, W): label bits x, which are logits, become tanh(x / 2) in
+    (-1, 1); other channels are unchanged."""
     parts = torch.split(output, [CHANNELS[name] for name in tensors.channels], 1)
     return torch.cat([(p / 2).tanh() if n == "label" else p for n, p in zip(tensors.channels, parts, strict=True)], 1)
 
@@ -128,17 +136,17 @@ def make_codec(network: nn.Module | None, tensors: TensorFormat, resolution: tup
     """The codec of a model.
 
     Args:
-        network: its autoencoder; None for a pixel model.
-        tensors: the layout of its tensors.
+        network: the model's autoencoder; None for a pixel model.
+        tensors: the layout of the model's tensors.
         resolution: H, W of the sensor.
 
     Raises:
-        DataError: on an autoencoder of other images.
+        DataError: on an autoencoder for images of another shape.
     """
     if network is None:
         return Identity((tensors.size, *resolution))
     codec = cast(Autoencoder, network)
     given, wanted = (codec.channels, *codec.resolution), (tensors.size, *resolution)
     if given != wanted:
-        raise DataError(f"an autoencoder of images of shape {given}", f"{wanted} for {tensors.channels}")
+        raise DataError(f"an autoencoder for images of shape {given}", f"{wanted} for {tensors.channels}")
     return Latent(codec, tensors)

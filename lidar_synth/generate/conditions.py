@@ -1,15 +1,15 @@
-"""What a scan can be generated from: a map of labels, or a camera image.
+"""Conditions of generation: a label map or a camera image.
 
-A condition is given as it is stored, whole numbers in an array, or as the real ``Scan`` that has it::
+A condition is an array of integers, or a real ``Scan`` that provides it::
 
     semantic   (H, W) uint8 train ids 0..18, 255 = unknown, on the model's sensor (``RangeImage.label``)
-    camera     (3, h, w) uint8 red, green, blue, of the size that the model's encoder takes, or the image's path in
+    camera     (3, h, w) uint8 red, green, blue, of the size that the model's encoder takes; or the image at
                ``Scan.image_path``, which is resized
 
-An encoder (``nets.encoders``), trained together with the velocity network, makes of it what that network takes as
-``cond``. A model that met a blank condition now and then in training (``dropout``) can be guided: see ``flow.guided``.
+An encoder (``models.encoders``), trained with the velocity network, encodes it as the ``cond`` of that network. A model
+that was also trained with blank conditions (``dropout``) can be guided: see ``flow.path.guided``.
 
-To add a condition: write its class, enter it in ``CONDITIONS``, and its encoder in ``nets.NETWORKS``.
+To add a condition: write its class and enter it in ``CONDITIONS``; enter its encoder in ``models.NETWORKS``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,29 +32,27 @@ class Condition(Protocol):
     """One kind of condition.
 
     Attributes:
-        name: in ``CONDITIONS``, in a checkpoint's header and in a user's dictionary.
-        field: of ``train.ImageCache`` that holds it.
-        encoders: architectures that take it, the default first.
-        turns: whether it turns with the scan about the vertical.
-        blank: its value where nothing is known.
+        name: key in ``CONDITIONS``, in a checkpoint's header and in a user's dictionary.
+        field: field of ``train.ImageCache`` that stores it.
+        turns: whether it has to be rotated when the scan is rotated about the vertical.
+        blank: value of a blank condition.
     """
 
     name: str
     field: str
-    encoders: tuple[str, ...]
     turns: bool
     blank: int
 
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
-        """Of one condition."""
+        """The shape of one condition."""
         ...
 
     def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
-        """The condition that a real scan has, of that shape."""
+        """The condition that a real scan provides, with the given shape."""
         ...
 
     def check(self, values: Tensor) -> None:
-        """Refuse values that are none."""
+        """Raise a DataError on invalid values."""
         ...
 
 
@@ -63,16 +61,15 @@ class SemanticMap:
 
     name = "semantic"
     field = "label"
-    encoders: tuple[str, ...] = ("semantic_map",)
     turns = True
     blank = IGNORE
 
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
         """(H, W)."""
-        return tuple(encoder.resolution)  # type: ignore[arg-type]  # every encoder has one
+        return tuple(encoder.resolution)  # type: ignore[arg-type]  # every encoder has a resolution
 
     def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
-        """The scan's labels, projected onto ``sensor``, whichever sensor took it.
+        """The scan's labels, projected onto ``sensor``, which need not be the scan's own.
 
         Raises:
             DataError: on a scan without labels.
@@ -83,36 +80,37 @@ class SemanticMap:
         return labels
 
     def check(self, values: Tensor) -> None:
-        """Train ids only.
+        """Check that all values are train ids or 255.
 
         Raises:
-            DataError: naming the others.
+            DataError: on other values.
         """
         wrong = values[(values >= len(NAMES)) & (values != IGNORE)]
         if len(wrong):
             raise DataError(
                 f"a label map with ids {sorted(set(wrong.tolist()))[:8]}",
                 "train ids 0..18, or 255 = unknown",
-                "SemanticKITTI's file ids become train ids by lidar_synth.datasets.classes.SEMANTIC_KITTI.decode.",
+                "lidar_synth.datasets.classes.SEMANTIC_KITTI.decode converts SemanticKITTI's file ids to train ids.",
             )
 
 
 class CameraImage:
-    """The image of a camera ahead, cut into views side by side."""
+    """The image of a forward-facing camera."""
 
     name = "camera"
     field = "camera"
-    encoders: tuple[str, ...] = ("views", "clip_views", "sight")
     turns = False
     blank = 0
 
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
         """(3, h, w)."""
-        return (3, *encoder.resolution)  # type: ignore[misc]  # every encoder has one
+        return (3, *encoder.resolution)  # type: ignore[misc]  # every encoder has a resolution
 
     def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
-        """The image taken with the scan, resized; ``options["image"]`` are the rows and columns that it has to have,
-        which stand for the camera: one that sees more or less than that of the training would mislead.
+        """The image taken with the scan, resized.
+
+        ``options["image"]`` are the rows and columns that the image file must have. They identify the camera of the
+        training; an image with another field of view would mislead the model.
 
         Raises:
             DataError: on a scan without an image, one that cannot be read, or of another size.
@@ -137,7 +135,7 @@ class CameraImage:
         return np.asarray(small, np.uint8).transpose(2, 0, 1).copy()
 
     def check(self, values: Tensor) -> None:
-        """All bytes are colours."""
+        """Accept all values, since every byte is a valid colour."""
 
 
 CONDITIONS: dict[str, Condition] = {"semantic": SemanticMap(), "camera": CameraImage()}
@@ -145,11 +143,11 @@ CONDITIONS: dict[str, Condition] = {"semantic": SemanticMap(), "camera": CameraI
 
 
 class Conditioned(nn.Module):
-    """A velocity network together with the encoder of its condition: v(y, t, c) of conditions as they are stored.
+    """A velocity network together with the encoder of its condition: v(y, t, c) with c as stored, uint8.
 
     Args:
-        velocity: takes what ``encoder`` gives.
-        encoder: of the condition.
+        velocity: the velocity network, which takes the output of ``encoder``.
+        encoder: the encoder of the condition.
     """
 
     def __init__(self, velocity: nn.Module, encoder: nn.Module) -> None:
@@ -163,12 +161,12 @@ class Conditioned(nn.Module):
 
 
 def blank(name: str, values: Tensor) -> Tensor:
-    """A condition that says nothing, like ``values``."""
+    """A blank condition of the shape and dtype of ``values``."""
     return torch.full_like(values, CONDITIONS[name].blank)
 
 
 def one_view(image: Tensor, views: int) -> Tensor:
-    """Images (B, 3, h, w) with all views but that right of the middle blank, as LiDM drops views in training."""
+    """Images (B, 3, h, w) with all views but the one right of the middle blank, as LiDM drops views in training."""
     width, kept = image.shape[3] // views, views // 2
     out = torch.zeros_like(image)
     out[..., kept * width : (kept + 1) * width] = image[..., kept * width : (kept + 1) * width]
@@ -178,23 +176,23 @@ def one_view(image: Tensor, views: int) -> Tensor:
 def batch_of(
     name: str, given: Any, count: int, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
 ) -> Tensor:
-    """What a user gives as the conditions of several scans.
+    """Convert a user's conditions of several scans to one tensor.
 
     Args:
-        name: of the model's condition.
+        name: name of the model's condition.
         given: a condition for all, or one for each: an array or tensor, a ``Scan`` or a sequence of them, or a
-            dictionary with one of these under ``name``, as a bank holds it.
+            dictionary with one of these under ``name``, as a bank stores it.
         count: B.
-        sensor: the model's.
-        shape: of one condition.
-        options: of the condition, from the checkpoint's header.
+        sensor: the model's sensor.
+        shape: shape of one condition.
+        options: options of the condition, from the checkpoint's header.
 
     Returns:
         (B, *shape) uint8.
 
     Raises:
         ConfigError: on another type, or a dictionary without ``name``.
-        DataError: on another shape, values that are none, or a scan that lacks what is needed.
+        DataError: on another shape, invalid values, or a scan that does not provide the condition.
     """
     condition = CONDITIONS[name]
     if isinstance(given, Mapping):

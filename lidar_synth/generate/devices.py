@@ -1,4 +1,4 @@
-"""The devices that torch can compute on here."""
+"""The devices that torch can compute on."""
 
 import torch
 
@@ -6,7 +6,7 @@ from lidar_synth.errors import ConfigError
 
 
 def available_devices() -> list[str]:
-    """Names of the devices that are there: "cpu" first, then each GPU, then "mps" on a Mac that has it."""
+    """Names of the available devices: "cpu" first, then each GPU, then "mps" if a Mac has it."""
     names = ["cpu"]
     for kind in ("cuda", "xpu"):
         module = getattr(torch, kind)
@@ -15,24 +15,24 @@ def available_devices() -> list[str]:
 
 
 def checked_device(device: str | torch.device) -> torch.device:
-    """The device of a name; a kind without a number is the current device of that kind.
+    """The device with a name; a type without an index is the current device of that type.
 
     Raises:
-        ConfigError: on a name that is no device, or a device that is not there; it lists those that are.
+        ConfigError: on an unknown name or an unavailable device; the message lists the available ones.
     """
     try:
         given = torch.device(device)
-    except (RuntimeError, TypeError) as error:  # torch knows no such word, or it is no word
+    except (RuntimeError, TypeError) as error:  # an unknown name, or not a string
         raise _missing(device, available_devices()) from error
     if given.type == "cpu" and not given.index:
-        return given  # without a look at the GPUs: a process that has looked cannot fork children that use them
-    there = available_devices()
-    kinds = {name.partition(":")[0] for name in there}
-    if str(given) not in there and (given.type not in kinds or given.index is not None):
-        raise _missing(device, there)
+        return given  # without querying GPUs: after CUDA is initialised, forked children cannot use it
+    available = available_devices()
+    kinds = {name.partition(":")[0] for name in available}
+    if str(given) not in available and (given.type not in kinds or given.index is not None):
+        raise _missing(device, available)
     return given
 
 
-def _missing(device: object, there: list[str]) -> ConfigError:
-    hint = "A GPU needs a build of torch for it and its driver: `lidar-synth doctor` says what is there."
-    return ConfigError(f"device {str(device)!r}", f"one that torch finds here: {', '.join(there)}", hint)
+def _missing(device: object, available: list[str]) -> ConfigError:
+    hint = "A GPU needs its driver and a build of torch that supports it; `lidar-synth doctor` shows what is installed."
+    return ConfigError(f"device {str(device)!r}", f"an available one: {', '.join(available)}", hint)

@@ -1,19 +1,20 @@
-"""From a checkpoint to scans: geometry, network and flow together.
+"""Generation of scans from a checkpoint.
 
-A scan is a function of (checkpoint, condition, time grid and solver, seed, index). The other scans of its batch, the
-order and the device change float rounding only.
+A scan is a function of (checkpoint, condition, time grid and solver, seed, index). The other scans of its batch,
+their order and the device change only float rounding.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
+from typing_extensions import Unpack
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
@@ -30,27 +31,42 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.noise import gaussian, uniform
 
 BATCH = {"cpu": 1, "cuda": 16}
-"""Scans at a time, by device: what fits a CPU's cache, what fills a GPU."""
+"""Default batch size by device: few enough for a CPU's cache, enough to fill a GPU."""
 
 SHIPPED = {
     "town": "2d8d08119dc4a1c0002040ff47e66dea71bf87c7ae82d667c0ccfff15778202b",
     "town-camera": "5d96b6af7d5479f45e8ece7120bc5cf0493e639d783c0725f5f87581a6a1dc78",
     "town-semantic": "36d110505d2108346c82a70092b1f112474d105c34e577e546d9ad36cd11e993",
 }
-"""Hashes of the shipped checkpoints whose format is the one that has no checksum of its header."""
+"""Hashes of the shipped checkpoints, whose older format has no checksum of the header."""
+
+
+class SamplingOptions(TypedDict, total=False):
+    """Options of ``Generator.range_images``, ``scans`` and ``samples``.
+
+    Attributes:
+        steps: number of steps of a uniform time grid; None, the default, uses the checkpoint's own grid.
+        solver: a key of ``SOLVERS``, by default "euler".
+        guidance: scale of classifier-free guidance; 1, the default, is no guidance. A larger scale follows the
+            condition more closely; any scale but 1 doubles the computation.
+    """
+
+    steps: int | None
+    solver: str
+    guidance: float
 
 
 @dataclass(frozen=True)
 class Generator:
-    """A generative model that makes scans by (seed, index); ``load_generator`` makes one.
+    """A generative model; a scan is a function of (seed, index). ``load_generator`` loads one.
 
     Args:
-        name: of the checkpoint; part of the scans' ids.
+        name: name of the checkpoint, which is part of the scans' ids.
         network: the flow, ``checkpoint.join`` of the checkpoint's networks, in evaluation mode.
-        header: of the checkpoint.
-        hash: of the checkpoint; "" for weights that come from none.
-        batch: number of scans computed at a time; it limits the memory and changes nothing else.
-        autoencoder: of a latent model; None for a pixel model.
+        header: the checkpoint's header.
+        hash: the checkpoint's hash; "" for weights without a checkpoint.
+        batch: number of scans computed at a time; it affects only memory and speed.
+        autoencoder: the autoencoder of a latent model; None for a pixel model.
 
     Example:
         >>> from lidar_synth import Generator, load_generator
@@ -102,33 +118,24 @@ class Generator:
         return next(self.network.parameters()).device
 
     def range_images(
-        self,
-        seed: int,
-        indices: Sequence[int],
-        condition: Any = None,
-        steps: int | None = None,
-        solver: str = "euler",
-        guidance: float = 1.0,
+        self, seed: int, indices: Sequence[int], condition: Any = None, **options: Unpack[SamplingOptions]
     ) -> list[RangeImage]:
         """Generate range images.
 
         Args:
-            seed: of the noise, 0 <= seed < 2^64.
-            indices: B numbers of scans, 0 <= index < 2^63, in any order.
+            seed: seed of the noise, 0 <= seed < 2^64.
+            indices: indices of B scans, 0 <= index < 2^63, in any order.
             condition: one condition for all scans, or B of them; None for an unconditional model. A semantic map is a
                 (H, W) uint8 array of train ids, 255 = unknown, such as the ``label`` of a range image on the model's
                 sensor; a camera image is (3, h, w) uint8. A real ``Scan``, or a list of B, provides the condition
                 itself: its projected labels, or the image at its ``image_path``. In a dictionary of conditions, the
                 one with the condition's name is used. See ``conditions``.
-            steps: number of steps of a uniform time grid; by default the checkpoint's own grid.
-            solver: a name of ``SOLVERS``.
-            guidance: scale of classifier-free guidance, 1 = none. A larger scale follows the condition more closely;
-                any scale but 1 takes twice the work.
+            options: ``steps``, ``solver`` and ``guidance``; see ``SamplingOptions``.
 
         Returns:
             B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its ``confidence`` in
             [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0) where there is no return. If a
-            model conditioned on semantic maps makes no labels of its own, ``label`` is the map's where there is a
+            model conditioned on semantic maps does not generate labels, ``label`` is the map's where there is a
             return, with confidence 1 where the map's label is known.
 
         Raises:
@@ -138,7 +145,7 @@ class Generator:
         """
         given = self._condition(condition, len(indices))
         images = []
-        for tensor in self._solve(seed, indices, given, steps, solver, guidance):
+        for tensor in self.samples(seed, indices, given, **options):
             images += self.tensors.to_images(tensor, self.sensor)
         if self.condition == "semantic" and "label" in self.fields - set(self.header.channels) and given is not None:
             for image, labels in zip(images, given.cpu().numpy(), strict=True):
@@ -147,20 +154,14 @@ class Generator:
         return images
 
     def scans(
-        self,
-        seed: int,
-        indices: Sequence[int],
-        condition: Any = None,
-        steps: int | None = None,
-        solver: str = "euler",
-        guidance: float = 1.0,
+        self, seed: int, indices: Sequence[int], condition: Any = None, **options: Unpack[SamplingOptions]
     ) -> list[Scan]:
         """Generate scans: the returns of ``range_images`` through the centres of their cells.
 
         Arguments and errors are those of ``range_images``. The ``id`` of a scan is ``<checkpoint>/<seed>/<index>``,
         and its ``domain`` is ``SYNTHETIC``.
         """
-        images = self.range_images(seed, indices, condition, steps, solver, guidance)
+        images = self.range_images(seed, indices, condition, **options)
         return [
             replace(unproject(image), id=f"{self.name}/{seed}/{index}", domain=SYNTHETIC)
             for index, image in zip(indices, images, strict=True)
@@ -171,51 +172,45 @@ class Generator:
         seed: int,
         indices: Sequence[int],
         condition: Any = None,
+        *,
         steps: int | None = None,
         solver: str = "euler",
         guidance: float = 1.0,
     ) -> Iterator[Tensor]:
-        """Yield the normalised tensors behind ``range_images``: (b, C, H, W) each, with b at most ``batch``."""
-        return self._solve(seed, indices, self._condition(condition, len(indices)), steps, solver, guidance)
+        """Yield the normalised tensors behind ``range_images``: (b, C, H, W) each, with b at most ``batch``.
 
-    def _solve(
-        self,
-        seed: int,
-        indices: Sequence[int],
-        condition: Tensor | None,
-        steps: int | None,
-        solver: str,
-        guidance: float,
-    ) -> Iterator[Tensor]:
+        Arguments and errors are those of ``range_images``.
+        """
         _refuse_worker(self.device)
+        given = self._condition(condition, len(indices))
         codec = self.codec
-        drawn = (codec.draws, *self.sensor.shape)
+        noise_shape = (codec.draws, *self.sensor.shape)
         grid = self.header.time_grid if steps is None else uniform_grid(steps)
         for first in range(0, len(indices), self.batch):
             part = slice(first, first + self.batch)
             noise = gaussian(seed, indices[part], codec.shape, self.device)
-            uniform_noise = uniform(seed, indices[part], drawn, self.device) if codec.draws else None
+            uniform_noise = uniform(seed, indices[part], noise_shape, self.device) if codec.draws else None
             with torch.inference_mode():
-                velocity, cond = self._flow(None if condition is None else condition[part], guidance)
+                velocity, cond = self._flow(None if given is None else given[part], guidance)
                 yield codec.decode(solve(velocity, noise, grid, solver, cond), uniform_noise)
 
     def _flow(self, condition: Tensor | None, guidance: float) -> tuple[Velocity, Tensor | None]:
-        """The flow to solve and what to give it: a condition is encoded once, not at every step."""
+        """The velocity to solve, and its encoded condition: a condition is encoded once, not at every step."""
         options = self.header.conditioning.get(str(self.condition), {})
         if guidance != 1 and (condition is None or not options.get("dropout")):
             raise ConfigError(
                 f"guidance {guidance} for {self.name!r}",
-                "1: its training never met a blank condition, which guidance starts from",
+                "1: it was trained without blank conditions, which guidance needs",
                 "Train it with condition.dropout=0.1.",
             )
         if condition is None or not isinstance(self.network, Conditioned):
             return self.network, condition
         encode: Callable[[Tensor], Tensor] = self.network.encoder
-        nothing = encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
-        return guided(self.network.velocity, guidance, nothing), encode(condition)
+        unconditional = encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
+        return guided(self.network.velocity, guidance, unconditional), encode(condition)
 
     def _condition(self, given: Any, count: int) -> Tensor | None:
-        """(B, ...) on the device, as the network takes it."""
+        """The conditions (B, ...) as the network takes them, on its device."""
         if given is None and self.condition is None:
             return None
         if self.condition is None:
@@ -223,7 +218,7 @@ class Generator:
         if given is None:
             raise DataError(f"no condition for {self.name!r}", f"condition=... ({self.condition}), or real scans")
         if not isinstance(self.network, Conditioned):
-            raise ConfigError(f"{self.name!r} without the encoder of its condition", "a whole checkpoint")
+            raise ConfigError(f"{self.name!r} without the encoder of its condition", "a checkpoint with all its parts")
         options = self.header.conditioning[self.condition]
         shape = CONDITIONS[self.condition].shape(self.network.encoder)
         return batch_of(self.condition, given, count, self.sensor, shape, options).to(self.device)
@@ -241,14 +236,15 @@ def load_generator(
 
     Args:
         model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
-        device: "cpu", "cuda" or "cuda:1"; a device of ``available_devices``.
-        dtype: what the network computes in; states stay float32.
-        compile: the flow's network and the decoder of a latent model, by ``torch.compile``; the first scan takes long.
-        batch: scans at a time; by default what suits the device.
+        device: an available device such as "cpu", "cuda" or "cuda:1"; see ``available_devices``.
+        dtype: dtype of the network's computations; states stay float32.
+        compile: whether to compile the velocity network and the decoder of a latent model with ``torch.compile``; the
+            first scan then takes long.
+        batch: number of scans computed at a time; by default it depends on the device.
 
     Raises:
-        ConfigError: on an unknown name, a device that is not there, or CUDA in a DataLoader worker.
-        FileError, DataError: where the checkpoint cannot be read, or a shipped one is damaged.
+        ConfigError: on an unknown name, an unavailable device, or CUDA in a DataLoader worker.
+        FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
 
     Example:
         >>> from lidar_synth import load_generator
@@ -273,10 +269,10 @@ def load_generator(
 
 
 def _compile(networks: dict[str, nn.Module]) -> None:
-    """Compile, in place, what runs for every scan: the velocity and the decoder."""
+    """Compile the velocity network and the decoder, in place."""
     networks[VELOCITY].compile()
     if (autoencoder := networks.get(CODEC)) is not None:
-        # ``Module.compile`` is for what ``forward`` does; a codec is asked to decode.
+        # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``.
         codec: Any = autoencoder
         codec.decode = torch.compile(codec.decode)
 
@@ -292,12 +288,14 @@ def find_model(model: str | Path) -> Path:
 
     Raises:
         ConfigError: on an unknown name.
-        FileError, DataError: where the shipped file cannot be read, or is not the one that was shipped.
+        FileError, DataError: if the shipped file cannot be read or is damaged.
     """
     shipped = shipped_models()
     if (name := str(model)) in shipped:
         if not has_checksum(shipped[name]) and read_header(shipped[name])[1] != SHIPPED.get(name):
-            raise DataError(f"{shipped[name]} is not the {name!r} of this version", "a whole file", "Install it again.")
+            raise DataError(
+                f"{shipped[name]} is not the {name!r} of this version", "an intact file", "Install it again."
+            )
         return shipped[name]
     path = Path(model)
     if path.suffix != ".safetensors":
@@ -307,7 +305,7 @@ def find_model(model: str | Path) -> Path:
 
 
 def _refuse_worker(device: torch.device | str) -> None:
-    """No CUDA in DataLoader workers: a forked process cannot use it, a spawned one pays for a context each."""
+    """Refuse CUDA in DataLoader workers: a forked process cannot use it, and each spawned one would need a context."""
     if str(device).startswith("cuda") and get_worker_info() is not None:
         raise ConfigError(
             "a generator on the GPU inside a DataLoader worker",

@@ -1,7 +1,8 @@
-"""Networks, one file per architecture; they know tensors and, as plain angles, rays, but no sensors.
+"""Networks, one file per architecture. They work on tensors and ray angles and depend on no sensor class.
 
-To add one: write its file, enter its class in ``NETWORKS``. Its arguments have to be plain values, since they
-stand in the checkpoint.
+To add one: write its file with a subclass of ``Network`` (or ``Encoder``), and enter the class in ``NETWORKS``. Its
+arguments have to be plain values, since a checkpoint stores them; its class attributes state what a training run
+provides beyond them.
 """
 
 from collections.abc import Mapping
@@ -11,16 +12,19 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.models.encoders.camera import SightEncoder
-from lidar_synth.models.encoders.maps import ClipViewEncoder, SemanticMapEncoder, ViewEncoder
+from lidar_synth.models.encoders.calibrated_camera import SightEncoder
+from lidar_synth.models.encoders.camera_views import ViewEncoder
+from lidar_synth.models.encoders.clip_views import ClipViewEncoder
+from lidar_synth.models.encoders.label_maps import SemanticMapEncoder
 from lidar_synth.models.hdit.denoiser import Denoiser
 from lidar_synth.models.hdit.hdit import HDiT
 from lidar_synth.models.lidm.diffusion import DiffusionUNet
 from lidar_synth.models.lidm.unet import UNet
 from lidar_synth.models.lidm.vqvae import VQVAE
+from lidar_synth.models.network import Encoder, Network
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
 
-NETWORKS: dict[str, type[nn.Module]] = {
+NETWORKS: dict[str, type[Network]] = {
     "hdit": HDiT,
     "denoiser": Denoiser,
     "unet": UNet,
@@ -32,26 +36,38 @@ NETWORKS: dict[str, type[nn.Module]] = {
     "clip_views": ClipViewEncoder,
     "sight": SightEncoder,
 }
-"""Architectures by the name that a checkpoint holds: velocity networks, autoencoders, encoders of conditions."""
-
-AUTOENCODERS = ("vqvae", "autoencoder")
-"""Those of them that make latents of range images."""
+"""Architectures by the name that a checkpoint stores: velocity networks, autoencoders, encoders of conditions."""
 
 
-def build_network(architecture: str, arguments: dict[str, Any]) -> nn.Module:
-    """A network with fresh weights; the one place where a name and arguments become a network.
-
-    Args:
-        architecture: a name of ``NETWORKS``.
-        arguments: of its class.
+def network_class(architecture: str) -> type[Network]:
+    """The class of an architecture.
 
     Raises:
-        ConfigError: on an unknown name or argument, or values that do not fit.
+        ConfigError: on a name that is not in ``NETWORKS``.
     """
     if architecture not in NETWORKS:
         raise ConfigError(f"architecture {architecture!r}", f"one of {', '.join(NETWORKS)}")
+    return NETWORKS[architecture]
+
+
+def encoders_of(condition: str) -> tuple[str, ...]:
+    """The architectures that encode a kind of condition, in the order of ``NETWORKS``; the first is the default."""
+    return tuple(k for k, cls in NETWORKS.items() if issubclass(cls, Encoder) and cls.condition == condition)
+
+
+def build_network(architecture: str, arguments: dict[str, Any]) -> Network:
+    """Build a network with fresh weights from its name and arguments.
+
+    Args:
+        architecture: a key of ``NETWORKS``.
+        arguments: keyword arguments of its class.
+
+    Raises:
+        ConfigError: on an unknown name or argument, or on values that do not fit together.
+    """
+    cls = network_class(architecture)
     try:
-        return NETWORKS[architecture](**arguments)
+        return cls(**arguments)
     except ConfigError:
         raise
     except (TypeError, ValueError, ArithmeticError, RuntimeError) as error:
@@ -66,18 +82,19 @@ def assemble(
     what: str,
     device: torch.device | str = "cpu",
 ) -> nn.Module:
-    """A network with given weights, float32 and in evaluation mode.
+    """Build a network with given weights, in float32 and in evaluation mode.
 
     Args:
-        architecture, arguments: as ``build_network`` takes them.
-        state: the weights by name; used as they are where they are float32 on ``device``.
-        what: to name in an error.
+        architecture, arguments: arguments of ``build_network``.
+        state: the weights by name. Tensors that are float32 on ``device`` are used without a copy.
+        what: name of the weights in an error.
+        device: device of the network.
 
     Raises:
-        DataError: on arguments that give no network, missing or unexpected keys, and other shapes.
+        DataError: on invalid arguments, missing or unexpected keys, or weights of other shapes.
     """
     try:
-        with torch.device("meta"):  # neither time nor memory for weights that will be replaced
+        with torch.device("meta"):  # saves time and memory for weights that will be replaced
             network = build_network(architecture, arguments)
     except ConfigError as error:
         raise DataError(f"{what}: {error}") from error
@@ -89,5 +106,5 @@ def assemble(
         shapes = ", ".join(f"{key} {shape} for {expected[key]}" for key, shape in wrong.items())
         raise DataError(f"{what} has weights of other shapes: {shapes}", "the shapes that its arguments give")
     network.load_state_dict({key: v.to(device, torch.float32) for key, v in state.items()}, assign=True)
-    # What is no image has no such layout; convolutions would arrange their weights anew at every call.
+    # Convolutions would otherwise convert their weights at every call; other weights have no such layout.
     return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload, no-any-return]

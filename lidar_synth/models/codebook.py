@@ -1,4 +1,4 @@
-"""A codebook: vectors move to the nearest of a set of codes, and the codes follow what they stand for."""
+"""A codebook: vectors are quantised to the nearest code, and codes are trained to follow their vectors."""
 
 import torch
 import torch.nn.functional as F
@@ -8,20 +8,20 @@ from lidar_synth.models.convolution import to_map, to_tokens
 from lidar_synth.models.layers import PIECE
 
 CODEBOOKS = ("gradient", "ema")
-"""How codes follow: by the gradient of their distance, or as moving averages of what they stand for."""
+"""How codes are trained: by the gradient of the distance, or as exponential moving averages of their vectors."""
 
 DECAY = 0.99
-"""Of moving averages, per batch."""
+"""Decay of the moving averages, per batch."""
 
-_LEAST = 0.03  # vectors per batch, below which a code of an "ema" codebook is dead and moves to where one is needed
+_LEAST = 0.03  # average vectors per batch below which a code of an "ema" codebook is dead and is reset
 
 
 class Codebook(nn.Module):
-    """Codes (van den Oord et al., "Neural Discrete Representation Learning", NeurIPS 2017).
+    """Vector quantisation (van den Oord et al., "Neural Discrete Representation Learning", NeurIPS 2017).
 
     Args:
-        count: of codes; 0 = none, vectors stay as they are.
-        channels: K, of a code.
+        count: number of codes; 0 = no quantisation.
+        channels: K, channels of a code.
         kind: one of ``CODEBOOKS``.
     """
 
@@ -41,7 +41,7 @@ class Codebook(nn.Module):
         return len(self.codes)
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Maps (B, K, h, w) to the nearest codes, of one shape, and the numbers of these (B, h w)."""
+        """Maps (B, K, h, w) to the nearest codes, (B, K, h, w), and their indices, (B, h w)."""
         tokens = to_tokens(z)
         if not len(self):
             return z, tokens.new_zeros(tokens.shape[:2], dtype=torch.long)
@@ -50,7 +50,7 @@ class Codebook(nn.Module):
 
     @torch.no_grad()
     def nearest(self, tokens: Tensor) -> Tensor:
-        """(N, K) to the (N,) nearest codes; the largest of z e - |e|^2 / 2 is the nearest."""
+        """(N, K) vectors to the (N,) indices of the nearest codes, which maximise z e - |e|^2 / 2."""
         codes = self.codes.float()
         half = codes.square().sum(1) / -2
         length = max(1, PIECE // len(codes)) if tokens.device.type == "cpu" else len(tokens)
@@ -60,7 +60,7 @@ class Codebook(nn.Module):
 
     @torch.no_grad()
     def follow(self, z: Tensor, index: Tensor) -> None:
-        """Move the codes of an "ema" codebook to the maps (B, K, h, w) that they stand for by ``index`` (B, h w)."""
+        """Update the codes of an "ema" codebook by the maps (B, K, h, w) that ``index`` (B, h w) assigns to them."""
         if not len(self.counts):
             return
         tokens, index = to_tokens(z).flatten(0, 1).float(), index.flatten()
@@ -72,7 +72,7 @@ class Codebook(nn.Module):
         self.counts.lerp_(counts, 1 - DECAY)
         self.sums.lerp_(sums, 1 - DECAY)
         dead = self.counts < _LEAST
-        # Evenly spaced vectors of the batch take the place of the dead: the same in every run.
+        # Evenly spaced vectors of the batch replace dead codes: a deterministic choice.
         places = torch.linspace(0, len(tokens) - 1, len(self), device=tokens.device).long()
         self.sums[dead] = tokens[places][dead]
         self.counts[dead] = 1.0
@@ -81,7 +81,7 @@ class Codebook(nn.Module):
 
 @torch.no_grad()
 def follow(z: Tensor, shift: Tensor, scale: Tensor) -> None:
-    """Moves the mean and the standard deviation (K,) of maps towards those of z (B, K, h, w), in place."""
+    """Update running mean and standard deviation (K,) by those of z (B, K, h, w), in place."""
     spread, mean = torch.std_mean(z.float(), (0, 2, 3))
     fresh = bool((scale == 1).all() & (shift == 0).all())
     shift.lerp_(mean, 1.0 if fresh else 1 - DECAY)

@@ -1,6 +1,7 @@
-"""The parts of convolutional networks over range images: columns wrap, rows end.
+"""Layers of convolutional networks over range images, whose columns wrap around and whose rows do not.
 
-Tensors lie channels last in memory, in which convolutions, norms and attention over tokens need no copies on a CPU.
+Tensors have the memory format channels last, in which convolutions, norms and attention over tokens need no copies on
+a CPU.
 """
 
 import math
@@ -16,21 +17,21 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.models.attention import Grid
 
 GROUPS = 32
-"""Groups of a group norm, as the peers have it. A group of a single channel forgets the channel's mean and, with it,
-the embedding of time: networks with less than 64 channels want less groups."""
+"""Groups of a group norm, as in latent diffusion and LiDM. A group of a single channel removes the channel's mean and,
+with it, the time embedding: networks with fewer than 64 channels need fewer groups."""
 
 
 class WrapConv(nn.Conv2d):
-    """Convolution whose columns wrap, as those of a full turn do, and whose rows are padded with zeros.
+    """Convolution with circular padding of columns (a full turn) and zero padding of rows.
 
     Args:
         inputs, outputs: channels.
         kernel: rows and columns.
         stride: rows and columns.
-        pad: columns to the left and to the right, rows above and below; by default what keeps the size, the odd one
-            to the right or below.
-        bias: whether it has one.
-        dilation: rows and columns from one weight of the kernel to the next.
+        pad: columns to the left and to the right, rows above and below; by default the size is kept, with an odd column
+            or row added to the right or below.
+        bias: whether to add a bias.
+        dilation: rows and columns between neighbouring weights of the kernel.
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class WrapConv(nn.Conv2d):
     ) -> None:
         rows, columns = (d * (k - 1) for k, d in zip(kernel, dilation, strict=True))
         self.left, self.right, above, below = pad or (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
-        # What is the same above and below, the convolution adds by itself, without a copy.
+        # The convolution itself adds symmetric padding of rows, without a copy.
         self.below = 0 if above == below else below - above
         super().__init__(inputs, outputs, kernel, stride, padding=(above, 0), dilation=dilation, bias=bias)
 
@@ -59,25 +60,25 @@ class WrapConv(nn.Conv2d):
 
 
 class Norm(nn.GroupNorm):
-    """Group norm of at most ``groups`` groups, as many as divide the channels."""
+    """Group norm with the greatest common divisor of ``groups`` and the channels as number of groups."""
 
     def __init__(self, channels: int, eps: float, groups: int = GROUPS) -> None:
         super().__init__(math.gcd(groups, channels), channels, eps)
 
 
 def activate(x: Tensor) -> Tensor:
-    """SiLU; in place where no gradient needs what was there."""
+    """SiLU, in place if gradients are disabled."""
     return F.silu(x, inplace=not torch.is_grad_enabled())
 
 
 class Residual(nn.Module):
-    """x + f(x) with f = convolution of SiLU of a norm, twice; the embedding of time is added in between.
+    """x + f(x), where f is two times norm, SiLU, convolution; the time embedding is added in between.
 
     Args:
         inputs, outputs: channels.
-        kernel: of both convolutions.
+        kernel: rows and columns of both kernels.
         embedding: channels of the time embedding; 0 = none.
-        eps, groups: of the norms.
+        eps, groups: arguments of the norms.
     """
 
     def __init__(
@@ -108,12 +109,12 @@ class Residual(nn.Module):
 
 
 class Attention(nn.Module):
-    """x + attention of every cell to all cells.
+    """x + self-attention over all cells.
 
     Args:
-        channels: of a cell.
-        heads: they divide the channels.
-        eps, groups: of the norm.
+        channels: channels of a cell.
+        heads: number of heads, a divisor of the channels.
+        eps, groups: arguments of the norm.
     """
 
     def __init__(self, channels: int, heads: int = 1, eps: float = 1e-6, groups: int = GROUPS) -> None:
@@ -124,20 +125,20 @@ class Attention(nn.Module):
         self.out = nn.Linear(channels, channels)
 
     def forward(self, x: Tensor, context: Tensor | None = None) -> Tensor:
-        """(B, C, H, W) to (B, C, H, W); ``context`` is not looked at."""
+        """(B, C, H, W) to (B, C, H, W); ``context`` is ignored."""
         q, k, v = self.qkv(to_tokens(self.norm(x))).chunk(3, -1)
         return x + to_map(self.out(attend(q, k, v, self.heads)), x)
 
 
 class ContextBlock(nn.Module):
-    """x + a transformer block: attention to all cells, attention to the tokens of a context, gated feed-forward
+    """x + a transformer block: self-attention over all cells, cross-attention to context tokens, gated feed-forward
     (the spatial transformer of Rombach et al., "High-Resolution Image Synthesis with Latent Diffusion Models", 2022).
 
     Args:
-        channels: of a cell.
-        heads: they divide the channels.
-        context: channels of a token of the context.
-        groups: of the norm.
+        channels: channels of a cell.
+        heads: number of heads, a divisor of the channels.
+        context: channels of a context token.
+        groups: groups of the norm.
         ratio: hidden channels per channel.
     """
 
@@ -159,7 +160,7 @@ class ContextBlock(nn.Module):
 
     def forward(self, x: Tensor, context: Tensor | None = None) -> Tensor:
         """(B, C, H, W) and the context (B, N, K) to (B, C, H, W)."""
-        assert context is not None  # the network has seen to it
+        assert context is not None  # checked by the network
         h = self.enter(to_tokens(self.norm(x)))
         q, k, v = self.qkv(self.norms[0](h)).chunk(3, -1)
         h = h + self.out(attend(q, k, v, self.heads))
@@ -177,12 +178,12 @@ def attend(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
 
 
 def to_tokens(x: Tensor) -> Tensor:
-    """(B, C, H, W) to (B, H W, C), without a copy where channels are last."""
+    """(B, C, H, W) to (B, H W, C), without a copy if the memory format is channels last."""
     return x.permute(0, 2, 3, 1).flatten(1, 2)
 
 
 def to_map(tokens: Tensor, like: Tensor) -> Tensor:
-    """(B, H W, C) to (B, C, H, W) of the rows and columns of ``like``, channels last."""
+    """(B, H W, C) to (B, C, H, W) with the rows and columns of ``like``, channels last."""
     return tokens.reshape(len(tokens), *like.shape[2:], -1).permute(0, 3, 1, 2)
 
 
@@ -200,23 +201,23 @@ def unfold(x: Tensor, patch: Grid) -> Tensor:
 
 
 def run(block: nn.Module, checkpointing: bool, *inputs: Tensor | None) -> Tensor:
-    """The block's answer; with ``checkpointing`` what is inside is computed again in the backward pass."""
+    """The output of a block; with ``checkpointing``, its activations are recomputed in the backward pass."""
     if checkpointing and torch.is_grad_enabled():
         return cast(Tensor, checkpoint(block, *inputs, use_reentrant=False))
     return cast(Tensor, block(*inputs))
 
 
 def pair(values: Sequence[int]) -> Grid:
-    """Rows and columns; in a checkpoint they are a list."""
+    """Rows and columns as a tuple; a checkpoint stores them as a list."""
     rows, columns = values
     return int(rows), int(columns)
 
 
 def reduced(size: Grid, strides: Sequence[Grid], what: str) -> Grid:
-    """Rows and columns after all strides.
+    """Rows and columns after all strides; ``what`` names the image in an error.
 
     Raises:
-        ConfigError: where they cannot be divided.
+        ConfigError: if the strides do not divide the size.
     """
     unit = math.prod(s[0] for s in strides), math.prod(s[1] for s in strides)
     if min(unit) < 1 or any(n < u or n % u for n, u in zip(size, unit, strict=True)):
@@ -225,26 +226,26 @@ def reduced(size: Grid, strides: Sequence[Grid], what: str) -> Grid:
 
 
 def check_shape(x: Tensor, shape: tuple[int, ...], what: str) -> None:
-    """Refuse a batch of another shape.
+    """Check the shape of a batch; ``what`` names it in an error.
 
     Raises:
-        DataError: naming both.
+        DataError: if the shape is not (B, *shape).
     """
     if x.ndim != len(shape) + 1 or x.shape[1:] != shape:
         raise DataError(f"{what} of shape {tuple(x.shape)}", f"(B, {', '.join(map(str, shape))})")
 
 
 def check_condition(cond: Tensor | None, count: int, maps: tuple[int, int, int], tokens: int) -> None:
-    """Refuse what is not the condition that a network takes.
+    """Check the shape of a condition against what a network takes.
 
     Args:
-        cond: what it was given.
-        count: B, of the states.
-        maps: channels, rows and columns of maps; 0 channels = it takes none.
-        tokens: channels of tokens; 0 = it takes none.
+        cond: the condition, or None.
+        count: B, number of states.
+        maps: channels, rows and columns of the maps that the network takes; 0 channels = no maps.
+        tokens: channels of the tokens that the network takes; 0 = no tokens.
 
     Raises:
-        DataError: naming both.
+        DataError: on a missing or unexpected condition, or one of another shape.
     """
     given = "no condition" if cond is None else f"a condition of shape {tuple(cond.shape)}"
     if maps[0]:

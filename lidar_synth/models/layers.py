@@ -1,6 +1,6 @@
-"""Layers that networks share: a norm that time modulates, a gated feed-forward layer, a mapping network.
+"""Layers shared by networks: a norm modulated by time, a gated feed-forward layer, a mapping network.
 
-Tokens lie as (B, N, C), so that a linear layer is one matrix product and no copy.
+Tokens are (B, N, C), so that a linear layer is one matrix product without a copy.
 """
 
 from collections.abc import Callable
@@ -11,20 +11,22 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 EPS = 1e-6
-"""Added to a mean square before its root is divided by."""
+"""Added to the mean square in RMS norms."""
 
 PIECE = 1 << 20
-"""Floats of the largest temporary array of one piece on a CPU: 4 MB. Memory in larger blocks goes back to the system
-when it is freed, and each of its pages has to be asked for again."""
+"""Floats of the largest temporary array per piece on a CPU: 4 MB. Larger blocks are returned to the system when they
+are freed, and allocating each page anew is slow."""
 
 
 def piece_length(x: Tensor, items: int, floats: int) -> int:
-    """How many of ``items`` to compute at once where each takes a temporary array of ``floats``.
+    """The number of items to compute at once, so that temporary arrays stay within ``PIECE`` on a CPU.
 
-    All of them where gradients are recorded, on an accelerator, and under ``torch.compile``.
+    It is all items if gradients are recorded, on an accelerator, and under ``torch.compile``.
 
     Args:
-        x: a tensor of the computation, for its device.
+        x: a tensor of the computation, which gives the device.
+        items: number of items.
+        floats: size of the temporary array per item.
     """
     if x.device.type != "cpu" or torch.is_grad_enabled() or torch.compiler.is_compiling():
         return items
@@ -33,19 +35,19 @@ def piece_length(x: Tensor, items: int, floats: int) -> int:
 
 
 class Exact(nn.Module):
-    """A module whose own buffers stay float32 when the network is moved to half precision.
+    """A module whose buffers stay float32 when the network is cast to half precision.
 
-    An angle of 3 rad in bfloat16 is off by up to 0.008; times the 128th harmonic that is a radian.
+    An angle of 3 rad in bfloat16 has an error of up to 0.008 rad; in the 128th harmonic, that is one radian.
     """
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        # Seen as integers, the bits follow to another device, and no cast of floats applies to them.
+        # Viewed as integers, the buffers move between devices, but casts of floats do not apply to them.
         super()._apply(lambda t: fn(t.view(torch.int32)).view(torch.float32), recurse)  # type: ignore[no-untyped-call]
         return self
 
 
 class RMSNorm(nn.Module):
-    """RMS norm with a learned gain, g x / rms(x); unlike torch's, for every mixture of precisions.
+    """RMS norm with a learned gain, g x / rms(x). Unlike torch's, it accepts inputs and gains of different dtypes.
 
     Args:
         dim: C, channels of a token.
@@ -61,7 +63,7 @@ class RMSNorm(nn.Module):
 
 
 class AdaRMSNorm(nn.Module):
-    """RMS norm whose gain comes from the embedding of time: (1 + W e) x / rms(x).
+    """RMS norm whose gain is predicted from the time embedding e: (1 + W e) x / rms(x).
 
     Args:
         dim: C, channels of a token.
@@ -96,14 +98,14 @@ class GatedFeedForward(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., C) to (..., C)."""
-        # Two products in place of one keep both halves contiguous: gelu is twice as fast on a CPU.
+        # Two products instead of one keep both halves contiguous, which makes gelu twice as fast on a CPU.
         value, gate = self.expand.weight.chunk(2)
         out: Tensor = self.contract(F.linear(x, value) * F.gelu(F.linear(x, gate)))
         return out
 
 
 class Mapping(nn.Module):
-    """Residual feed-forward layers between two norms, for the embeddings of time and place.
+    """Residual feed-forward layers between two norms, for the embeddings of time and position.
 
     Args:
         dim: C, channels in and out.

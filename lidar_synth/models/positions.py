@@ -1,8 +1,8 @@
-"""Where a token looks, and when: encodings of ray angles and of time.
+"""Position and time encodings: ray angles and timesteps as features of tokens.
 
-Angles are (2, H, W): elevation, then azimuth, radians; which sensor they belong to is not known here. Every
-network turns them by whole harmonics (``Rotary``) inside its attention; one of four further encodings is
-added to its tokens: a learned table, or features of the angles that a small network maps.
+Angles are (2, H, W): elevation, then azimuth, radians. Attention uses a rotary encoding with integer harmonics of the
+angles (``Rotary``). One of four further encodings is added to the tokens: a learned table, or one of three fixed
+features of the angles, mapped by a small network.
 """
 
 import math
@@ -16,12 +16,11 @@ from lidar_synth.models.layers import Exact, Mapping
 
 
 class RayAngles(Exact):
-    """Elevation and azimuth of every cell, and their means over patches.
+    """Stores the elevation and azimuth of every cell; averages them over patches.
 
     Args:
         resolution: H, W.
-        angles: (2, H, W) radians; None = NaN until a checkpoint brings them, so that a forgotten sensor does
-            not pass for a real one.
+        angles: (2, H, W) radians; None = NaN until a checkpoint is loaded, so that missing angles are noticed.
     """
 
     cells: Tensor
@@ -32,7 +31,7 @@ class RayAngles(Exact):
         self.register_buffer("cells", cells.detach().to(torch.float32, copy=True))
 
     def forward(self, patch: Sequence[int], levels: int) -> list[Tensor]:
-        """(2, rows, columns) of the tokens of each level, finest first: means over patches, then over 2 x 2."""
+        """(2, rows, columns) angles of the tokens of each level, finest first: means over patches, then over 2 x 2."""
         means = [F.avg_pool2d(self.cells[None], tuple(patch))]
         while len(means) < levels:
             means.append(F.avg_pool2d(means[-1], 2))
@@ -40,10 +39,10 @@ class RayAngles(Exact):
 
 
 class Rotary(Exact):
-    """Axial rotary encoding (Su et al., "RoFormer", 2021) by whole harmonics of elevation and azimuth.
+    """Axial rotary encoding (Su et al., "RoFormer", 2021) with integer harmonics of elevation and azimuth.
 
-    Of the D / 2 rotations of a head the first half turns with elevation, the second with azimuth. The
-    harmonics are spread geometrically from 1 to half the number of rows (columns), over all heads together.
+    Of the D / 2 rotations of a head, the first half depends on elevation, the second on azimuth. The harmonics are
+    spaced geometrically from 1 to half the number of rows (columns), over all heads together.
 
     Args:
         grid: rows and columns of tokens.
@@ -57,23 +56,24 @@ class Rotary(Exact):
         super().__init__()
         highest = [math.log(max(size // 2, 1)) for size in grid]
         spread = torch.stack([torch.linspace(0, h, heads * width // 4).exp().round() for h in highest])
-        # (2, heads, D / 4): neighbouring harmonics go to different heads.
+        # (2, heads, D / 4): neighbouring harmonics are assigned to different heads.
         self.register_buffer("harmonics", spread.reshape(2, width // 4, heads).transpose(1, 2).contiguous())
 
     def forward(self, angles: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles (2, H, W) to cosine and sine of the tokens, each (N, heads, D / 2)."""
+        """Angles (2, H, W) to the tokens' cosines and sines, each (N, heads, D / 2)."""
         turn = torch.cat(tuple(angles.flatten(1)[..., None, None] * self.harmonics[:, None]), -1)
         return turn.cos(), turn.sin()
 
 
 def rotate(x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-    """Turn the pairs (element i, element i + D/2) of x (..., heads, D)."""
+    """Rotate the pairs (element i, element i + D/2) of x (..., heads, D)."""
     a, b = x.chunk(2, -1)
     return torch.stack((a * cosine - b * sine, a * sine + b * cosine), -2).flatten(-2)
 
 
 def spherical_harmonics(angles: Tensor, degree: int = 4) -> Tensor:
-    """Real spherical harmonics of the ray directions, orthonormal; l = 0..degree, for each m = -l..l.
+    """Real spherical harmonics of the ray directions, orthonormal, in the order l = 0..degree and, for each l, m =
+    -l..l.
 
     Args:
         angles: (2, H, W) radians.
@@ -85,11 +85,11 @@ def spherical_harmonics(angles: Tensor, degree: int = 4) -> Tensor:
     z, across = elevation.sin(), elevation.cos()
     components = {}
     for m in range(degree + 1):
-        # Legendre polynomials P_l^m, without the sign (-1)^m, by their recurrence in l from P_m^m upwards.
+        # Associated Legendre polynomials P_l^m without the sign (-1)^m, by recurrence in l, starting at P_m^m.
         below, legendre = torch.zeros_like(z), across**m * math.prod(range(1, 2 * m, 2))
         for n in range(m, degree + 1):
             norm = (2 * n + 1) / (2 * math.pi) * math.factorial(n - m) / math.factorial(n + m)
-            # y = cos(elevation) sin(-azimuth): azimuth grows to the right.
+            # y = cos(elevation) sin(-azimuth), since azimuth increases clockwise.
             components[n, -m] = math.sqrt(norm) * legendre * (m * -azimuth).sin()
             components[n, m] = math.sqrt(norm if m else norm / 2) * legendre * (m * azimuth).cos()
             below, legendre = legendre, ((2 * n + 1) * z * legendre - (n + m) * below) / (n - m + 1)
@@ -124,7 +124,7 @@ BASES: dict[str, Callable[[Tensor], Tensor]] = {
 
 LEARNED = "learned"
 POSITIONS = (LEARNED, *BASES)
-"""What can be added to the tokens."""
+"""The encodings that can be added to the tokens."""
 
 
 class LearnedPosition(nn.Module):
@@ -141,18 +141,18 @@ class LearnedPosition(nn.Module):
         nn.init.trunc_normal_(self.table, std=0.02)
 
     def forward(self, angles: Tensor) -> Tensor:
-        """(H, W, C), whatever the angles (2, H, W)."""
+        """The table (H, W, C); ``angles`` is ignored."""
         return self.table
 
 
 class AnglePosition(nn.Module):
-    """Features of the rays' angles, mapped by a small network.
+    """Fixed features of the ray angles, mapped by a small network.
 
     Args:
-        basis: a name of ``BASES``.
+        basis: a key of ``BASES``.
         grid: rows and columns of tokens.
         dim: C, channels of a token.
-        ratio, depth: of the mapping network.
+        ratio, depth: arguments of the mapping network.
     """
 
     def __init__(self, basis: str, grid: Sequence[int], dim: int, ratio: float, depth: int) -> None:
@@ -191,7 +191,7 @@ class TimeEmbedding(nn.Module):
 
     Args:
         dim: E, channels of the embedding, even.
-        ratio, depth: of the mapping network.
+        ratio, depth: arguments of the mapping network.
     """
 
     def __init__(self, dim: int, ratio: float, depth: int) -> None:

@@ -1,7 +1,8 @@
-"""A small range-view segmenter: per-cell classes of a range image, and features to compare sets of scans by.
+"""A small range-view segmenter: per-cell classes of a range image, and features for comparing sets of scans.
 
-A U-Net whose columns wrap, as those of a full turn do. It is there to judge scans (do generated labels agree
-with what a segmenter trained on other scans sees?) and as the reference trainer's network, not to win a benchmark.
+It is a U-Net with circular padding of columns. It serves to evaluate scans (do generated labels agree with the
+predictions of a segmenter trained on other scans?) and as the reference trainer's network; it is not tuned for
+benchmarks.
 """
 
 from itertools import pairwise
@@ -13,11 +14,11 @@ from torch import Tensor, nn
 from lidar_synth.datasets.classes import NAMES
 
 ROW_BANDS = 4
-"""Bands of rows over which the features are averaged: what is high and what is low stays apart."""
+"""Bands of rows over which features are averaged separately, so that high and low objects are distinguished."""
 
 
 class CircularConv(nn.Module):
-    """3x3 convolution, norm and ReLU; columns wrap, rows are padded with zeros."""
+    """3 x 3 convolution, norm and ReLU, with circular padding of columns and zero padding of rows."""
 
     def __init__(self, inputs: int, outputs: int, stride: tuple[int, int] = (1, 1)) -> None:
         super().__init__()
@@ -31,12 +32,12 @@ class CircularConv(nn.Module):
 
 
 class RangeSegmenter(nn.Module):
-    """Classes of every cell of a range image.
+    """Predicts the class of every cell of a range image.
 
     Args:
-        in_channels: of the input; ``segmenter_input`` makes 4.
-        classes: how many to tell apart.
-        widths: channels per level; every level after the first halves the columns, from the third on the rows too.
+        in_channels: channels of the input; ``segmenter_input`` gives 4.
+        classes: number of classes.
+        widths: channels per level. Every level after the first halves the columns, and from the third on the rows too.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class RangeSegmenter(nn.Module):
         self.head = nn.Conv2d(widths[0], classes, 1)
 
     def decode(self, x: Tensor) -> Tensor:
-        """(B, in_channels, H, W) to the last map of the decoder (B, widths[0], H, W)."""
+        """(B, in_channels, H, W) to the decoder's last feature map (B, widths[0], H, W)."""
         skips = [self.stem(x)]
         for level in self.down:
             skips.append(level(skips[-1]))
@@ -69,12 +70,13 @@ class RangeSegmenter(nn.Module):
         return logits
 
     def features(self, x: Tensor) -> Tensor:
-        """(B, in_channels, H, W) to (B, ROW_BANDS * widths[0]) means of the decoder's last map over bands of rows."""
+        """(B, in_channels, H, W) to (B, ROW_BANDS * widths[0]) means of the decoder's last feature map over bands of
+        rows."""
         return F.adaptive_avg_pool2d(self.decode(x), (ROW_BANDS, 1)).flatten(1)
 
 
 def segmenter_input(distance: Tensor, reflectance: Tensor, height: Tensor) -> Tensor:
-    """What the segmenter sees of a batch of range images, each channel of order one.
+    """Input of the segmenter from a batch of range images, with values of order one.
 
     Args:
         distance: (B, H, W) metres, 0 = no return.
@@ -84,5 +86,5 @@ def segmenter_input(distance: Tensor, reflectance: Tensor, height: Tensor) -> Te
     Returns:
         (B, 4, H, W): log2(1 + d) / 6, z / 2, reflectance, and 1 where there is a return.
     """
-    seen = (distance > 0).to(distance.dtype)
-    return torch.stack([torch.log2(1 + distance) / 6, distance * height / 2, reflectance * seen, seen], 1)
+    returned = (distance > 0).to(distance.dtype)
+    return torch.stack([torch.log2(1 + distance) / 6, distance * height / 2, reflectance * returned, returned], 1)

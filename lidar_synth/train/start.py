@@ -19,11 +19,8 @@ from lidar_synth.formats import BankScans, ScanFiles, layout_of
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, NetworkSpec, load_checkpoint
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.models import build_network
+from lidar_synth.models import build_network, network_class
 from lidar_synth.train.config import Data, Network, Run, TrainConfig
-
-LOOKING = ("hdit", "denoiser", "sight", "autoencoder")
-"""Architectures that take the angles of rays."""
 
 
 def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
@@ -78,7 +75,8 @@ def _add_condition(
     """An unconditional model as the start of a conditional one: it generates what it did, and learns to look."""
     assert config.condition is not None
     held = header.networks[VELOCITY]
-    own = {name: value for name, value in held.arguments.items() if name not in ("resolution", "channels")}
+    derived = network_class(held.architecture).derived_arguments
+    own = {name: value for name, value in held.arguments.items() if name not in derived}
     asked = config.model_copy(update={"network": Network(architecture=held.architecture, arguments=own)})
     state = make_codec(networks.get(CODEC), header.tensors, header.sensor.shape).shape
     parts = asked.parts(state, header.sensor.shape)
@@ -102,10 +100,10 @@ def _build(
     torch.manual_seed(config.seed)
     angles = torch.from_numpy(sensor.ray_angles(config.rays))
     pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[0]
-    networks = {}
+    networks: dict[str, nn.Module] = {}
     for name, part in parts.items():
-        looks = {"angles": pooled} if part.architecture in LOOKING else {}
-        networks[name] = build_network(part.architecture, part.arguments | looks)
+        needed = {"angles": pooled} if network_class(part.architecture).needs_ray_angles else {}
+        networks[name] = build_network(part.architecture, part.arguments | needed)
     return networks
 
 

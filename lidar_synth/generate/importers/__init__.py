@@ -1,6 +1,6 @@
-"""Peers' weights as checkpoints of this package, one file per peer; their conventions end here.
+"""Importers of weights released by other projects (peers), one file per peer, which translate their conventions.
 
-To add a peer: write its file, enter its reader in ``IMPORTERS``.
+To add a peer: write its file and enter its reader in ``IMPORTERS``.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,4 +16,4 @@ IMPORTERS: dict[str, Callable[[Path], tuple[Header, Mapping[str, nn.Module]]]] =
     "r2flow": read_r2flow,
     "lidm": read_lidm,
 }
-"""Readers of peers' files by the peer's name: a path to the header and the networks of a checkpoint."""
+"""Readers by the peer's name; each maps a path to the header and the networks of a checkpoint."""

@@ -1,15 +1,16 @@
 """LiDM's released weights (https://github.com/hancyran/LiDAR-Diffusion) as checkpoints of this package.
 
-A release is a folder with ``model.ckpt`` and the ``config.yaml`` that the file does not repeat; both kinds are read:
+A release is a folder with ``model.ckpt`` and its ``config.yaml``. Two kinds are supported:
 
-    first stage     an autoencoder: one part, the codec; what lies under ``loss.`` trained it and is left out
+    first stage     an autoencoder: one part, the codec; weights under ``loss.`` belong to its training and are skipped
     diffusion       ``model.diffusion_model.`` the U-Net, ``first_stage_model.`` the autoencoder, ``cond_stage_model.``
                     the condition's encoder, ``model_ema.`` the U-Net's averaged weights (by names without dots), which
-                    are taken where they are there; the tensors of the schedule are checked and computed anew
+                    are preferred; the tensors of the schedule are checked and recomputed
 
-The peer's U-Net tells the noise of a diffusion's step; ``nets.diffusion`` makes of it the velocity of a rectified flow,
-so that it can be sampled from and distilled without training. Frozen CLIP, which a camera model repeats in its file,
-is left out: see ``nets.encoders``. Its label maps count "unlabelled" as 0 and the classes from 1; ours are moved.
+LiDM's U-Net predicts the noise of a diffusion step; ``models.lidm.diffusion`` converts it to the velocity of a
+rectified flow, so that it can be sampled and distilled without training. The file of a camera model repeats the frozen
+CLIP weights, which are skipped (see ``models.encoders.clip_views``). LiDM's label maps use 0 for "unlabelled" and
+number the classes from 1; the weights are permuted to our order.
 """
 
 import math
@@ -36,9 +37,9 @@ from lidar_synth.models import assemble
 from lidar_synth.models.lidm.diffusion import schedule_times
 
 STEPS = 50
-"""Of the uniform time grid that the checkpoint names: the peer samples in 50."""
+"""Steps of the checkpoint's uniform time grid: LiDM samples in 50."""
 CAMERA_SIZE = (376, 1408)
-"""Rows and columns of KITTI-360's rectified images, which the peer cuts into views."""
+"""Rows and columns of KITTI-360's rectified images, which LiDM cuts into views."""
 SOURCE = "https://github.com/hancyran/LiDAR-Diffusion"
 IMAGES = "KITTI-360 and KITTI odometry"
 _LABELLED = ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10")
@@ -48,18 +49,20 @@ SEEN = {
     IMAGES: whole(KITTI360, KITTI360_SPLITS["lidm/train"] or ())
     | frames_of("semantic_kitti", (*_LABELLED, *map(str, range(11, 22)))),
 }
-"""What the peer trains on, by the names that a provenance has under ``data`` (its lidm/data/kitti.py). All of its
-autoencoders are trained on range images of both datasets, with the sequences of the odometry benchmark's test set."""
+"""LiDM's training data by the name under ``data`` of a provenance (from its lidm/data/kitti.py). All of its
+autoencoders are trained on range images of both datasets, including the test sequences of the odometry benchmark."""
 OFFSET = 1.0001
-"""The peer's logarithmic scale is log2(d + 0.0001 + 1)."""
+"""LiDM's logarithmic scale is log2(d + 0.0001 + 1)."""
 
 
 def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
-    """A released ``model.ckpt``, with ``config.yaml`` beside it, as header and networks for ``save_checkpoint``.
+    """Read a released ``model.ckpt`` and the ``config.yaml`` in its folder as header and networks for
+    ``save_checkpoint``.
 
     Raises:
-        FileError: where one of the two cannot be read.
-        DataError: on a file that is no such checkpoint, is cut, holds code, or whose keys or configuration do not fit.
+        FileError: if one of the two files cannot be read.
+        DataError: on a file that is not such a checkpoint, is truncated or contains code, or whose keys or
+            configuration do not fit.
     """
     config = _config(path.with_name("config.yaml"))
     content = load_pickle(path, "LiDM")
@@ -108,7 +111,7 @@ def _parts(
         beta_start=model["linear_start"], beta_end=model["linear_end"], steps=model.get("timesteps", 1000)
     )
     parts, condition = {VELOCITY: unet, CODEC: codec}, model.get("cond_stage_config") or {}
-    if not isinstance(condition, dict):  # a word that says that there is none
+    if not isinstance(condition, dict):  # a string that stands for no condition
         condition = {}
     kind = condition.get("target", "").rpartition(".")[2]
     if kind == "SpatialRescaler":
@@ -124,18 +127,23 @@ def _parts(
         options = {"dropout": 0.0, "view_dropout": augment.get("camera_drop", 0.0), "image": list(CAMERA_SIZE)}
         return parts | {ENCODER: NetworkSpec("clip_views", arguments)}, {"camera": options}
     if kind:
-        raise DataError(f"{path}: a condition by {kind}", "label maps (SpatialRescaler) or camera images, or none")
+        raise DataError(
+            f"{path}: a condition encoded by {kind}",
+            "label maps (SpatialRescaler), camera images (FrozenClipMultiImageEmbedder) or no condition",
+        )
     return parts, {}
 
 
 def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> NetworkSpec:
-    """The autoencoder of the peer's configuration, for images of ``size`` rows and columns."""
+    """The autoencoder of LiDM's configuration, for images of ``size`` rows and columns."""
     inner, mask = params["ddconfig"], bool(params.get("use_mask"))
     wanted = {"double_z": False, "z_channels": params["embed_dim"], "out_ch": inner["in_channels"] + mask}
-    odd = {key: inner.get(key) for key, value in wanted.items() if inner.get(key) != value}
-    if odd or params.get("lib_name") != "lidm":
-        raise DataError(f"{path}: an autoencoder with {odd or dict(params)}", "one of LiDM's published configurations")
-    # A level that there is not is no mistake to the peer.
+    unsupported = {key: inner.get(key) for key, value in wanted.items() if inner.get(key) != value}
+    if unsupported or params.get("lib_name") != "lidm":
+        raise DataError(
+            f"{path}: an autoencoder with {unsupported or dict(params)}", "one of LiDM's published configurations"
+        )
+    # LiDM ignores attention levels that do not exist.
     attends = sorted(set(inner["attn_levels"]) & set(range(len(inner["ch_mult"]))))
     extra: dict[str, Any] = ({"attention_levels": attends} if attends else {}) | ({"mask": True} if mask else {})
     return NetworkSpec("vqvae", {
@@ -146,7 +154,8 @@ def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> 
 
 
 def unet_part(params: Mapping[str, Any], path: Path | str) -> NetworkSpec:
-    """The U-Net of the peer's configuration; ``channels`` counts those of a condition beside the state."""
+    """The U-Net of LiDM's configuration; ``channels`` includes those of a condition that is concatenated with the
+    state."""
     levels = [1 << i for i in range(len(params["channel_mult"]))]
     if params.get("lib_name") != "lidm" or not set(params["attention_resolutions"]) <= set(levels):
         raise DataError(f"{path}: a U-Net with {dict(params)}", "one of LiDM's published configurations")
@@ -162,14 +171,14 @@ def unet_part(params: Mapping[str, Any], path: Path | str) -> NetworkSpec:
 def _normalisation(dataset: Mapping[str, Any]) -> Normalisation:
     low, high = dataset["depth_range"]
     scale = float(dataset["depth_scale"])
-    # Older configurations do not name the scale; it was the logarithmic one, log2(range + 1) of 0 to the farthest.
+    # Older configurations do not state the scale, which was then logarithmic, log2(range + 1).
     if dataset.get("log_scale", scale < 2 * math.log2(high + 1)):
         return Normalisation("log", low, high, scale, OFFSET)
     return Normalisation("linear", low, high, scale)
 
 
 def _sensor(data: Mapping[str, Any]) -> Sensor:
-    """The HDL-64E of the data set, within the range limits of the training."""
+    """The HDL-64E of the dataset, with the range limits of the training."""
     dataset = data["dataset"]
     sensor = presets()["hdl64e_kitti" if _semantic_kitti(data) else "hdl64e_kitti360"]
     low, high = dataset["depth_range"]
@@ -185,18 +194,18 @@ def _semantic_kitti(data: Mapping[str, Any]) -> bool:
 
 
 def _data(train: Mapping[str, Any]) -> str:
-    """The key of ``SEEN`` of a configuration's training data."""
+    """The key of ``SEEN`` for a configuration's training data."""
     if "SemanticKITTI" in train["target"]:
         return "SemanticKITTI"
     return IMAGES if "KITTIImage" in train["target"] else "KITTI-360"
 
 
 def seen(data: str, generates: bool) -> Recordings:
-    """The recordings that weights know.
+    """The recordings that weights were trained on.
 
     Args:
-        data: a key of ``SEEN``; of another one nothing is known.
-        generates: a diffusion model; its autoencoder, which its file repeats, knows ``IMAGES``.
+        data: a key of ``SEEN``; the recordings of other data are unknown.
+        generates: whether the weights are those of a diffusion model, whose autoencoder was trained on ``IMAGES``.
     """
     return SEEN.get(data, Recordings()) | (SEEN[IMAGES] if generates else Recordings())
 
@@ -219,15 +228,15 @@ def _provenance(config: Mapping[str, Any], path: Path) -> dict[str, Any]:
 def convert(
     weights: Mapping[str, Tensor], parts: Mapping[str, NetworkSpec], what: str = "LiDM's weights"
 ) -> dict[str, nn.Module]:
-    """LiDM's state dict as networks of ours.
+    """Convert LiDM's state dict to our networks.
 
     Args:
-        weights: by the peer's names, with the prefixes of a diffusion model where there is one.
+        weights: tensors by LiDM's names, with the prefixes of a diffusion model if it is one.
         parts: the networks that they belong to.
-        what: to name in an error.
+        what: name of the weights in an error.
 
     Raises:
-        DataError: on missing or unexpected keys, other shapes, or another schedule than the part's.
+        DataError: on missing or unexpected keys, other shapes, or another noise schedule than the part's.
     """
     weights, nested = dict(weights), set(parts) != {CODEC}
     if VELOCITY in parts:
@@ -249,7 +258,7 @@ def convert(
 
 
 def _statistics(part: NetworkSpec) -> dict[str, Tensor]:
-    """Of latents that are taken as they are."""
+    """Buffers for latents that are not normalised."""
     size = part.arguments["latent_channels"]
     return {
         "shift": torch.zeros(size),
@@ -264,14 +273,14 @@ def _frozen(key: str) -> bool:
 
 
 def _averaged(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights without schedule, with the averaged U-Net in the place of the last one."""
+    """The weights without the schedule, and with the averaged U-Net instead of the last one."""
     plain = {k: v for k, v in weights.items() if k not in _SCHEDULE and not k.startswith(UNET_EMA)}
     average = {k: v for k, v in weights.items() if k.startswith(UNET_EMA) and k not in _COUNTERS}
     if not average:
         return plain
     names = {k: UNET_EMA + k.removeprefix("model.").replace(".", "") for k in plain if k.startswith(UNET)}
-    taken = {k: average.pop(name) for k, name in names.items() if name in average}
-    return {k: v for k, v in plain.items() if k not in names} | taken | average
+    averaged = {k: average.pop(name) for k, name in names.items() if name in average}
+    return {k: v for k, v in plain.items() if k not in names} | averaged | average
 
 
 _COUNTERS = (f"{UNET_EMA}decay", f"{UNET_EMA}num_updates")
@@ -284,26 +293,26 @@ _SCHEDULE = (
 
 def _check_schedule(weights: Mapping[str, Tensor], arguments: Mapping[str, Any], what: str) -> None:
     if "scale_factor" in weights and float(weights["scale_factor"]) != 1:
-        raise DataError(f"{what}: latents scaled by {float(weights['scale_factor'])}", "1, as LiDM has them")
+        raise DataError(f"{what}: latents scaled by {float(weights['scale_factor'])}", "1, as in LiDM's releases")
     if (signal := weights.get("alphas_cumprod")) is None:
         return
     times = schedule_times(arguments["beta_start"], arguments["beta_end"], arguments["steps"])
     signal = signal.double()
-    held = (1 - signal).sqrt() / (signal.sqrt() + (1 - signal).sqrt())
-    if held.shape != times.shape or not torch.allclose(held, times, atol=1e-4):
+    stored = (1 - signal).sqrt() / (signal.sqrt() + (1 - signal).sqrt())
+    if stored.shape != times.shape or not torch.allclose(stored, times, atol=1e-4):
         raise DataError(
-            f"{what}: another schedule of noise than its config.yaml", "linear_start, linear_end, timesteps"
+            f"{what}: another noise schedule than in its config.yaml", "linear_start, linear_end, timesteps"
         )
 
 
 def _arranged(ours: str, tensor: Tensor, part: NetworkSpec) -> Tensor:
-    """A peer's tensor in our order of dimensions."""
-    if part.architecture == "semantic_map":  # their unlabelled 0, 1..19 are our 0..18 and then unlabelled
+    """LiDM's tensor in our order of dimensions and classes."""
+    if part.architecture == "semantic_map":  # LiDM: unlabelled, then 19 classes; ours: 19 classes, then unlabelled
         return tensor[:, [*range(1, len(NAMES) + 1), 0]]
     if ours == "view_embedding":
         return tensor[0]
     if part.architecture == "diffusion_unet" and ".attention.qkv." in ours and not part.arguments["context_channels"]:
-        # Heads stand outside there: query, key and value of the first head, then of the next.
+        # In LiDM, heads are outermost: query, key and value of the first head, then of the next.
         width = part.arguments["head_channels"]
         tensor = tensor.reshape(-1, 3, width, *tensor.shape[1:]).transpose(0, 1).reshape(tensor.shape)
     linear = (".qkv.", ".out.", ".enter.", ".leave.")

@@ -1,4 +1,4 @@
-"""The names of LiDM's weights: for every key of our networks, the peer's keys it comes from."""
+"""The names of LiDM's weights: the LiDM keys of every key of our networks."""
 
 from collections.abc import Collection
 
@@ -11,7 +11,7 @@ UNET, UNET_EMA = "model.diffusion_model.", "model_ema."
 FIRST_STAGE, COND_STAGE = "first_stage_model.", "cond_stage_model."
 
 Sources = dict[str, tuple[str, ...]]
-"""{our name: the peer's, whose tensors are set one after the other}."""
+"""{our name: LiDM's names, whose tensors are concatenated}."""
 
 RESIDUAL = {"norm1": "in_layers.0", "conv1": "in_layers.2", "time": "emb_layers.1", "norm2": "out_layers.0",
             "conv2": "out_layers.3", "shortcut": "skip_connection"}  # fmt: skip
@@ -25,43 +25,43 @@ CONTEXT: Sources = {
     "context_out": (f"{INNER}.attn2.to_out.0",),
     "expand": (f"{INNER}.ff.net.0.proj",), "contract": (f"{INNER}.ff.net.2",),
 }  # fmt: skip
-"""Inside the U-Net's blocks: residual, attention, attention with a context."""
+"""Names inside the U-Net's blocks: residual, self-attention, cross-attention to a context."""
 
 CODEC_RESIDUAL = {"shortcut": "nin_shortcut"}
 CODEC_ATTENTION: Sources = {"norm": ("norm",), "qkv": ("q", "k", "v"), "out": ("proj_out",)}
-"""Inside the autoencoder's blocks; a name that is not here is the same in both."""
+"""Names inside the autoencoder's blocks; all other names are the same in both."""
 MIDDLE = ("mid.block_1", "mid.attn_1", "mid.block_2")
 STATISTICS = ("shift", "scale", "codebook.counts", "codebook.sums")
-"""What only our autoencoder holds."""
+"""Buffers that only our autoencoder has."""
 
 
 def peer_names(name: str, part: NetworkSpec, nested: bool) -> Sources:
-    """Where every weight of a part comes from.
+    """The LiDM names of every weight of a part.
 
     Args:
-        name: of the part.
+        name: name of the part.
         part: the network.
-        nested: in the file of a diffusion model, with its prefixes.
+        nested: whether the file is that of a diffusion model, whose names have prefixes.
     """
     with torch.device("meta"):
         keys = list(build_network(*part).state_dict())
     if name == VELOCITY:
-        looking = {key.partition(".attention.")[0] for key in keys if ".attention." in key}
+        attending = {key.partition(".attention.")[0] for key in keys if ".attention." in key}
         attention = CONTEXT if part.arguments["context_channels"] else ATTENTION
-        found = {key: _unet(key, looking, attention) for key in keys}
+        names = {key: _unet(key, attending, attention) for key in keys}
     elif name == CODEC:
         levels = len(part.arguments["multipliers"])
-        looking = part.arguments.get("attention_levels", ())
-        found = {key: _codec(key, levels, looking) for key in keys if key not in STATISTICS}
+        attending = part.arguments.get("attention_levels", ())
+        names = {key: _codec(key, levels, attending) for key in keys if key not in STATISTICS}
     else:
-        names = {"mix": "channel_mapper", "project": "linear"}
-        found = {key: (_renamed(key, names),) for key in keys}
+        renamed = {"mix": "channel_mapper", "project": "linear"}
+        names = {key: (_renamed(key, renamed),) for key in keys}
     prefix = {VELOCITY: UNET, CODEC: FIRST_STAGE, ENCODER: COND_STAGE}[name] if nested else ""
-    return {ours: tuple(prefix + one for one in theirs) for ours, theirs in found.items()}
+    return {ours: tuple(prefix + one for one in theirs) for ours, theirs in names.items()}
 
 
-def _unet(key: str, looking: set[str], attention: Sources) -> tuple[str, ...]:
-    """The U-Net's; ``looking``: the blocks that have attention, ``attention``: the names inside."""
+def _unet(key: str, attending: set[str], attention: Sources) -> tuple[str, ...]:
+    """LiDM's names of a U-Net key, given the blocks that have attention and the names inside attention."""
     top = {"time": "time_embed", "stem": "input_blocks.0.0", "norm": "out.0", "head": "out.2"}
     where, number, *rest = key.split(".")
     if where in top:
@@ -70,7 +70,7 @@ def _unet(key: str, looking: set[str], attention: Sources) -> tuple[str, ...]:
     if where == "middle":  # residual, attention, residual
         place = f"middle_block.{1 if kind == 'attention' else 2 * int(number)}"
     else:
-        after = 1 + (f"{where}.{number}" in looking)
+        after = 1 + (f"{where}.{number}" in attending)
         block = f"input_blocks.{int(number) + 1}" if where == "down" else f"output_blocks.{number}"
         place = f"{block}.{ {'residual': 0, 'attention': 1, 'resample': after, 'conv': 0}[kind] }"
     if kind == "conv":
@@ -83,8 +83,8 @@ def _unet(key: str, looking: set[str], attention: Sources) -> tuple[str, ...]:
     return tuple(f"{place}.{name}.{last}" for name in attention[layer])
 
 
-def _codec(key: str, levels: int, looking: Collection[int]) -> tuple[str, ...]:
-    """The autoencoder's of so many levels; ``looking``: those that attend after each block."""
+def _codec(key: str, levels: int, attending: Collection[int]) -> tuple[str, ...]:
+    """LiDM's names of an autoencoder key, given the number of levels and the levels with attention."""
     top = {"to_latent": "quant_conv", "from_latent": "post_quant_conv"}
     if key == "codebook.codes":
         return ("quantize.embedding.weight",)
@@ -99,23 +99,25 @@ def _codec(key: str, levels: int, looking: Collection[int]) -> tuple[str, ...]:
         place = f"{where}.{MIDDLE[int(number)]}"
         return _attention(place, inside) if int(number) == 1 else (f"{place}.{_renamed(inside, CODEC_RESIDUAL)}",)
     side = "down" if where == "encoder" else "up"
-    level = int(number) if side == "down" else levels - 1 - int(number)  # ours counts as the decoder runs
+    level = (
+        int(number) if side == "down" else levels - 1 - int(number)
+    )  # our decoder numbers its levels in the order of computation
     if kind == "levels":
         first, _, inside = inside.partition(".")
-        block, attends = divmod(int(first), 2) if level in looking else (int(first), 0)
-        if attends:
+        block, is_attention = divmod(int(first), 2) if level in attending else (int(first), 0)
+        if is_attention:
             return _attention(f"{where}.{side}.{level}.attn.{block}", inside)
         return (f"{where}.{side}.{level}.block.{block}.{_renamed(inside, CODEC_RESIDUAL)}",)
     return (f"{where}.{side}.{level}.{side}sample.conv.{inside.removeprefix('conv.')}",)
 
 
 def _attention(place: str, key: str) -> tuple[str, ...]:
-    """Of a layer of the autoencoder's attention at a place."""
+    """LiDM's names of a key inside the autoencoder's attention at ``place``."""
     layer, _, last = key.rpartition(".")
     return tuple(f"{place}.{name}.{last}" for name in CODEC_ATTENTION[layer])
 
 
 def _renamed(key: str, names: dict[str, str]) -> str:
-    """The key with another first word, where there is one for it."""
+    """The key with its first component replaced, if ``names`` has it."""
     first, dot, rest = key.partition(".")
     return names.get(first, first) + dot + rest

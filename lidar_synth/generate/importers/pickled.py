@@ -1,4 +1,4 @@
-"""Reading the pickles in which peers ship their weights: tensors and plain values come out, code never runs."""
+"""Safe reading of peers' pickled weights: only tensors and plain values are loaded, and code never runs."""
 
 import re
 from pathlib import Path
@@ -11,15 +11,15 @@ from lidar_synth.errors import DataError, FileError
 
 
 def load_pickle(path: Path, peer: str) -> Any:
-    """What a ``.pth`` or ``.ckpt`` holds.
+    """The content of a ``.pth`` or ``.ckpt`` file.
 
     Args:
         path: the file.
-        peer: whose it is, to name in an error.
+        peer: name of the project that released it, for errors.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: on a file that is cut, is no such file, or asks for code.
+        FileError: if the file cannot be read.
+        DataError: on a truncated file, one of another format, or one that contains code.
     """
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
@@ -30,22 +30,22 @@ def load_pickle(path: Path, peer: str) -> Any:
     except Exception as error:  # a damaged pickle can raise anything
         if code := re.search(r"GLOBAL ([\w.]+)", str(error)):
             raise DataError(
-                f"{path} calls for {code[1]} when it is loaded, and was not loaded",
+                f"{path} would call {code[1]} when loaded, and was not loaded",
                 "tensors and plain values only",
-                f"A pickle with code in it can do anything: get the file from {peer}'s own release page.",
+                f"A pickle that contains code can do anything: get the file from {peer}'s own release page.",
             ) from error
         raise DataError(
-            f"{path} is cut, damaged or no {path.suffix} file", f"a whole file of {peer}'s release"
+            f"{path} is truncated, damaged or no {path.suffix} file", f"an intact file of {peer}'s release"
         ) from error
 
 
 def state_of(content: Any, key: str, path: Path) -> dict[str, Tensor]:
-    """The state dictionary under a key.
+    """The state dictionary under a key of a file's content.
 
     Raises:
-        DataError: where there is none.
+        DataError: if the value is not a dictionary of tensors.
     """
     weights = content[key]
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-        raise DataError(f"{path}: its weights are no tensors by name", "the state dictionary of a network")
+        raise DataError(f"{path}: its weights are not tensors by name", "the state dictionary of a network")
     return weights

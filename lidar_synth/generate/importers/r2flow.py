@@ -1,13 +1,13 @@
 """R2Flow's released weights (https://github.com/kazuto1011/r2flow) as a checkpoint of this package.
 
-The peer's convention ends here. Its network gives u(s, x) = data - noise at s = 1 - t, so that ours is
-v(y, t) = -u(1 - t, y). Both changes are linear and are folded into the weights::
+R2Flow's network predicts u(s, x) = data - noise at s = 1 - t, so that ours is v(y, t) = -u(1 - t, y). Both changes are
+linear and are folded into the weights::
 
     sign   the last layer is negated
     time   cos(2 pi f (1 - t)) = cos(2 pi f) cos(2 pi f t) + sin(2 pi f) sin(2 pi f t), and likewise the sine:
            the layer after the Fourier features of time absorbs this rotation
 
-Its rotary harmonics, stored for every block, are those of a level and stored once.
+R2Flow stores the rotary harmonics in every block; here they are stored once per level.
 """
 
 import math
@@ -32,7 +32,8 @@ from lidar_synth.models.positions import BASES, LEARNED
 
 HEADS = (2, 4, 8, 16)
 MAPPING_DEPTH = 2
-"""The peer's loader takes these from no configuration; nor patch, window and ratio, which are our defaults."""
+"""These are fixed in R2Flow's loader and not part of its configuration, like patch, window and ratio, whose values are
+our defaults."""
 
 POSITIONS = {"learnable_embedding": LEARNED, **{name: name for name in BASES}}
 NORMALISATIONS: dict[str, Literal["log", "linear", "inverse"]] = {
@@ -41,7 +42,7 @@ NORMALISATIONS: dict[str, Literal["log", "linear", "inverse"]] = {
     "metric": "linear",
 }
 DATA = {"kitti_360": ("KITTI-360", "hdl64e_kitti360"), "kitti_raw": ("KITTI raw", "hdl64e_kitti")}
-"""The peer's names of data sets: their own and the sensor's."""
+"""R2Flow's names of datasets: (name of the dataset, name of the sensor)."""
 
 BLOCK = {
     "attention.temperature": "residual_attn.scale",
@@ -52,20 +53,20 @@ BLOCK = {
     "feed_forward.layer.expand.weight": "residual_ffn.gegelu.weight",
     "feed_forward.layer.contract.weight": "residual_ffn.linear.weight",
 }
-"""Our names inside a block, and the peer's."""
+"""Names inside a block: ours to R2Flow's."""
 HARMONICS = ("residual_attn.rope.freqs_h", "residual_attn.rope.freqs_w")
 FOURIER = ("spatial_pe.0.embedding.freqs", "spatial_pe.0.embedding.phase")
 
 
 def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
-    """A released ``.pth`` as header and networks, ready for ``save_checkpoint``.
+    """Read a released ``.pth`` as header and networks, ready for ``save_checkpoint``.
 
     Args:
-        path: r2flow-kitti360-1rf.pth, -2rf.pth, or any checkpoint that the peer's training wrote.
+        path: r2flow-kitti360-1rf.pth, -2rf.pth, or any checkpoint written by R2Flow's training.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: on a file that is no such checkpoint, is cut, holds code, or whose keys do not fit.
+        FileError: if the file cannot be read.
+        DataError: on a file that is not such a checkpoint, is truncated or contains code, or whose keys do not fit.
     """
     content = _load(path)
     try:
@@ -120,7 +121,7 @@ def _normalisation(data: Mapping[str, Any], path: Path) -> Normalisation:
 
 
 def _sensor(data: Mapping[str, Any]) -> Sensor:
-    """The HDL-64E on the grid that the network was trained on."""
+    """The HDL-64E with the grid of the network's training."""
     sensor = presets()[DATA[data["dataset"]][1]]
     if data["projection"].startswith("unfolding"):
         sensor = sensor.by_beams()
@@ -138,7 +139,7 @@ def _time_grid(cfg: Mapping[str, Any]) -> tuple[float, ...]:
 
 def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
     cfg = content["cfg"]
-    # Of its split of KITTI raw nothing is published.
+    # R2Flow's split of KITTI raw is not published.
     known = whole(KITTI360, KITTI360_SPLITS["r2flow/train"] or ())
     seen = {"seen": known.to_list()} if cfg["data"]["dataset"] == "kitti_360" else {}
     return {
@@ -156,15 +157,15 @@ def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def convert(weights: Mapping[str, Tensor], part: NetworkSpec, what: str = "R2Flow's weights") -> nn.Module:
-    """R2Flow's state dict as an ``HDiT`` in our convention.
+    """Convert R2Flow's state dict to an ``HDiT`` in our convention.
 
     Args:
-        weights: by the peer's names.
+        weights: tensors by R2Flow's names.
         part: the network that they belong to.
-        what: to name in an error.
+        what: name of the weights in an error.
 
     Raises:
-        DataError: on missing or unexpected keys, other shapes, or buffers that no network of the peer holds.
+        DataError: on missing or unexpected keys, other shapes, or buffers with values that R2Flow never writes.
     """
     depths, position = part.arguments["depths"], part.arguments["position"]
     names = peer_names(depths, position)
@@ -187,7 +188,7 @@ def convert(weights: Mapping[str, Tensor], part: NetworkSpec, what: str = "R2Flo
 
 
 def peer_names(depths: Sequence[int], position: str) -> dict[str, str]:
-    """{our name: the peer's} of all weights, save the rotary harmonics."""
+    """{our name: R2Flow's name} of all weights except the rotary harmonics."""
     names = {
         "angles.cells": "coords",
         "tokenize.weight": "tokenizer.0.weight",
@@ -212,7 +213,7 @@ def peer_names(depths: Sequence[int], position: str) -> dict[str, str]:
 
 
 def block_names(depths: Sequence[int]) -> dict[str, str]:
-    """{our name: the peer's} of every block."""
+    """{our name: R2Flow's name} of every block."""
     *upper, middle = depths
     names = {f"middle.{j}": f"mid_levels.{j}" for j in range(middle)}
     for side in ("down", "up"):
@@ -232,7 +233,7 @@ def _mapping_names(ours: str, theirs: str) -> dict[str, str]:
 
 
 def _reverse_time(weight: Tensor, frequencies: Tensor) -> Tensor:
-    """The (E, E) layer over cosines and sines of 2 pi f (1 - t) as one over those of 2 pi f t."""
+    """Convert an (E, E) layer over cosines and sines of 2 pi f (1 - t) to one over those of 2 pi f t."""
     turn = 2 * math.pi * frequencies.double()
     cosine, sine = weight.double().chunk(2, 1)
     reverse = (cosine * turn.cos() + sine * turn.sin(), cosine * turn.sin() - sine * turn.cos())
@@ -240,18 +241,21 @@ def _reverse_time(weight: Tensor, frequencies: Tensor) -> Tensor:
 
 
 def _harmonics(weights: Mapping[str, Tensor], depths: Sequence[int], what: str) -> dict[str, Tensor]:
-    """The rotary harmonics of each level, (2, heads, D / 4), from those of its blocks."""
+    """The rotary harmonics of each level, (2, heads, D / 4), which all its blocks have to share."""
     state: dict[str, Tensor] = {}
     for ours, theirs in block_names(depths).items():
         level = len(depths) - 1 if ours.startswith("middle") else ours.split(".")[1]
         stored = torch.stack([weights[f"{theirs}.{name}"] for name in HARMONICS])
         if not torch.equal(state.setdefault(f"rotary.{level}.harmonics", stored), stored):
-            raise DataError(f"{what}: {theirs} has other rotary harmonics than its level", "one set for all its blocks")
+            raise DataError(
+                f"{what}: {theirs} has other rotary harmonics than its level",
+                "the same harmonics in all blocks of a level",
+            )
     return state
 
 
 def _check_octaves(weights: Mapping[str, Tensor], what: str) -> None:
-    """The peer stores the octaves of its Fourier features; ours are computed."""
+    """Check the stored octaves of R2Flow's Fourier features, since ours are computed."""
     stored, phase = (weights[name] for name in FOURIER)
     rows = int((stored[:, 0] > 0).sum())
     octaves = torch.zeros(len(stored), 2)

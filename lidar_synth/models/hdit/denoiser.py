@@ -1,14 +1,14 @@
-"""HDiT that is asked for the data in place of the velocity: for networks that are small for their images.
+"""HDiT that predicts the data instead of the velocity, for networks that are small relative to their images.
 
-A velocity holds the noise, as many numbers as the image has; tokens narrower than their patch cannot pass them on. Of
-the data, few numbers tell most. So the network F gives the data, and only what is finer than it can tell is taken from
-the state (the preconditioning of Karras et al., "Elucidating the Design Space of Diffusion-Based Generative Models",
-NeurIPS 2022, on the rectified path)::
+The velocity contains the noise, which has as many degrees of freedom as the image has values; tokens with fewer
+channels than their patch has values cannot represent it. The data have far fewer. The network F therefore predicts the
+data, and only details that are finer than its prediction are taken from the state (the preconditioning of Karras et
+al., "Elucidating the Design Space of Diffusion-Based Generative Models", NeurIPS 2022, on the rectified path)::
 
     y0' = (1 - t) s^2 / d(t) y - t / sqrt(d(t)) F(y, t, c),      d(t) = (1 - t)^2 s^2 + t^2
     v   = (y - y0') / t = (t - (1 - t) s^2) / d(t) y + F(y, t, c) / sqrt(d(t))
 
-with s the standard deviation of these details.
+where s is the standard deviation of these details.
 """
 
 from typing import Any
@@ -21,11 +21,11 @@ from lidar_synth.models.hdit.hdit import HDiT
 
 
 class Denoiser(HDiT):
-    """Velocity network v(y, t, c) as ``HDiT``, through an estimate of the data.
+    """Velocity network v(y, t, c) like ``HDiT``, computed from an estimate of the data.
 
     Args:
-        detail: s, standard deviation of what the state tells better than the network, in normalised units.
-        arguments: of ``HDiT``.
+        detail: s, standard deviation of the details that are taken from the state, in normalised units.
+        arguments: arguments of ``HDiT``.
 
     Raises:
         ConfigError: on values that do not fit together.
@@ -38,9 +38,9 @@ class Denoiser(HDiT):
         self.detail = detail
 
     def forward(self, y: Tensor, t: Tensor | float, cond: Tensor | None = None) -> Tensor:
-        """The velocity dy/dt at y and t; arguments and result as of ``HDiT``."""
-        answer = super().forward(y, t, cond)
+        """The velocity dy/dt at y and t; arguments and result are those of ``HDiT``."""
+        output = super().forward(y, t, cond)
         t = torch.as_tensor(t, device=y.device, dtype=torch.float32).reshape(-1, 1, 1, 1)
         data = (1 - t) * self.detail**2
         spread = (1 - t) * data + t**2
-        return ((t - data) / spread * y + spread.rsqrt() * answer).to(y.dtype)
+        return ((t - data) / spread * y + spread.rsqrt() * output).to(y.dtype)

@@ -1,20 +1,22 @@
-"""HDiT: a transformer in the shape of an hourglass that gives the velocity of a range image.
+"""HDiT: an hourglass transformer that predicts the velocity of a range image.
 
 The architecture is that of R2Flow (Nakashima et al., "Fast LiDAR Data Generation with Rectified Flows", ICRA
 2025) after Crowson et al., "Scalable High-Resolution Pixel-Space Image Synthesis with Hourglass Diffusion
 Transformers", ICML 2024::
 
     image (B, C, H, W) -> tokens of 1 x 4 cells
-      -> levels with attention to the neighbourhood; 2 x 2 tokens merge into one of twice the width
-      -> the coarsest level, attention to all tokens
-      -> back up the levels, mixed with what was there on the way down
+      -> levels with neighbourhood attention; 2 x 2 tokens merge into one of twice the width
+      -> the coarsest level with global attention
+      -> back up through the levels, with skip connections
     -> velocity (B, C, H, W)
 
-A condition comes in one of two ways: maps on the grid of the state are added to the tokens (``condition_channels``),
-tokens are attended to by those of the coarsest level (``context_channels``). Both begin at 0.
+A condition is given in one of two forms: maps on the grid of the state, which are added to the tokens
+(``condition_channels``), or tokens, to which those of the coarsest level attend (``context_channels``). The layers of
+both are initialised to zero.
 """
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +27,7 @@ from lidar_synth.models.attention import Grid, NeighbourhoodAttention
 from lidar_synth.models.convolution import check_condition
 from lidar_synth.models.hdit.transformer import Block, Expand, Level, Merge, from_patches, to_patches
 from lidar_synth.models.layers import RMSNorm
+from lidar_synth.models.network import Network
 from lidar_synth.models.positions import (
     LEARNED,
     POSITIONS,
@@ -36,32 +39,34 @@ from lidar_synth.models.positions import (
 )
 
 
-class HDiT(nn.Module):
+class HDiT(Network):
     """Velocity network v(y, t, c) in the paper's convention: t = 1 noise, t = 0 data, v = y1 - y0.
 
-    All arguments but ``angles`` are plain values, which stand in the checkpoint. It computes in the dtype of
-    its weights (or of autocast) and answers in that of y.
+    All arguments but ``angles`` are plain values, which a checkpoint stores. The network computes in the dtype of its
+    weights (or of autocast) and returns the dtype of y.
 
     Args:
         resolution: H, W of the image; each a multiple of the patch times 2^(levels - 1).
         channels: C of the image.
-        condition_channels: channels of a condition on the same grid, set beside those of the image.
-        context_channels: channels of the tokens that are attended to; 0 = no context.
+        condition_channels: channels of a condition's maps on the same grid; 0 = no maps.
+        context_channels: channels of a condition's tokens; 0 = no tokens.
         width: channels of a token at the finest level; each further level has twice as many.
         time_width: channels of the time embedding, even.
-        depths: blocks per level, finest first; those of all but the last stand again on the way up.
+        depths: blocks per level, finest first; all levels but the last have as many again on the way up.
         heads: attention heads per level.
         patch: rows and columns of cells in a token.
         window: rows and columns of tokens in a neighbourhood, odd.
         ratio: hidden channels per channel of the feed-forward layers.
-        mapping_depth: layers of the networks that map time and place.
-        position: one of ``POSITIONS``, what is added to the tokens.
-        angles: (2, H, W) elevation and azimuth of every cell, radians (``Sensor.ray_angles``); without them
-            they have to come from a checkpoint.
+        mapping_depth: layers of the mapping networks of time and position.
+        position: one of ``POSITIONS``, the encoding that is added to the tokens.
+        angles: (2, H, W) elevation and azimuth of every cell, radians (``Sensor.ray_angles``); None if a
+            checkpoint will be loaded.
 
     Raises:
         ConfigError: on values that do not fit together.
     """
+
+    needs_ray_angles: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -85,7 +90,7 @@ class HDiT(nn.Module):
         self.channels, self.condition_channels, self.context_channels = channels, condition_channels, context_channels
         self.grids = _grids(self.resolution, self.patch, len(depths))
         self.gradient_checkpointing = False
-        """Forget what is inside the blocks and compute it again in the backward pass."""
+        """Recompute the activations of the blocks in the backward pass instead of storing them."""
         _check(self.grids, width, heads, position)
         if angles is not None and angles.shape != (2, *self.resolution):
             raise ConfigError(f"ray angles of shape {tuple(angles.shape)}", f"{(2, *self.resolution)}")
@@ -124,8 +129,8 @@ class HDiT(nn.Module):
 
         Args:
             y: (B, C, H, W) state.
-            t: (B,) times, or one for all, in [0, 1]; 1 = noise.
-            cond: (B, condition_channels, H, W) maps or (B, M, context_channels) tokens, whichever the network takes.
+            t: (B,) times, or one for all states, in [0, 1]; 1 = noise.
+            cond: (B, condition_channels, H, W) maps or (B, M, context_channels) tokens, as the network takes.
 
         Returns:
             (B, C, H, W).
@@ -160,10 +165,10 @@ class HDiT(nn.Module):
         return from_patches(x, self.patch, self.resolution).movedim(-1, 1).to(y.dtype)
 
     def _level(self, i: int, angles: Tensor, dtype: torch.dtype) -> Level:
-        """What the blocks of level i share; its tokens look at ``angles`` (2, rows, columns)."""
+        """The inputs that the blocks of level i share, given the ray angles (2, rows, columns) of its tokens."""
         cosine, sine = self.rotary[i](angles)
         near = self.near[i] if i < len(self.near) else None
-        return Level(cosine.to(dtype), sine.to(dtype), near)  # type: ignore[arg-type]  # a ModuleList holds any
+        return Level(cosine.to(dtype), sine.to(dtype), near)  # type: ignore[arg-type]  # the elements of a ModuleList have no type
 
     def _run(self, blocks: nn.Module, x: Tensor, time: Tensor, level: Level) -> Tensor:
         for block in blocks.children():
@@ -185,7 +190,7 @@ class HDiT(nn.Module):
 
 
 def _pair(values: Sequence[int]) -> Grid:
-    """Rows and columns; in a checkpoint they are a list."""
+    """Rows and columns as a tuple; a checkpoint stores them as a list."""
     rows, columns = values
     return int(rows), int(columns)
 

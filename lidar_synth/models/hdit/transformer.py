@@ -1,4 +1,4 @@
-"""The parts of a transformer over range images: attention, feed-forward, and the steps between resolutions."""
+"""Layers of a transformer over range images: attention, feed-forward, and changes of resolution."""
 
 import math
 from typing import NamedTuple
@@ -14,12 +14,12 @@ from lidar_synth.models.positions import rotate
 
 
 class Level(NamedTuple):
-    """What the blocks of one resolution share.
+    """Inputs that the blocks of one resolution share.
 
     Args:
         cosine, sine: (N, heads, D / 2) rotation of each token.
-        near: attention to the neighbourhood; None where every token attends to all.
-        context: (B, M, K) tokens of a condition; None where there is none to look at.
+        near: neighbourhood attention; None for global attention.
+        context: (B, M, K) tokens of a condition, or None.
     """
 
     cosine: Tensor
@@ -61,7 +61,7 @@ class SelfAttention(nn.Module):
         return out
 
     def _project(self, x: Tensor, time: Tensor, cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values (B, N, heads, D); q k^T carries the temperature."""
+        """Queries, keys and values (B, N, heads, D); q k^T includes the temperature."""
         q, k, v = self.qkv(self.norm(x, time)).reshape(*x.shape[:2], 3, self.heads, -1).unbind(2)
         # A vector of root mean square 1 has the length sqrt(D).
         scale = self.temperature.clamp(max=math.log(100.0)).exp() / q.shape[-1]
@@ -117,7 +117,10 @@ class FeedForward(nn.Module):
 
 
 class Block(nn.Module):
-    """Attention, attention to the context where it has channels, then feed-forward; arguments as theirs."""
+    """Self-attention, cross-attention if the context has channels, then feed-forward.
+
+    The arguments are those of the three layers.
+    """
 
     def __init__(self, dim: int, embedding: int, heads: int, ratio: float, context: int = 0) -> None:
         super().__init__()
@@ -135,7 +138,7 @@ class Block(nn.Module):
 
 
 class Merge(nn.Module):
-    """2 x 2 tokens of C channels to one of 2 C.
+    """Merges 2 x 2 tokens of C channels into one of 2 C.
 
     Args:
         dim: C.
@@ -152,7 +155,7 @@ class Merge(nn.Module):
 
 
 class Expand(nn.Module):
-    """One token of 2 C channels to 2 x 2 of C, mixed with the tokens of the way down by a learned share.
+    """One token of 2 C channels to 2 x 2 of C, interpolated with the skip connection by a learned weight.
 
     Args:
         dim: C.
@@ -170,7 +173,7 @@ class Expand(nn.Module):
 
 
 def to_patches(x: Tensor, patch: Grid) -> Tensor:
-    """(B, H, W, C) to (B, N, p q C), patches of p x q row by row."""
+    """(B, H, W, C) to (B, N, p q C), patches of p x q in row-major order."""
     batch, rows, columns, _ = x.shape
     x = x.reshape(batch, rows // patch[0], patch[0], columns // patch[1], patch[1], -1)
     return x.transpose(2, 3).flatten(3).flatten(1, 2)

@@ -1,13 +1,13 @@
-"""A convolutional U-Net that gives the velocity of a range image or of a latent.
+"""A convolutional U-Net that predicts the velocity of a range image or of a latent.
 
-The architecture is that of latent diffusion (Rombach et al., CVPR 2022) with columns that wrap (Ran et al., "Towards
+The architecture is that of latent diffusion (Rombach et al., CVPR 2022) with circular columns (Ran et al., "Towards
 Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024), and with LiDAR-Flow's addition, which the paper
-states in one sentence: "integrates positional embeddings into latent features". The form here: a learned table with
-one vector for every cell is added to the features after the first convolution, before the first block, so that every
-level and every skip connection knows where a cell looks.
+describes in one sentence: "integrates positional embeddings into latent features". Here, a learned table with one
+vector per cell is added to the features after the first convolution and before the first block, so that every level and
+every skip connection has access to a cell's position.
 
-A condition comes in one of two ways: maps on the grid of the state are set beside it (``condition_channels``),
-tokens are attended to by every cell at every level with attention (``context_channels``).
+A condition is given in one of two forms: maps on the grid of the state, which are concatenated with it
+(``condition_channels``), or tokens, to which every cell attends at every level with attention (``context_channels``).
 """
 
 import math
@@ -34,16 +34,17 @@ from lidar_synth.models.convolution import (
     run,
     unfold,
 )
+from lidar_synth.models.network import Network
 
 TIME_SCALE = 1000.0
-"""Times in [0, 1] become the peers' numbers of steps before their sines are taken."""
+"""Factor from times in [0, 1] to the diffusion steps that the time embedding expects."""
 
-_EPS = 1e-5  # of the residual blocks' norms, as the peers have it
-_LONGEST = 10_000.0  # what the slowest sine of time turns by one radian in, in steps
+_EPS = 1e-5  # of the residual blocks' norms, as in latent diffusion
+_LONGEST = 10_000.0  # inverse of the lowest frequency of the time embedding, in steps per radian
 
 
 class _Row(NamedTuple):
-    """One entry of the way down or up: channels in and out, its level, and whether rows and columns change."""
+    """One entry of the downward or upward path: channels in and out, level, and whether it resamples."""
 
     inputs: int
     outputs: int
@@ -51,25 +52,26 @@ class _Row(NamedTuple):
     resample: bool = False
 
 
-class UNet(nn.Module):
+class UNet(Network):
     """Velocity network v(y, t, c) in the paper's convention: t = 1 noise, t = 0 data, v = y1 - y0.
 
-    All arguments are plain values, which stand in the checkpoint. It computes in the dtype of its weights (or of
-    autocast) and answers in that of y. The defaults are LiDM's.
+    All arguments are plain values, which a checkpoint stores. The network computes in the dtype of its weights (or of
+    autocast) and returns the dtype of y. The defaults are LiDM's.
 
     Args:
         resolution: H, W of the state.
         channels: C of the state.
-        condition_channels: channels of a map on the same grid, set beside those of the state.
-        context_channels: channels of the tokens that are attended to; 0 = no context.
+        condition_channels: channels of a condition's maps on the same grid; 0 = no maps.
+        context_channels: channels of a condition's tokens; 0 = no tokens.
         width: channels at the finest level.
         multipliers: channels per level in units of ``width``; every level after the first halves rows and columns.
-        blocks: residual blocks per level; one more on the way up.
-        attention: levels with attention; the middle always has it.
+        blocks: residual blocks per level, and one more on the upward path.
+        attention: levels with attention; the middle always has attention.
         head_channels: channels of an attention head, at most a level's.
-        position: add the learned table.
-        patch: rows and columns of cells that are taken together, for states as large as a range image.
-        groups: of the norms; see ``convolution.GROUPS``.
+        position: whether to add the learned table.
+        patch: rows and columns of cells that form one position of the finest level, for states as large as a range
+            image.
+        groups: groups of the norms; see ``convolution.GROUPS``.
 
     Raises:
         ConfigError: on values that do not fit together.
@@ -95,7 +97,7 @@ class UNet(nn.Module):
         self.channels, self.condition_channels, self.context_channels = channels, condition_channels, context_channels
         self.width, self.groups = width, groups
         self.gradient_checkpointing = False
-        """Forget what is inside the blocks and compute it again in the backward pass."""
+        """Recompute the activations of the blocks in the backward pass instead of storing them."""
         widths = [width * m for m in multipliers]
         grid = reduced(self.resolution, [self.patch], "a state")
         reduced(grid, [(2, 2)] * (len(widths) - 1), f"patches of {self.patch}, which are halved between levels:")
@@ -109,10 +111,10 @@ class UNet(nn.Module):
         if self.table is not None:
             nn.init.trunc_normal_(self.table, std=0.02)
 
-        def stage(row: _Row, looks: bool, resample: nn.Module | None = None) -> _Stage:
-            seen = self._attention(row.outputs, head_channels) if looks else None
+        def stage(row: _Row, attends: bool, resample: nn.Module | None = None) -> _Stage:
+            attention_layer = self._attention(row.outputs, head_channels) if attends else None
             residual = Residual(row.inputs, row.outputs, embedding=embedding, eps=_EPS, groups=groups)
-            return _Stage(residual, seen, resample)
+            return _Stage(residual, attention_layer, resample)
 
         down, up = _plan(widths, blocks)
         self.down = nn.ModuleList(
@@ -126,15 +128,15 @@ class UNet(nn.Module):
         self.norm = Norm(widths[0], _EPS, groups)
         self.head = WrapConv(widths[0], cells * channels)
         nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]  # it has one
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]  # the convolution has a bias
 
     def forward(self, y: Tensor, t: Tensor | float, cond: Tensor | None = None) -> Tensor:
         """The velocity dy/dt at y and t.
 
         Args:
             y: (B, C, H, W) state.
-            t: (B,) times, or one for all, in [0, 1]; 1 = noise.
-            cond: (B, condition_channels, H, W) maps or (B, N, context_channels) tokens, whichever the network takes.
+            t: (B,) times, or one for all states, in [0, 1]; 1 = noise.
+            cond: (B, condition_channels, H, W) maps or (B, N, context_channels) tokens, as the network takes.
 
         Returns:
             (B, C, H, W).
@@ -145,7 +147,7 @@ class UNet(nn.Module):
         return self.evaluate(y, torch.as_tensor(t, device=y.device) * TIME_SCALE, cond)
 
     def evaluate(self, y: Tensor, step: Tensor, cond: Tensor | None) -> Tensor:
-        """The answer at a number of step in [0, 1000], which need not be whole; else as ``forward``."""
+        """The output at a diffusion step in [0, 1000], which may be fractional; otherwise like ``forward``."""
         check_shape(y, (self.channels, *self.resolution), "a state")
         dtype = self.head.weight.dtype
         time = self._time(step, len(y), dtype)
@@ -174,15 +176,17 @@ class UNet(nn.Module):
         return block
 
     def _time(self, step: Tensor, count: int, dtype: torch.dtype) -> Tensor:
-        """SiLU of the embedding of time, (B, 4 width): every block starts with it."""
+        """SiLU of the time embedding, (B, 4 width), the first operation of every block."""
         if step.shape not in ((), (1,), (count,)):
-            raise DataError(f"times of shape {tuple(step.shape)} for {count} states", "one per state, or one for all")
+            raise DataError(
+                f"times of shape {tuple(step.shape)} for {count} states", "one time per state, or one for all"
+            )
         half = torch.arange(self.width // 2, device=step.device)
         turn = step.float().expand(count)[:, None] * torch.exp(half * (-math.log(_LONGEST) / (self.width // 2)))
         return nn.functional.silu(self.time(torch.cat((turn.cos(), turn.sin()), 1).to(dtype)))
 
     def _condition(self, y: Tensor, cond: Tensor | None, dtype: torch.dtype) -> tuple[Tensor, Tensor | None]:
-        """The state with the maps beside it, and the context."""
+        """The state concatenated with the condition's maps, and the condition's tokens."""
         check_condition(cond, len(y), (self.condition_channels, *self.resolution), self.context_channels)
         if cond is None:
             return y, None
@@ -190,10 +194,10 @@ class UNet(nn.Module):
 
 
 class Downsample(nn.Module):
-    """Half the rows and columns, by a convolution.
+    """Halves the rows and columns by a strided convolution.
 
     Args:
-        channels: in and out.
+        channels: channels of input and output.
     """
 
     def __init__(self, channels: int) -> None:
@@ -207,10 +211,10 @@ class Downsample(nn.Module):
 
 
 class Upsample(nn.Module):
-    """Twice the rows and columns: every cell four times, then a convolution.
+    """Doubles the rows and columns by nearest-neighbour upsampling and a convolution.
 
     Args:
-        channels: in and out.
+        channels: channels of input and output.
     """
 
     def __init__(self, channels: int) -> None:
@@ -224,14 +228,14 @@ class Upsample(nn.Module):
 
 
 class _Stage(nn.Module):
-    """A residual block, then attention, then resampling, the latter two where there are any."""
+    """A residual block, then optional attention, then optional resampling."""
 
     def __init__(self, residual: Residual, attention: nn.Module | None, resample: nn.Module | None) -> None:
         super().__init__()
         self.residual, self.attention, self.resample = residual, attention, resample
 
     def forward(self, x: Tensor, time: Tensor, context: Tensor | None = None) -> Tensor:
-        """(B, C, H, W), SiLU of the time embedding (B, E) and the context to (B, C', H', W')."""
+        """(B, C, H, W), SiLU of the time embedding (B, E) and the context tokens to (B, C', H', W')."""
         x = self.residual(x, time)
         if self.attention is not None:
             x = self.attention(x, context)
@@ -241,7 +245,7 @@ class _Stage(nn.Module):
 
 
 def _plan(widths: list[int], blocks: int) -> tuple[list[_Row], list[_Row]]:
-    """The entries of the way down and of the way up; each of the latter takes one skip connection."""
+    """The entries of the downward and of the upward path; each of the latter takes one skip connection."""
     down, skips, channels = [], [widths[0]], widths[0]
     for level, width in enumerate(widths):
         for _ in range(blocks):

@@ -1,16 +1,15 @@
 """An autoencoder of range images with a codebook (VQ-VAE), after LiDM's.
 
-Columns wrap. The decoder is curve-wise: the beams of a sensor draw curves, and its finest levels convolve along a row
-only (1 x 4). ``encode`` gives the latent as the encoder made it, ``decode`` first moves every vector of it to its
-nearest code (Ran et al., "Towards Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024): a flow between
-noise and latents that misses them by a little still ends on codes.
+Columns wrap around. The decoder is curve-wise: the beams of a sensor trace curves, and its finest levels convolve along
+rows only (1 x 4). ``encode`` returns the latent before quantisation, and ``decode`` first quantises it (Ran et al.,
+"Towards Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024), which removes small errors of a flow.
 
-The first and the last channels are those of the image, whatever they hold: labels go in and come out as bits. With a
-``mask``, the decoder has one channel more, which says whether there is a return: below 0, the cell is empty.
+Input and output have the channels of the image; labels are encoded as bits. With ``mask``, the decoder has one more
+channel that predicts returns: a cell is empty where it is below 0.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -33,13 +32,14 @@ from lidar_synth.models.convolution import (
     run,
     unfold,
 )
+from lidar_synth.models.network import Network
 
 CURVE = (1, 4)
-"""Kernel of the decoder's levels whose rows are those of the image."""
+"""Kernel of the decoder's levels that have as many rows as the image."""
 
 
 class _Step(NamedTuple):
-    """Between two levels: kernel and padding (left, right, above, below) on the way down, kernel on the way up."""
+    """Change of resolution: kernel and padding (left, right, above, below) of the encoder, kernel of the decoder."""
 
     down: Grid
     pad: tuple[int, int, int, int]
@@ -55,13 +55,13 @@ _STEPS: dict[Grid, _Step] = {
 
 
 class Encoding(NamedTuple):
-    """What training looks at.
+    """Result of a forward pass, for the training loss.
 
     Args:
-        output: (B, C, H, W) the decoder's answer through the codebook, with gradients to the encoder straight through;
-            (B, C + 1, H, W) of a network with a mask, which comes last.
+        output: (B, C, H, W) decoded image; gradients pass the codebook straight through to the encoder. (B, C + 1, H,
+            W) for a network with a mask, which is the last channel.
         gap: (B,) mean squared distance of the latent to its codes, with gradients to the encoder.
-        code_gap: (B,) the same with gradients to the codes.
+        code_gap: (B,) the same distance with gradients to the codes.
     """
 
     output: Tensor
@@ -69,29 +69,31 @@ class Encoding(NamedTuple):
     code_gap: Tensor
 
 
-class VQVAE(nn.Module):
-    """Autoencoder of range images; the defaults are LiDM's, which takes 64 x 1024 to 8 x 16 x 128.
+class VQVAE(Network):
+    """Autoencoder of range images. The defaults are LiDM's, which encode 64 x 1024 cells to 8 x 16 x 128.
 
     Args:
         resolution: H, W of the image.
         channels: C of the image.
-        latent_channels: of the latent and of a code.
-        codes: size of the codebook; 0 = none, latents are bounded by tanh instead.
+        latent_channels: channels of the latent and of a code.
+        codes: size of the codebook; 0 = no codebook, latents are bounded by tanh instead.
         codebook: one of ``CODEBOOKS``.
         width: channels at the finest level.
         multipliers: channels per level in units of ``width``.
         strides: rows and columns by which the image shrinks between two levels.
-        blocks: residual blocks per level; one more in the decoder.
-        attention: attend in the middle.
-        attention_levels: numbers of the levels, 0 = the finest, that attend after each of their blocks.
-        mask: decode whether there is a return in a channel of its own.
-        patch: rows and columns of cells that are taken together at the finest level: (1, 1) is LiDM's, more is
-            faster.
-        groups: of the norms; see ``convolution.GROUPS``.
+        blocks: residual blocks per level; the decoder has one more.
+        attention: whether the coarsest level has attention.
+        attention_levels: levels (0 = the finest) with attention after each block.
+        mask: whether to predict returns in a separate channel.
+        patch: rows and columns of cells that form one position of the finest level: LiDM uses (1, 1), larger patches
+            are faster.
+        groups: groups of the norms; see ``convolution.GROUPS``.
 
     Raises:
         ConfigError: on values that do not fit together.
     """
+
+    is_autoencoder: ClassVar[bool] = True
 
     shift: Tensor
     scale: Tensor
@@ -127,7 +129,7 @@ class VQVAE(nn.Module):
         self.latent_shape = (latent_channels, *reduced(self.resolution, [self.patch, *steps], "an image"))
         """Channels, rows and columns of a latent."""
         self.gradient_checkpointing = False
-        """Forget what is inside the levels and compute it again in the backward pass."""
+        """Recompute the activations of the levels in the backward pass instead of storing them."""
         widths, cells = [width * m for m in multipliers], self.patch[0] * self.patch[1]
         attends = [level in attention_levels for level in range(len(widths))]
         levels = (widths, steps, blocks, attends, attention, groups)
@@ -136,7 +138,7 @@ class VQVAE(nn.Module):
         self.from_latent = nn.Conv2d(latent_channels, latent_channels, 1)
         self.decoder = Decoder(cells * (channels + mask), latent_channels, *levels)
         self.codebook = Codebook(codes, latent_channels, codebook)
-        # Latents leave with mean 0 and variance 1 per channel, as a flow from standard normal noise likes them.
+        # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise needs.
         self.register_buffer("shift", torch.zeros(latent_channels))
         self.register_buffer("scale", torch.ones(latent_channels))
 
@@ -145,15 +147,20 @@ class VQVAE(nn.Module):
         return (self._encode(x) - _channel(self.shift)) / _channel(self.scale)
 
     def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
-        """Latents (B, *latent_shape), moved to their codes, to images (B, C, H, W), -1 where the mask says that there
-        is no return; nothing is left to ``uniform_noise``."""
+        """Latents (B, *latent_shape), quantised, to images (B, C, H, W), with -1 where the mask predicts no return.
+
+        ``uniform_noise`` is ignored, since decoding is deterministic.
+        """
         check_shape(z, self.latent_shape, "a latent")
         z = z.to(self.to_latent.weight.dtype) * _channel(self.scale) + _channel(self.shift)
         output = self._decode(self.codebook(z)[0])
         return torch.where(output[:, self.channels :] < 0, -1.0, output[:, : self.channels]) if self.mask else output
 
     def forward(self, x: Tensor) -> Encoding:
-        """Images (B, C, H, W) there and back; in training an "ema" codebook and the latents' statistics move."""
+        """Encode and decode images (B, C, H, W).
+
+        In training mode, this updates the running statistics of the latents and the codes of an "ema" codebook.
+        """
         z = self._encode(x)
         if self.training:
             follow(z.detach(), self.shift, self.scale)
@@ -175,8 +182,8 @@ class VQVAE(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Images (B, C, H, W) to (B, K, h, w); arguments as of ``VQVAE``, ``widths`` and ``attends`` per level, finest
-    first."""
+    """Images (B, C, H, W) to (B, K, h, w). Arguments are those of ``VQVAE``; ``widths`` and ``attends`` are per level,
+    finest first."""
 
     def __init__(
         self,
@@ -194,7 +201,8 @@ class Encoder(nn.Module):
         self.stem = WrapConv(channels, width)
         inputs = [width, *widths[:-1]]
         self.levels = nn.ModuleList(
-            _level(a, b, blocks, groups, looks) for a, b, looks in zip(inputs, widths, attends, strict=True)
+            _level(a, b, blocks, groups, has_attention)
+            for a, b, has_attention in zip(inputs, widths, attends, strict=True)
         )
         self.down = nn.ModuleList(
             WrapConv(w, w, _STEPS[s].down, s, _STEPS[s].pad) for w, s in zip(widths[:-1], strides, strict=True)
@@ -210,8 +218,8 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """(B, K, h, w) to images (B, C, H, W); arguments as of ``VQVAE``, ``widths`` and ``attends`` per level, finest
-    first."""
+    """(B, K, h, w) to images (B, C, H, W). Arguments are those of ``VQVAE``; ``widths`` and ``attends`` are per level,
+    finest first."""
 
     def __init__(
         self,
@@ -227,12 +235,12 @@ class Decoder(nn.Module):
         super().__init__()
         self.stem = WrapConv(latent, widths[-1])
         self.middle = _middle(widths[-1], attention, groups)
-        # The level that a stride led to; rows stay where they are up to the first stride that takes them.
+        # One kernel per level: levels before the first stride over rows have the rows of the image.
         kernels = [CURVE, *((3, 3) if s[0] > 1 else CURVE for s in strides)]
         inputs = [*widths[1:], widths[-1]]
         levels = [
-            _level(a, b, blocks + 1, groups, looks, k)
-            for a, b, looks, k in zip(inputs, widths, attends, kernels, strict=True)
+            _level(a, b, blocks + 1, groups, has_attention, k)
+            for a, b, has_attention, k in zip(inputs, widths, attends, kernels, strict=True)
         ]
         self.levels = nn.ModuleList(reversed(levels))
         self.up = nn.ModuleList(_Upsample(w, s) for w, s in reversed(list(zip(widths[1:], strides, strict=True))))
@@ -246,7 +254,7 @@ class Decoder(nn.Module):
 
 
 class _Upsample(nn.Module):
-    """More rows and columns: bilinear between the first and the last ones, then a convolution."""
+    """Bilinear upsampling with aligned corners, then a convolution."""
 
     def __init__(self, channels: int, stride: Grid) -> None:
         super().__init__()

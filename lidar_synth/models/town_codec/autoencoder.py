@@ -12,6 +12,7 @@ a network trained on such means would take the noise of real scans for something
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -22,6 +23,7 @@ from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.models.codebook import follow
 from lidar_synth.models.convolution import WrapConv, check_shape, pair, reduced
 from lidar_synth.models.layers import EPS
+from lidar_synth.models.network import Network
 from lidar_synth.models.town_codec.distributions import CellDistributions
 from lidar_synth.models.town_codec.multiscale import LATTICES, LatticeRefinement, at_lattice, step_ratio
 from lidar_synth.models.town_codec.plane_fit import PlaneFit
@@ -64,7 +66,7 @@ class Residual(nn.Module):
         return out
 
 
-class Autoencoder(nn.Module):
+class Autoencoder(Network):
     """Images to latents and back; a codec like ``VQVAE``.
 
     Args:
@@ -84,6 +86,10 @@ class Autoencoder(nn.Module):
     Raises:
         ConfigError: on values that do not fit together.
     """
+
+    derived_arguments: ClassVar[tuple[str, ...]] = ("resolution", "channels", "normalisation")
+    needs_ray_angles: ClassVar[bool] = True
+    is_autoencoder: ClassVar[bool] = True
 
     shift: Tensor
     scale: Tensor

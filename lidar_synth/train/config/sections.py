@@ -9,9 +9,9 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import NetworkSpec
-from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.geometry.scan import Source
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.models import encoders_of, network_class
 from lidar_synth.town.town import Town
 from lidar_synth.train.state import Recipe
 
@@ -148,12 +148,12 @@ class Condition(Section):
         Raises:
             ConfigError: on an encoder of something else.
         """
-        encoders = CONDITIONS[self.kind].encoders
+        encoders = encoders_of(self.kind)
         if (encoder := self.encoder or encoders[0]) not in encoders:
             raise ConfigError(f"condition.encoder {encoder!r}", f"one of {', '.join(encoders)}")
         sizes = {"resolution": list(resolution), "target": list(target), "image": list(self.image or ())}
-        wanted = {"semantic_map": ("resolution", "target"), "sight": ("target", "image")}.get(encoder, ())
-        return NetworkSpec(encoder, {name: sizes[name] for name in wanted} | self.arguments)
+        derived = network_class(encoder).derived_arguments
+        return NetworkSpec(encoder, {name: sizes[name] for name in derived} | self.arguments)
 
     def options(self) -> dict[str, Any]:
         """What the checkpoint's header says about it."""

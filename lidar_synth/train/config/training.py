@@ -9,13 +9,14 @@ from torch import nn
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.models import AUTOENCODERS, build_network
+from lidar_synth.models import build_network, network_class
+from lidar_synth.models.network import Encoder
 from lidar_synth.train.autoencoder import Losses
 from lidar_synth.train.config.sections import Condition, Count, Network, Run, Section
 
 
 class TrainConfig(Run):
-    """A teacher, a rectified flow from noise to scans; or, with one of ``AUTOENCODERS``, the autoencoder of one.
+    """A teacher, a rectified flow from noise to scans; or an autoencoder, if the network is one.
 
     Args:
         sensor: a preset's name or a YAML file.
@@ -48,7 +49,7 @@ class TrainConfig(Run):
     @property
     def autoencodes(self) -> bool:
         """Whether an autoencoder is trained, and no flow."""
-        return self.network.architecture in AUTOENCODERS
+        return network_class(self.network.architecture).is_autoencoder
 
     def tensors(self) -> TensorFormat:
         """Layout of the network's tensors.
@@ -70,14 +71,15 @@ class TrainConfig(Run):
         Raises:
             ConfigError: on values that do not fit together.
         """
-        given: dict[str, Any] = {"resolution": list(state[1:]), "channels": state[0]}
+        run = {"resolution": list(state[1:]), "channels": state[0], "normalisation": self.normalisation}
+        derived = network_class(self.network.architecture).derived_arguments
+        given: dict[str, Any] = {name: run[name] for name in derived}
         parts = {}
         if self.condition is not None:
             parts[ENCODER] = part = self.condition.part(resolution, state[1:])
             encoder = _checked(part)
-            given[str(encoder.argument)] = encoder.channels
-        if self.network.architecture == "autoencoder":
-            given["normalisation"] = self.normalisation
+            assert isinstance(encoder, Encoder)
+            given[encoder.argument] = encoder.channels
         if twice := sorted(set(given) & set(self.network.arguments)):
             raise ConfigError(f"network.arguments with {twice}", "no such keys: they follow from what the states are")
         part = NetworkSpec(self.network.architecture, given | self.network.arguments)

@@ -1,6 +1,7 @@
-"""An encoder that knows where the camera looks: every cell of the state gets the image's features along its rays."""
+"""Encoder of one calibrated camera's images: every cell of the state gets the image features along its ray."""
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -8,36 +9,41 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.models.convolution import check_shape, pair, reduced
+from lidar_synth.models.network import Encoder
 from lidar_synth.models.positions import RayAngles
 
 
-class SightEncoder(nn.Module):
-    """A camera image as maps on the grid of the state, by the camera's calibration.
+class SightEncoder(Encoder):
+    """Encodes a camera image as feature maps on the grid of the state, using the camera's calibration.
 
-    Convolutions make features of the image; a cell takes those of the pixel that sees a point ``distance`` metres away
-    along the cell's ray. Nearer and farther points lie a little beside it: by as much as the camera stands beside the
-    sensor, which neighbouring features have to make good. The last map is 1 where the camera looks.
+    Convolutions compute features of the image. Each cell samples them at the pixel onto which the point ``distance``
+    metres along the cell's ray projects. Nearer and farther points project to slightly different pixels, because the
+    camera and the sensor are apart; the receptive field of the features covers this parallax. The last map is 1 where
+    the cell lies within the image.
 
-    Unlike tokens that are attended to, this need not be learnt: it works after minutes, with hundreds of images. It is
-    made for one camera, beside one sensor.
+    Unlike attention to tokens, the correspondence between cells and pixels is not learnt, so that minutes of training
+    on hundreds of images suffice. The encoder is specific to one camera and its mounting.
 
     Args:
         target: rows and columns of the state.
         image: rows and columns of the camera's images.
-        image_from_sensor: (3, 4) pixels of such an image from homogeneous points in the sensor frame
+        image_from_sensor: (3, 4) projection from homogeneous points in the sensor frame to pixels of such an image
             (``Calibration.image_from_sensor``).
-        resolution: h, w that images are resized to.
-        channels: of the maps.
+        resolution: h, w to which images are resized.
+        channels: channels of the maps.
         widths: channels of the convolutions, each of which halves rows and columns.
-        distance: metres.
-        angles: (2, rows, columns) elevation and azimuth (clockwise from ahead) of every cell, radians; without them
-            they have to come from a checkpoint.
+        distance: distance of the projected points in metres.
+        angles: (2, rows, columns) elevation and azimuth (clockwise from ahead) of every cell, radians; None if a
+            checkpoint will be loaded.
 
     Raises:
         ConfigError: on values that do not fit together.
     """
 
-    argument = "condition_channels"
+    derived_arguments: ClassVar[tuple[str, ...]] = ("target", "image")
+    needs_ray_angles: ClassVar[bool] = True
+    condition: ClassVar[str] = "camera"
+    argument: ClassVar[str] = "condition_channels"
 
     def __init__(
         self,
@@ -62,9 +68,9 @@ class SightEncoder(nn.Module):
             self.body.extend([nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.BatchNorm2d(b), nn.SiLU()])
         self.body.append(nn.Conv2d(widths[-1], channels - 1, 3, 1, 1))
 
-    def places(self) -> Tensor:
-        """(rows, columns, 2) where the cells look: column and row in the image, from -1 to 1 within it; far outside for
-        what lies behind the camera."""
+    def pixel_coordinates(self) -> Tensor:
+        """The (rows, columns, 2) image position of every cell: column and row, from -1 to 1 within the image, and 9 for
+        points behind the camera."""
         elevation, azimuth = self.angles.cells
         flat = elevation.cos()
         ray = torch.stack([flat * azimuth.cos(), -flat * azimuth.sin(), elevation.sin()], -1)
@@ -72,8 +78,8 @@ class SightEncoder(nn.Module):
         pixels = points @ torch.tensor(self.matrix, device=ray.device).T
         ahead = pixels[..., 2:] > 1.0
         size = torch.tensor(self.image[::-1], device=ray.device)
-        found = (2 * pixels[..., :2] / pixels[..., 2:] + 1) / size - 1
-        return torch.where(ahead, found, torch.full_like(found, 9.0))
+        position = (2 * pixels[..., :2] / pixels[..., 2:] + 1) / size - 1
+        return torch.where(ahead, position, torch.full_like(position, 9.0))
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, h, w) uint8 to (B, channels, rows, columns).
@@ -84,7 +90,7 @@ class SightEncoder(nn.Module):
         check_shape(image, (3, *self.resolution), "a camera image")
         x = image.to(next(self.body.parameters()).dtype) / 127.5 - 1
         features = self.body(x.contiguous(memory_format=torch.channels_last)).float()
-        places = self.places()
-        seen = (places.abs() <= 1).all(-1).float().expand(len(x), 1, *places.shape[:2])
-        maps = F.grid_sample(features, places.expand(len(x), *places.shape), align_corners=False)
-        return torch.cat([maps * seen, seen], 1).to(x.dtype)
+        positions = self.pixel_coordinates()
+        visible = (positions.abs() <= 1).all(-1).float().expand(len(x), 1, *positions.shape[:2])
+        maps = F.grid_sample(features, positions.expand(len(x), *positions.shape), align_corners=False)
+        return torch.cat([maps * visible, visible], 1).to(x.dtype)

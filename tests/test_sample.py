@@ -1,0 +1,105 @@
+"""Command line `lidar-synth sample`: formats, resuming, and conditions from a dataset."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import random_scan
+from layouts import write_all
+from small_models import SENSOR, write
+from typer.testing import CliRunner
+
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.formats import WRITERS, open_scans
+from lidar_synth.generate.generator import load_generator
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("generator") / "small.safetensors")
+
+
+@pytest.mark.parametrize("form", [name for name in WRITERS if name != "kitti_object"])  # no model gives boxes
+def test_sample_writes_every_format_and_resumes(form: str, path: Path, tmp_path: Path) -> None:
+    from lidar_synth.cli import app
+
+    def sample(*options: str) -> str:
+        result = CliRunner().invoke(
+            app, ["sample", str(tmp_path / "out"), "--model", str(path), "--to", form, *options]
+        )
+        assert result.exception is None, result.exception
+        return result.output
+
+    assert "2 scans written, 0 were there already" in sample("--count", "2", "--seed", "4")
+    assert "1 scans written, 2 were there already" in sample("--count", "3", "--seed", "4")
+    if form in ("npz", "semantic_kitti", "kitti", "webdataset"):
+        written = open_scans(tmp_path / "out", sensor=SENSOR)
+        expected = load_generator(path).scans(4, range(3))
+        assert len(written) == 3
+        for a, b in zip(written, expected, strict=True):
+            assert np.allclose(a.points, b.points, atol=1e-4)
+            assert np.array_equal(a.label, b.label)
+
+
+def test_sample_refuses_a_folder_that_holds_samples_of_another_seed(path: Path, tmp_path: Path) -> None:
+    from lidar_synth.cli import app
+
+    call = ["sample", str(tmp_path / "out"), "--model", str(path), "--count", "1"]
+    assert CliRunner().invoke(app, [*call, "--seed", "4"]).exception is None
+    before = (tmp_path / "out" / "000000.npz").read_bytes()
+    with pytest.raises(ConfigError, match=r"'seed': 4.*'seed': 5"):
+        CliRunner().invoke(app, [*call, "--seed", "5"], catch_exceptions=False)
+    assert (tmp_path / "out" / "000000.npz").read_bytes() == before
+
+
+def test_sample_takes_its_conditions_from_a_dataset(tmp_path: Path) -> None:
+    from lidar_synth.cli import app
+
+    guided = write(tmp_path / "guided.safetensors", ("range",), 0.1)
+    real = [random_scan(SENSOR, 400, seed) for seed in range(2)]
+    write_all("semantic_kitti", tmp_path / "real", real)
+    call = ["sample", str(tmp_path / "out"), "--model", str(guided), "--seed", "3", "--guidance", "2"]
+    given = [
+        "--condition",
+        str(tmp_path / "real"),
+        "--condition-split",
+        "train",
+        "--condition-layout",
+        "semantic_kitti",
+    ]
+    result = CliRunner().invoke(app, [*call, *given, "--count", "1"])
+    assert result.exception is None, result.exception
+    result = CliRunner().invoke(app, [*call, *given, "--count", "3"])
+    assert result.exception is None and "2 scans written, 1 were there already" in result.output
+    expected = load_generator(guided).scans(3, range(3), [real[0], real[1], real[0]], guidance=2.0)
+    for a, b in zip(open_scans(tmp_path / "out"), expected, strict=True):
+        assert a.id == f"{int(b.id.rpartition('/')[2]):06d}"
+        assert np.allclose(a.points, b.points, atol=1e-3)
+        assert np.array_equal(a.label, b.label) and len(np.unique(a.label)) > 2
+    for change, message in (
+        (["--guidance", "1"], r"'guidance': 2.0.*'guidance': 1.0"),
+        (["--condition", str(tmp_path)], "no scan in a layout|no sequence"),
+    ):
+        with pytest.raises((ConfigError, DataError), match=message):
+            CliRunner().invoke(app, [*call, *given, *change], catch_exceptions=False)
+
+
+@pytest.mark.parametrize(
+    ("conditional", "options", "error", "message"),
+    [
+        (True, [], ConfigError, "condition None for model 'model', which takes semantic conditions; expected a data"),
+        (False, ["--condition", "real"], ConfigError, "condition real for model 'model', which takes no condition"),
+        (True, ["--condition", "nowhere"], FileError, "nowhere does not exist"),
+        (False, ["--condition-split", "train"], ConfigError, "split train, but no dataset; expected --condition PATH"),
+    ],
+)
+def test_sample_refuses_conditions_that_do_not_fit(
+    conditional: bool, options: list[str], error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    from lidar_synth.cli import app
+
+    model = write(tmp_path / "model.safetensors", ("range",), 0.1 if conditional else None)
+    call = ["sample", str(tmp_path / "out"), "--model", str(model), *options]
+    with pytest.raises(error, match=message):
+        CliRunner().invoke(app, call, catch_exceptions=False)
+    assert not (tmp_path / "out").exists()
