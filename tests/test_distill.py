@@ -148,7 +148,7 @@ def test_a_grid_that_is_not_uniform_is_refused(name: str) -> None:
 @pytest.mark.parametrize("name", sorted(set(STRATEGIES) - {"reflow"}))
 @pytest.mark.parametrize("grid", [(0.0, 0.5, 1.0), (1.0, 0.5, 0.1), (0.9, 0.45, 0.0), (1.0,)])
 def test_invalid_student_grids_are_refused(name: str, grid: tuple[float, ...]) -> None:
-    expected = "at least two descending times|one that runs from 1 down to 0|which is uniform"
+    expected = "at least two descending times|one from 1 down to 0|which is uniform"
     with pytest.raises(ConfigError, match=rf"time grid [\[(].*; expected .*({expected})"):
         STRATEGIES[name](gaussian_velocity, DATA, NOISE, U, grid, 2, None)
 
