@@ -120,7 +120,7 @@ def size_and_rate(root: Path, images: list[RangeImage]) -> Bank:
     return plain
 
 
-def reading(path: Path, bank: Bank, root: Path) -> None:
+def reading(path: Path, bank: Bank) -> None:
     """Prints the cost of reading a scan from a bank, and from a point file."""
     turn = iter(np.random.default_rng(0).integers(0, len(bank), 10**6).tolist())
     sensor, shard = bank.sensor, bank.shard(0)
@@ -131,7 +131,7 @@ def reading(path: Path, bank: Bank, root: Path) -> None:
 
     ours = "random scan of a bank, as image"
 
-    with h5py.File(root / shard.entry.file, rdcc_nbytes=0) as file:  # no cache: every read decompresses
+    with h5py.File(bank.root / shard.entry.file, "r", rdcc_nbytes=0) as file:  # no cache: every read decompresses
         datasets = [file[name] for name in bank.facts.encoding.names]
 
         def by_hdf5() -> list[object]:
@@ -160,12 +160,12 @@ def stages(image: RangeImage) -> None:
         "encode": lambda: encoding.encode(image),
         "CRC-32": lambda: checksum(0, 0, arrays),
         pack: lambda: [deflate(values) for values in arrays.values()],
-        "of which deflate": lambda: [libdeflate.zlib_compress(plane, 1) for plane in planes],
+        "deflate alone": lambda: [libdeflate.zlib_compress(plane, 1) for plane in planes],
         "deflate by zlib": lambda: [zlib.compress(plane, 1) for plane in planes],
         "Fletcher-32, inflate, unshuffle": lambda: [inflate(c, *kinds[name]) for name, c in packed.items()],
-        "of which inflate": lambda: [libdeflate.zlib_decompress(c[:-4], 1 << 17) for c in packed.values()],
+        "inflate alone": lambda: [libdeflate.zlib_decompress(c[:-4], 1 << 17) for c in packed.values()],
         "inflate by zlib": lambda: [zlib.decompress(c[:-4], bufsize=1 << 17) for c in packed.values()],
-        "of which Fletcher-32": lambda: [fletcher32(chunk) for chunk in packed.values()],
+        "Fletcher-32 alone": lambda: [fletcher32(chunk) for chunk in packed.values()],
         "decode": lambda: encoding.decode(arrays),
         "unproject": lambda: unproject(decoded),
     }
@@ -188,7 +188,7 @@ def main() -> None:
         path = options.scan or root / "random.bin"
         if options.scan is None:
             random_points(plain.sensor).tofile(path)
-        reading(path, plain, root / "plain")
+        reading(path, plain)
         stages(images[0])
         if options.generated:
             generator = load_generator(options.model)
