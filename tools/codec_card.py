@@ -37,10 +37,10 @@ def there_and_back(model: str, images: list[RangeImage]) -> list[RangeImage]:
 def row(name: str, real: list[RangeImage], made: list[RangeImage]) -> str:
     """A line of the table, in per cent."""
     a, b = (np.stack([image.range for image in images]) for images in (real, made))
-    labels, said = (np.stack([image.channels["label"] for image in images]) for images in (real, made))
+    labels, decoded = (np.stack([image.channels["label"] for image in images]) for images in (real, made))
     both = (a > 0) & (b > 0)
     off = np.abs(np.divide(b, a, where=both, out=np.ones_like(a)) - 1)
-    right = [((a > 0) == (b > 0)).mean(), (labels == said)[both & (labels != IGNORE)].mean()]
+    right = [((a > 0) == (b > 0)).mean(), (labels == decoded)[both & (labels != IGNORE)].mean()]
     medians = [np.median(off[both & (labels == TRAIN_ID[one])]) for one in CLASSES]
     return f"| {name} | {' | '.join(f'{100 * v:.1f}' for v in (*right, *medians))} |"
 

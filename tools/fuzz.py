@@ -3,10 +3,10 @@
     python tools/fuzz.py [--cases 5000] [--reader NAME ...] [--seed 0] [--jobs 2] [--keep FOLDER]
     python tools/fuzz.py --reader NAME --case NUMBER --keep FOLDER
 
-A case is decided by reader, seed and number (and by the versions of the libraries that write the valid files). Reading
-it has to give a sound result or one of the package's errors. Cases that do something else are listed below the table,
-and their files are kept. With ``--case`` one case is put into the folder and read in this process, without limits, so
-that its error can be looked at. The exit status is 1 where a case has a flaw. Linux only.
+A case is a function of reader, seed and number (and of the versions of the libraries that write the valid files).
+Reading it has to give a correct result or one of the package's errors. All other cases are listed below the table, and
+their files are kept. With ``--case`` one case is written to the folder and read in this process, without limits, to
+inspect its error. The exit status is 1 if any case has a flaw. Linux only.
 """
 
 import argparse

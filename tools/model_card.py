@@ -48,7 +48,7 @@ SPAN = 8
 TILES = 16
 CLOSE = 4
 NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)).camera()
-"""Where cars and poles can be told from each other."""
+"""A camera from which cars and poles are distinguishable."""
 
 
 class Autoguided(nn.Module):
@@ -185,8 +185,8 @@ def main() -> None:
     other = town(OTHER, given.count)
     lines = [rows("real against real (lower bound)", reference, other, judge)]
     for i, text in enumerate(given.models):
-        name, asked = text.split("=", 1)
-        model, steps, *guidance = asked.split(":") if ":" in asked else (asked, "")
+        name, spec = text.split("=", 1)
+        model, steps, *guidance = spec.split(":") if ":" in spec else (spec, "")
         if steps == "0":
             scans = drawn_again(model, other)
         else:

@@ -60,14 +60,14 @@ def main() -> None:
     wanted = {name: text for name, text in lowest().items() if name not in KEPT}
     python = install(options.venv.absolute(), wanted)
     tests = options.tests or [f"tests/{name}" for name in TESTS if (ROOT / "tests" / name).exists()]
-    told = subprocess.run(
+    versions = subprocess.run(
         [python, "-c", "import sys; from importlib.metadata import version\n"
          "for name in sys.argv[1:]: print(version(name))", *wanted], check=True, capture_output=True, text=True,
     ).stdout.split()  # fmt: skip
     environment = os.environ | {"NUMBA_CACHE_DIR": str(options.venv.absolute() / "numba")}
     done = subprocess.run([python, "-m", "pytest", *tests], cwd=ROOT, env=environment, check=False)
     print(f"\nPython {sys.version.split()[0]}\n\n| dependency | declared from | tested |\n|---|---|---|")
-    for name, text in zip(wanted, told, strict=True):
+    for name, text in zip(wanted, versions, strict=True):
         print(f"| {name} | {wanted[name]} | {text} |")
     for name in KEPT:
         print(f"| {name} | {lowest()[name]} | {version(name)}: not at its lowest version, see above |")
