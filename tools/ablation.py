@@ -1,11 +1,11 @@
-"""Strategies of distillation beside each other, at one budget of network evaluations (the paper's Table 4).
+"""Compare distillation strategies at an equal budget of network evaluations (the paper's Table 4).
 
     python tools/ablation.py TEACHER WORK [--evaluations 20000] [--count 256] [KEY=VALUE ...]
 
-Every strategy gets a student from the same teacher, the same noise and data, and as many evaluations of the network,
-the teacher's included: a sample costs its strategy the teacher's steps and one evaluation by the student. KEY=VALUE
-changes configs/town_student.yaml for all of them. Students of an earlier call are used again. Figures as in
-tools/model_card.py; the time grid is the selected one for adaptive_piecewise and uniform for the others.
+Every strategy trains a student from the same teacher, with the same noise and data and the same number of network
+evaluations: each sample costs the teacher's steps and one evaluation of the student. KEY=VALUE changes the recipe
+town_student for all of them. Students of an earlier call are reused. The figures are those of tools/model_card.py. The
+time grid is the selected one for adaptive_piecewise and uniform for the others.
 """
 
 import argparse
@@ -25,12 +25,12 @@ WHOLE = ("reflow", "timestep_distillation")
 
 
 def student(strategy: str, teacher: Path, work: Path, evaluations: int, overrides: list[str]) -> tuple[Path, str]:
-    """The checkpoint of one strategy, and what it was given."""
+    """The checkpoint of one strategy, and a description of its budget."""
 
     def configured(*more: str) -> DistillConfig:
         path = ROOT / "configs" / "town_student.yaml"
         own = (
-            "weaker=null",  # what guidance brings is another question
+            "weaker=null",  # without autoguidance, which would affect the strategies differently
             "guidance=1",
             f"output={work / strategy}",
             f"data.cache={work / 'cache'}",
@@ -53,8 +53,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("teacher", type=Path)
     parser.add_argument("work", type=Path, help="folder of the students")
-    parser.add_argument("--evaluations", type=int, default=20_000, help="of the network, for each strategy")
-    parser.add_argument("--count", type=int, default=256, help="scans to measure on")
+    parser.add_argument("--evaluations", type=int, default=20_000, help="network evaluations of each strategy")
+    parser.add_argument("--count", type=int, default=256, help="scans in each row")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     given = parser.parse_intermixed_args()
 

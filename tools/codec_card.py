@@ -1,11 +1,11 @@
-"""What the autoencoder of a latent model keeps of a scan, class by class: the figures of docs/models.md.
+"""Measure what the autoencoder of a latent model preserves of a scan, by class: the figures of docs/models.md.
 
     python tools/codec_card.py NAME=MODEL ... [--count 24]
 
     python tools/codec_card.py "as it ships=town" "mine=runs/town_codec/town_codec.safetensors"
 
-Scans of a town that no model was trained on, each on another street, there and back, the likeliest of everything that
-the decoder says. A flow on its latents comes no nearer than this.
+The scans are from a town that no model was trained on, each on another street. They are encoded, and decoded to the
+mode of the predicted distributions. A flow on these latents cannot be more accurate than this.
 """
 
 import argparse
@@ -27,7 +27,7 @@ CLASSES = ("road", "building", "fence", "vegetation", "car", "pole")
 
 
 def there_and_back(model: str, images: list[RangeImage]) -> list[RangeImage]:
-    """Range images through the autoencoder of a checkpoint."""
+    """Range images, encoded and decoded by the autoencoder of a checkpoint."""
     codec, made = open_codec(model), []
     for image in tqdm(images, desc=Path(model).stem, unit="scan"):
         made += reconstruct(codec, codec.tensors.from_images([image]), image.sensor)
@@ -35,12 +35,12 @@ def there_and_back(model: str, images: list[RangeImage]) -> list[RangeImage]:
 
 
 def row(name: str, real: list[RangeImage], made: list[RangeImage]) -> str:
-    """A line of the table, per cent."""
+    """A line of the table, in per cent."""
     a, b = (np.stack([image.range for image in images]) for images in (real, made))
-    labels, said = (np.stack([image.channels["label"] for image in images]) for images in (real, made))
+    labels, decoded = (np.stack([image.channels["label"] for image in images]) for images in (real, made))
     both = (a > 0) & (b > 0)
     off = np.abs(np.divide(b, a, where=both, out=np.ones_like(a)) - 1)
-    right = [((a > 0) == (b > 0)).mean(), (labels == said)[both & (labels != IGNORE)].mean()]
+    right = [((a > 0) == (b > 0)).mean(), (labels == decoded)[both & (labels != IGNORE)].mean()]
     medians = [np.median(off[both & (labels == TRAIN_ID[one])]) for one in CLASSES]
     return f"| {name} | {' | '.join(f'{100 * v:.1f}' for v in (*right, *medians))} |"
 

@@ -1,4 +1,4 @@
-"""Does the condition count? The figures and the pictures of conditional models in docs/models.md.
+"""Does a model follow its condition? The figures and images of conditional models in docs/models.md.
 
     python tools/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64] [--picture OUT.png]
 
@@ -6,13 +6,13 @@
     lidar-synth town unseen --seed 1 --scans 64 --interval 1 --layout kitti360          # camera models need images
     python tools/condition_card.py "student, 4 steps=RUN/student.safetensors" --root unseen
 
-Every model gets the conditions of the same real scans, those of a town that it has not seen or of ROOT, and the same
-noise. The table says how near the generated scans come as a set. Below it stands how well each agrees with the scan
-whose condition it got, and with another one of them, half the set away:
+Every model gets the same noise and the conditions of the same real scans, from an unseen town or from ROOT. The first
+table measures how close the generated scans are as a set. The second one measures how well each agrees with the scan of
+its own condition, and with another scan, half the set away:
 
-    semantic   mIoU between the label map and what the town's segmenter sees in the generated scan
-    camera     intersection over union of the bird's-eye cells that hold something above the ground, where the
-               camera looks: a metre wide, up to 40 m away
+    semantic   mIoU between the label map and the segmenter's prediction on the generated scan
+    camera     intersection over union of the occupied bird's-eye cells (1 m) in the camera's view, up to 40 m away;
+               a cell is occupied if it has a return above the ground
 """
 
 import argparse
@@ -41,18 +41,18 @@ SHOWN = 8
 
 
 def map_agreement(scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> float:
-    """mIoU between the real scans' labels, cell by cell, and what the segmenter sees in the generated ones."""
+    """mIoU between the real scans' labels, cell by cell, and the segmenter's prediction on the generated ones."""
     return mean_iou(judge.agreement([relabelled(a, b) for a, b in zip(scans, real, strict=True)]))
 
 
 def sight_agreement(scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> float:
-    """Mean intersection over union of what stands in the camera's sight."""
+    """Mean intersection over union of the occupied cells in the camera's view."""
     pairs = [(obstacles(a), obstacles(b)) for a, b in zip(scans, real, strict=True)]
     return float(np.mean([(a & b).sum() / max((a | b).sum(), 1) for a, b in pairs]))
 
 
 def obstacles(scan: Scan) -> NDArray[np.bool_]:
-    """(REACH, 2 REACH) square metres ahead that hold a return above the ground."""
+    """(REACH, 2 REACH) square metres ahead that have a return above the ground."""
     x, y, z = scan.points.T
     seen = (np.abs(np.arctan2(y, x)) < FIELD) & (np.hypot(x, y) < REACH) & (z > ABOVE - SENSOR_HEIGHT)
     cells = np.zeros((REACH, 2 * REACH), bool)
@@ -75,7 +75,7 @@ def verdict(name: str, kind: str, scans: Sequence[Scan], real: Sequence[Scan], j
 
 
 def generate(model: str, steps: int | None, real: Sequence[Scan]) -> tuple[str, list[Scan]]:
-    """The kind of condition, and one scan from each real scan's."""
+    """The kind of condition, and one generated scan for the condition of each real scan."""
     generator = load_generator(model)
     if generator.condition is None:
         raise SystemExit(f"{model} is unconditional: see tools/model_card.py")
@@ -87,12 +87,12 @@ def generate(model: str, steps: int | None, real: Sequence[Scan]) -> tuple[str, 
 
 
 def seen(kind: str, scan: Scan, sensor: Sensor) -> NDArray[np.uint8]:
-    """A picture of a scan's condition."""
+    """An image of a scan's condition."""
     if kind == "camera":
         assert scan.image_path is not None
         return np.asarray(Image.open(scan.image_path).convert("RGB").resize((704, 188)))
     shown = picture(project(scan, sensor, ["label"]), "label")
-    return np.repeat(shown, 4, axis=0)  # 64 rows are few
+    return np.repeat(shown, 4, axis=0)  # the map has only 64 rows
 
 
 def draw(path: Path, kind: str, made: Sequence[Scan], real: Sequence[Scan]) -> None:
@@ -115,10 +115,10 @@ def draw(path: Path, kind: str, made: Sequence[Scan], real: Sequence[Scan]) -> N
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
-    parser.add_argument("--root", help="a dataset with labels, or images; without it a town")
-    parser.add_argument("--split", help="of ROOT")
-    parser.add_argument("--count", type=int, default=64, help="scans of every row")
-    parser.add_argument("--picture", type=Path, help="PNG of the first model's scans; of real data, for yourself only")
+    parser.add_argument("--root", help="a dataset with labels or images [default: a town]")
+    parser.add_argument("--split", help="split of ROOT")
+    parser.add_argument("--count", type=int, default=64, help="scans in each row")
+    parser.add_argument("--picture", type=Path, help="PNG of the first model's scans; do not publish it for real data")
     given = parser.parse_args()
 
     judge = load_judge()
@@ -140,7 +140,7 @@ def main() -> None:
         if i == 0 and given.picture:
             apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
             draw(given.picture, kind, [scans[k] for k in apart], [real[k] for k in apart])
-    print(f"{len(real)} scans a row\n\n{header(real, judge)}\n" + "\n".join(lines))
+    print(f"{len(real)} scans per row\n\n{header(real, judge)}\n" + "\n".join(lines))
     print("\n| scans | % | with its own condition | with another's |\n|---|---|---:|---:|\n" + "\n".join(verdicts))
 
 

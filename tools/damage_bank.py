@@ -1,10 +1,10 @@
-"""Damage a shard in many ways, one at a time, and see that each is found and that no wrong scan is handed out.
+"""Damage a shard in many ways, one at a time; check that all damage is found and that no wrong scan is returned.
 
     python tools/damage_bank.py [--model town] [--flips 1000] [--cuts 200]
 
-Bits are flipped and ends are cut off at random. Every time all scans are read again, twice: through the index, and
-from the shard alone, as if nobody knew its size and hash. What a reader hands out has to be equal to what was written;
-``verify`` has to find all of it. At the end ``repair`` makes the shard again.
+Random bits are flipped and the file is truncated at random lengths. After each damage all scans are read twice: through
+the index, and from the shard alone, without the size and hash of the index. Every scan that a reader returns has to
+equal the one that was written, and ``verify`` has to find all damage. At the end ``repair`` generates the shard again.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from lidar_synth.errors import DataError, FileError
 
 
 def by_index(root: Path, number: int) -> list[bytes]:
-    """The scans of a shard as a bank hands them out."""
+    """The scans of a shard, read through the bank's index."""
     bank = Bank(root)
     first = bank.index.ends[number] - bank.index.shards[number].scans
     scans = [bank[i] for i in range(first, bank.index.ends[number])]
@@ -34,13 +34,13 @@ def by_index(root: Path, number: int) -> list[bytes]:
 
 
 def alone(path: Path) -> list[bytes]:
-    """The arrays of a shard's scans, by a reader that knows the shard only."""
+    """The arrays of a shard's scans, read from the shard alone."""
     with ShardReader(path, str(path)) as shard:
         return [b"".join(a.tobytes() for a in shard.read(i).values()) for i in range(shard.entry.scans)]
 
 
 def attempt(read: Callable[[], list[bytes]], expected: list[bytes]) -> str:
-    """What comes of reading: an error that was meant, scans that are equal, or the worst."""
+    """The outcome of reading: one of the package's errors, equal scans, or a fault."""
     try:
         return "equal scans" if read() == expected else "WRONG SCANS"
     except (DataError, FileError):
@@ -48,12 +48,12 @@ def attempt(read: Callable[[], list[bytes]], expected: list[bytes]) -> str:
 
 
 def main() -> None:
-    """Prints what was found by whom; exits with 1 on a wrong scan or damage that nobody found."""
+    """Prints what each check found; exits with 1 on a wrong scan or on damage that no check found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", default="town", help="a shipped model or a checkpoint")
     parser.add_argument("--flips", type=int, default=1000)
     parser.add_argument("--cuts", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0, help="of bits and lengths")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the flipped bits and the lengths")
     given = parser.parse_args()
     rng = np.random.default_rng(given.seed)
     with tempfile.TemporaryDirectory() as folder:
@@ -77,7 +77,7 @@ def main() -> None:
     print(f"a shard of {len(content):,} bytes, {entry.scans} scans of {facts.sensor.shape}, {facts.fields}")
     for (kind, who, what), count in counts.items():
         print(f"{kind:5} {who:24} {what:12} {count:6}")
-    print(f"repair: {done}, {'the same bytes' if same else 'OTHER BYTES'}")
+    print(f"repair: {done}, {'the same bytes' if same else 'DIFFERENT BYTES'}")
     if not same or any(what.isupper() for _, _, what in counts):
         sys.exit(1)
 

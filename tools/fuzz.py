@@ -3,10 +3,10 @@
     python tools/fuzz.py [--cases 5000] [--reader NAME ...] [--seed 0] [--jobs 2] [--keep FOLDER]
     python tools/fuzz.py --reader NAME --case NUMBER --keep FOLDER
 
-A case is decided by reader, seed and number (and by the versions of the libraries that write the valid files). Reading
-it has to give a sound result or one of the package's errors. Cases that do something else are listed below the table,
-and their files are kept. With ``--case`` one case is put into the folder and read in this process, without limits, so
-that its error can be looked at. The exit status is 1 where a case has a flaw. Linux only.
+A case is a function of reader, seed and number (and of the versions of the libraries that write the valid files).
+Reading it has to give a correct result or one of the package's errors. All other cases are listed below the table, and
+their files are kept. With ``--case`` one case is written to the folder and read in this process, without limits, to
+inspect its error. The exit status is 1 if any case has a flaw. Linux only.
 """
 
 import argparse
@@ -38,13 +38,15 @@ def main() -> None:
     """Prints the table and the flaws."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=5000, help="for each reader")
-    parser.add_argument("--reader", action="append", choices=TARGETS, help="several times for several; all by default")
+    parser.add_argument(
+        "--reader", action="append", choices=TARGETS, help="a reader to fuzz; repeat for several [default: all]"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2, help="processes that read at a time")
-    parser.add_argument("--memory", type=float, default=500, help="megabytes that a case may take")
-    parser.add_argument("--seconds", type=float, default=5, help="that a case may take")
+    parser.add_argument("--memory", type=float, default=500, help="limit of memory of a case, in megabytes")
+    parser.add_argument("--seconds", type=float, default=5, help="limit of time of a case, in seconds")
     parser.add_argument("--keep", type=Path, help="folder for the files of the cases with a flaw")
-    parser.add_argument("--case", type=int, help="put this case into --keep, and read it here")
+    parser.add_argument("--case", type=int, help="write this case to --keep, and read it in this process")
     given = parser.parse_args()
     names = given.reader or list(TARGETS)
     if given.case is not None:
@@ -104,7 +106,7 @@ def print_flaws(name: str, seed: int, report: Report, keep: Path | None) -> None
 
 
 def look(name: str, seed: int, number: int, keep: Path) -> str:
-    """Put a case into its place, read it, and say what came of it."""
+    """Write the file of a case, read it, and describe the outcome."""
     folder = keep / name / f"{seed}-{number}"
     root = Cases(name, TARGETS[name], seed, folder).place(number)
     print(f"the case is in {root}, the valid files are in {folder / 'valid'}")

@@ -5,8 +5,8 @@
 #   bash tools/install_mmdet3d.sh .venv --ops          also mmcv's operators, compiled for the CPU (half an hour)
 #   MMCV_WHEEL=mmcv-2.1.0-....whl bash tools/install_mmdet3d.sh .venv --ops     the same from a wheel
 #
-# An extra of the package cannot do this: nuscenes-devkit pins numpy < 2, so it goes in without its dependencies, and
-# mmdet3d, mmdet and mmengine ask for libraries that nothing here uses. numpy 2.4 works.
+# An extra of the package cannot do this: nuscenes-devkit pins numpy < 2, so it is installed without its dependencies, and
+# mmdet3d, mmdet and mmengine require libraries that nothing here uses. numpy 2.4 works.
 set -euo pipefail
 
 venv="${1:?usage: install_mmdet3d.sh VENV [--ops]}"
@@ -18,7 +18,7 @@ trap 'rm -f "$freeze"' EXIT
 pip() { "$python" -m pip install --disable-pip-version-check --quiet --constraint "$freeze" "$@"; }
 
 pip --no-deps mmengine==0.10.7 mmdet==3.3.0 mmdet3d==1.4.0 nuscenes-devkit==1.2.0 lyft_dataset_sdk==0.0.8
-# Headless: the other build of OpenCV wants libGL.
+# Headless: the other build of OpenCV needs libGL.
 pip --no-deps opencv-python-headless
 pip --only-binary :all: addict yapf termcolor regex rich terminaltables shapely six pycocotools trimesh plyfile \
     scikit-image scikit-learn scipy pyquaternion cachetools fire packaging prettytable

@@ -1,11 +1,11 @@
-"""Kill a bake at random moments, over and over, and see that what is there in the end has the same bytes.
+"""Kill a bake at random moments, many times, and check that the finished bank has the same bytes.
 
     python tools/kill_bake.py --kills 100 [--engine processes] [--model town]
 
-A bank is baked in one go first. Then the same bake runs in a process group of its own, which is killed (SIGKILL) after
-a random part of the time that a whole run takes, and is started again; whenever it comes to its end, its files are
-compared and the next bank begins. The model is a quick one that has learnt nothing, unless another is named: what is
-tried is the writing.
+First a bank is baked without interruption. Then the same bake runs in its own process group, which is killed (SIGKILL)
+after a random fraction of the time of a complete run, and is started again. Whenever a bake finishes, its files are
+compared and the next bank begins. By default the model is a fast one with random weights, because the test is about
+writing.
 """
 
 import argparse
@@ -27,10 +27,10 @@ from lidar_synth.bank import INDEX
 
 
 def start(plan: BakePlan, engine: str, workers: int) -> int:
-    """Bake in a child process with a group of its own; its id."""
+    """Bake in a child process with its own process group; returns its id."""
     child = os.fork()
     if child:
-        os.setpgid(child, child)  # here too: it may be killed before it has come to that itself
+        os.setpgid(child, child)  # in the parent too: the child may be killed before it sets its group itself
         return child
     os.setpgid(0, 0)
     try:
@@ -42,7 +42,7 @@ def start(plan: BakePlan, engine: str, workers: int) -> int:
 
 
 def killed(child: int, seconds: float) -> bool:
-    """Wait, then kill the child's group; whether there still was something to kill."""
+    """Wait, then kill the child's group; returns whether it was still running."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -56,12 +56,12 @@ def killed(child: int, seconds: float) -> bool:
 
 
 def files(root: Path) -> dict[str, bytes]:
-    """All files of a bank, those of a bake that is not at its end among them."""
+    """All files of a bank, including those of an unfinished bake."""
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
 def main() -> None:
-    """Kills until the number is reached; exits with 1 where bytes differ."""
+    """Repeats until the number of kills is reached; exits with 1 if bytes differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", help="a shipped model or a checkpoint")
     parser.add_argument("--kills", type=int, default=100)
@@ -69,9 +69,9 @@ def main() -> None:
     parser.add_argument("--shard-size", type=int, default=4)
     parser.add_argument("--engine", default="local")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the moments")
     given = parser.parse_args()
-    chance = random.Random(given.seed)
+    rng = random.Random(given.seed)
     with tempfile.TemporaryDirectory() as folder:
         model = given.model or str(write_untrained(Path(folder) / "untrained.safetensors"))
         job = BakeJob(model=model, count=given.count, shard_size=given.shard_size)
@@ -85,18 +85,18 @@ def main() -> None:
         kills = banks = 0
         with tqdm(total=given.kills, unit="kill") as bar:
             while kills < given.kills or out.exists():
-                moment = chance.uniform(0, seconds) if kills < given.kills else 1e6
+                moment = rng.uniform(0, seconds) if kills < given.kills else 1e6
                 if killed(start(plan, given.engine, given.workers), moment):
                     kills += 1
                     bar.update()
                 elif (out / INDEX).exists():
                     assert verify(out, progress=False) == []
                     if files(out) != expected:
-                        sys.exit(f"bank {banks} after {kills} kills has other bytes than one baked in one go")
+                        sys.exit(f"bank {banks} after {kills} kills has other bytes than one baked without a kill")
                     banks += 1
                     shutil.rmtree(out)
         print(f"{kills} kills, {banks} banks of {given.count} scans in {len(plan.shards)} shards by {given.engine}, "
-              f"a whole run takes {seconds:.1f} s: all files have the same bytes as those baked in one go")  # fmt: skip
+              f"a whole run takes {seconds:.1f} s: all files have the same bytes as without a kill")  # fmt: skip
 
 
 if __name__ == "__main__":

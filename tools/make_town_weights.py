@@ -1,17 +1,17 @@
-"""The recipe of the weights that ship, on scans of the town only: autoencoder, teacher, a weaker teacher to lead away
-from, timesteps, student, decoder.
+"""Train the shipped weights on scans of the town: autoencoder, teacher, a weaker teacher for autoguidance, timesteps,
+student, decoder.
 
     python tools/make_town_weights.py WORK [--model town] [--codec 60] [--teacher 180] [--weaker 10] [--student 30]
         [--decoder 30] [--set RUN.KEY=VALUE ...]
     python tools/make_town_weights.py WORK --model town-semantic --teacher 60      # after the first, in the same folder
     python tools/make_town_weights.py WORK --model town-camera --teacher 60
 
-The conditional models begin as the teacher of the first. The numbers are minutes: every run has a budget of time in
-place of iterations. It goes on at a constant rate until three quarters of it are over, then the rate falls to zero
-over a third of the steps done so far (the schedule "trapezoid"). A run that was stopped or killed goes on when the
-same is typed again, with the budget anew. --set changes the configurations (configs/town_codec.yaml,
-town_teacher.yaml, town_semantic_student.yaml ...), such as teacher.recipe.batch=16; data has to stay the same in all.
-On a machine that does other things too, set OMP_WAIT_POLICY=passive.
+The conditional models start from the teacher of the first model. The numbers are minutes: every run has a budget of
+time instead of iterations. The learning rate is constant for three quarters of the budget, then falls to zero over a
+third of the steps done so far (the schedule "trapezoid"). The same command resumes a run that was stopped or killed,
+with a new budget. --set changes the recipes (town_codec, town_teacher, town_semantic_student ...), such as
+teacher.recipe.batch=16; the data has to be the same in all of them. On a machine that does other work, set
+OMP_WAIT_POLICY=passive.
 """
 
 import argparse
@@ -74,7 +74,7 @@ def main() -> None:
     for name, stage in STAGES.items():
         parser.add_argument(f"--{name}", type=float, default=stage.minutes, metavar="MINUTES")
     parser.add_argument("--set", nargs="*", default=[], metavar="RUN.KEY=VALUE")
-    parser.add_argument("--out", type=Path, help="by default where the package has its weights")
+    parser.add_argument("--out", type=Path, help="file to write [default: the package's weights]")
     given = parser.parse_args()
 
     data = [f"data.cache={given.work / 'cache'}"]
@@ -93,7 +93,7 @@ def main() -> None:
 
 
 def train(kind: type[TrainConfig] | type[DistillConfig], folder: Path, minutes: float, overrides: list[str]) -> Path:
-    """A run with a budget of time; a second call goes on with it."""
+    """A run with a budget of time; a second call resumes it."""
     note = folder / "budget.json"
     overrides = [f"output={folder}", "recipe.schedule=trapezoid", *overrides]
 
@@ -110,7 +110,7 @@ def train(kind: type[TrainConfig] | type[DistillConfig], folder: Path, minutes: 
 
 
 def ship(path: Path, out: Path) -> None:
-    """The student as the package holds it, in half precision if it has to be."""
+    """Write the student as the package ships it, in half precision where it would be too large."""
     checkpoint = load_checkpoint(path)
     count = sum(p.numel() for network in checkpoint.networks.values() for p in network.parameters())
     dtype = torch.float32 if 4 * count < 0.9 * LIMIT else torch.float16

@@ -1,16 +1,16 @@
-"""The figures and the pictures of docs/models.md: how near generated scans come to scans of the town.
+"""The figures and images of docs/models.md: how close generated scans are to scans of the town.
 
     python tools/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ... [--count 512] [--pictures OUT]
 
     python tools/model_card.py "student, 4 steps=town" "teacher, 50 steps=RUN/town_teacher.safetensors:50" \\
         "teacher, 4 steps=RUN/town_teacher.safetensors:4" --pictures docs/models
 
-Every model makes scans from the same noise. They stand beside scans of a town that no model was trained on (seed 1);
-the first row is a third town (seed 2), which is as near as different streets of one kind come. STEPS of 0 stand for the
-third town's scans through the autoencoder of a latent model, which is as near as its flow can come. With the checkpoint
-of a WEAKER model the flow is led away from it (autoguidance) from t = HIGH to LOW, as a student's teacher is.
+Every model generates scans from the same noise. They are compared with scans of a town that no model was trained on
+(seed 1). The first row is a third town (seed 2): real against real, the lower bound. With STEPS = 0 a row has the third
+town's scans, encoded and decoded by the model's autoencoder: the lower bound for its flow. With the checkpoint of a
+WEAKER model the flow is autoguided from t = HIGH to LOW, as the teacher of a student is.
 
-Models with a condition have a card of their own: tools/condition_card.py.
+tools/condition_card.py is for conditional models.
 """
 
 import argparse
@@ -48,11 +48,11 @@ SPAN = 8
 TILES = 16
 CLOSE = 4
 NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)).camera()
-"""Where cars and poles can be told from each other."""
+"""A camera from which cars and poles are distinguishable."""
 
 
-class Led(nn.Module):
-    """A flow that is led away from a weaker one."""
+class Autoguided(nn.Module):
+    """A flow that is autoguided by a weaker one."""
 
     def __init__(self, network: nn.Module, weaker: nn.Module, scale: float, low: float, high: float) -> None:
         super().__init__()
@@ -64,11 +64,11 @@ class Led(nn.Module):
 
 
 def generate(model: str, steps: int | None, count: int, weaker: str = "", *how: str) -> list[Scan]:
-    """Scans of one model, which all models make from the same noise."""
+    """Scans of one model; all models get the same noise."""
     generator = load_generator(model)
     if weaker:
-        led = Led(generator.network, load_generator(weaker).network, *map(float, how))
-        generator = replace(generator, network=led)
+        guided = Autoguided(generator.network, load_generator(weaker).network, *map(float, how))
+        generator = replace(generator, network=guided)
     indices = tqdm(range(count), desc=Path(model).stem, unit="scan")
     return [generator.scans(SEED, [i], steps=steps)[0] for i in indices]
 
@@ -86,32 +86,32 @@ def open_codec(model: str) -> Latent:
 
 
 def drawn_again(model: str, scans: Sequence[Scan]) -> list[Scan]:
-    """Scans through the autoencoder of a model, drawn from what it says."""
+    """Scans encoded by the autoencoder of a model, and sampled from its predicted distributions."""
     codec, made = open_codec(model), []
     for i, scan in enumerate(tqdm(scans, desc=f"{Path(model).stem}, autoencoder", unit="scan")):
         image = project(scan, channels=["reflectance", "label"])
-        chance = uniform(SEED, [i], (codec.draws, *image.sensor.shape), "cpu")
-        x = codec.decode(codec.encode(codec.tensors.from_images([image])), chance)
+        noise = uniform(SEED, [i], (codec.draws, *image.sensor.shape), "cpu")
+        x = codec.decode(codec.encode(codec.tensors.from_images([image])), noise)
         made.append(replace(unproject(codec.tensors.to_images(x, image.sensor)[0]), domain=SYNTHETIC))
     return made
 
 
 def relabelled(scan: Scan, other: Scan) -> Scan:
-    """A scan on the grid, each return with the label that another one has in its cell."""
+    """A scan on the grid, each return with the label of the same cell in another scan."""
     image, labels = project(scan, scan.sensor), project(other, scan.sensor, ["label"]).channels["label"]
     image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(np.uint8)
     return replace(unproject(image), id=scan.id, domain=scan.domain)
 
 
 def town(seed: int, count: int) -> list[Scan]:
-    """Scans of one town, each on another street: neighbouring ones would make a town of three or four streets."""
+    """Scans of one town, each on another street: neighbouring scans would show only three or four streets."""
     source = Town(seed, scans=count * STRETCH_FRAMES, interval=1.0)
     return [source[i * STRETCH_FRAMES] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
 
 
 def rows(name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge) -> tuple[str, str]:
-    """A line of the table, and one of the second table: what the segmenter sees as the labels say, class by class, and
-    how straight walls are."""
+    """A line of the first table, and one of the second: IoU by class between the labels and the segmenter's prediction,
+    and the bend of walls."""
     values = [f"{score.value:.4g}" for score in _scores(reference, scans, judge)]
     mean, bent, ious = float("nan"), float("nan"), np.full(len(NAMES), np.nan)
     if scans[0].label is not None:
@@ -122,7 +122,7 @@ def rows(name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Jud
 
 
 def bend(scans: Sequence[Scan]) -> float:
-    """How far walls are from straight: median of |q(j - 8) - 2 q(j) + q(j + 8)| / q(j) of the inverse ranges q of rows,
+    """The bend of walls: median of |q(j - 8) - 2 q(j) + q(j + 8)| / q(j) of the inverse ranges q of rows,
     where all cells from j - 8 to j + 8 are a building's. A plane has 0.0024 on 1024 columns."""
     found = []
     for scan in scans:
@@ -136,27 +136,27 @@ def bend(scans: Sequence[Scan]) -> float:
 
 
 def header(reference: Sequence[Scan], judge: Judge) -> str:
-    """The table's head, in the order of ``rows``."""
+    """The head of the table and its first row, real against real, in the order of ``rows``."""
     scores = _scores(reference[:2], reference[2:4], judge, progress=False)
     names = [f"{score.metric} ({score.protocol})" for score in scores]
     return f"| scans | {' | '.join(names)} | mIoU with the town segmenter, % |\n|---|{'---:|' * (len(names) + 1)}"
 
 
 def _scores(reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge, progress: bool = True) -> list[Score]:
-    """By R2Flow's measures on the town's grid, by the segmenter's features, and by LiDM's measures."""
+    """R2Flow's measures on the town's grid, distances of the segmenter's features, and LiDM's measures."""
     own = evaluate(reference, scans, "town", {"the town segmenter": judge.features}, progress=progress)
     return own + evaluate(reference, scans, "lidm", progress=progress)
 
 
 def picture(path: Path, scans: Sequence[Scan], title: str) -> None:
-    """A sheet of scans as a PNG of few colours: small enough for a repository."""
+    """Write a sheet of scans as a PNG with few colours, small enough for a repository."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_view(path, list(scans), title=title)
     shrink(path)
 
 
 def near(path: Path, scans: Sequence[Scan], reference: Sequence[Scan]) -> None:
-    """Fewer scans, from nearer by: generated ones on the left, the town's on the right."""
+    """Write an enlarged sheet of fewer scans: generated ones on the left, the town's on the right."""
     pairs = zip(scans, reference, strict=True)
     seen = [[render(scan, "label", camera=NEAR, size=(900, 480), boxes=False) for scan in pair] for pair in pairs]
     Image.fromarray(np.vstack([np.hstack(pair) for pair in seen])).save(path)
@@ -164,40 +164,40 @@ def near(path: Path, scans: Sequence[Scan], reference: Sequence[Scan]) -> None:
 
 
 def shrink(path: Path) -> None:
-    """Fewer pixels and colours in a PNG."""
+    """Reduce the pixels and colours of a PNG."""
     image = Image.open(path).convert("RGB")
     width = 1500
     image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
-    # Few cells are cars or poles: a palette by number of pixels would lose their colours, one by coverage alone the
-    # background's.
+    # Few cells are cars or poles: a palette by number of pixels would lose their colours, a palette by coverage
+    # alone those of the background.
     image.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]]")
-    parser.add_argument("--count", type=int, default=512, help="scans of every row")
+    parser.add_argument("--count", type=int, default=512, help="scans in each row")
     parser.add_argument("--pictures", type=Path, help="folder for sheets of the first model and of the town")
     given = parser.parse_args()
 
     judge = load_judge()
     reference = town(REFERENCE, given.count)
     other = town(OTHER, given.count)
-    lines = [rows("another town", reference, other, judge)]
+    lines = [rows("real against real (lower bound)", reference, other, judge)]
     for i, text in enumerate(given.models):
-        name, asked = text.split("=", 1)
-        model, steps, *led = asked.split(":") if ":" in asked else (asked, "")
+        name, spec = text.split("=", 1)
+        model, steps, *guidance = spec.split(":") if ":" in spec else (spec, "")
         if steps == "0":
             scans = drawn_again(model, other)
         else:
-            scans = generate(model, int(steps) if steps else None, given.count, *led)
+            scans = generate(model, int(steps) if steps else None, given.count, *guidance)
         lines.append(rows(name, reference, scans, judge))
         if i == 0 and given.pictures:
             apart = np.linspace(0, given.count - 1, TILES).astype(int)
-            picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans that were not chosen")
+            picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans, not selected")
             picture(given.pictures / "town.png", [reference[k] for k in apart], f"{TILES} scans of the town")
             near(given.pictures / "near.png", scans[:CLOSE], [reference[k] for k in apart[:CLOSE]])
-    print(f"{given.count} scans a row, {given.count} of the town\n\n{header(reference, judge)}")
+    print(f"{given.count} scans per row, {given.count} of the town\n\n{header(reference, judge)}")
     print("\n".join(line for line, _ in lines))
     columns = (*CLASSES, "bend of walls, %")
     print(f"\n| IoU with the segmenter, % | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")

@@ -1,11 +1,11 @@
-"""Does it help, and how much of it? mIoU of a segmenter over the share of synthetic scans in its training.
+"""Which ratio helps? mIoU of a segmenter over the share of synthetic scans in its training.
 
     python tools/ratio_curve.py [ROOT] [--model town] [--labelled 40] [--epochs 20] [--seeds 3] [--plot OUT.png]
 
-A few labelled scans of the town (or of ROOT, SemanticKITTI for instance) are given in every epoch; synthetic scans are
-added until they make 10, 25 and 50 % of the samples, so that these runs take more iterations. "real, as long" trains
-on the real scans alone for as many iterations as the longest of them. Every row is run with several seeds of the
-weights, the order and the choice of synthetic scans; held out is another town (or the split val of ROOT).
+Every epoch has a few labelled scans of the town (or of ROOT, SemanticKITTI for instance). Synthetic scans are added up
+to 10, 25 and 50 % of the samples, so these runs have more iterations. "real, as long" trains on the real scans alone
+for as many iterations as the longest of them. Every row is run with several seeds of the weights, the order and the
+synthetic scans. Another town (or the split val of ROOT) is held out.
 """
 
 import argparse
@@ -25,8 +25,8 @@ BATCH = 4
 
 
 def run(real: Source, synthetic: list[Scan], ratio: float, steps: int, held_out: Source, seed: int) -> np.ndarray:
-    """The confusion of one training."""
-    # Of the synthetic scans, every seed gets others.
+    """The confusion matrix of one training."""
+    # Every seed gets other synthetic scans.
     apart = np.random.default_rng(seed).permutation(len(synthetic))
     source = [synthetic[i] for i in apart] if ratio else None
     mixed = MixedScans(real, source, ratio, seed=seed, collate="range")
@@ -35,7 +35,7 @@ def run(real: Source, synthetic: list[Scan], ratio: float, steps: int, held_out:
 
 
 def plot(path: Path, rows: dict[str, list[float]]) -> None:
-    """Means and spreads."""
+    """Plot the means and standard deviations."""
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
@@ -51,9 +51,9 @@ def plot(path: Path, rows: dict[str, list[float]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("root", nargs="?", help="a labelled dataset; without it the town")
+    parser.add_argument("root", nargs="?", help="a labelled dataset [default: the town]")
     parser.add_argument("--model", default="town")
-    parser.add_argument("--labelled", type=int, default=40, help="real scans that are trained on")
+    parser.add_argument("--labelled", type=int, default=40, help="real scans to train on")
     parser.add_argument("--held-out", type=int, default=200)
     parser.add_argument("--epochs", type=int, default=20, help="over the real scans")
     parser.add_argument("--seeds", type=int, default=3)
@@ -65,7 +65,7 @@ def main() -> None:
         real = [source[int(i)] for i in np.linspace(0, len(source) - 1, given.labelled)]
         held_out = [other[int(i)] for i in np.linspace(0, len(other) - 1, given.held_out)]
     else:
-        # Twenty neighbouring scans share a stretch of road: few scans, but of many stretches.
+        # Twenty neighbouring scans share a stretch of road: a wide interval spreads few scans over many stretches.
         real, held_out = town(0, 10 * given.labelled)[::10], town(1, given.held_out)
     generator, needed = load_generator(given.model), 10 * given.labelled
     synthetic = [generator.scans(0, [i])[0] for i in tqdm(range(needed), desc="synthetic", unit="scan")]

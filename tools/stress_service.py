@@ -1,10 +1,10 @@
-"""Does the rolling bank survive? Processes killed at random, and reads without end while scans are replaced.
+"""Stress the rolling bank: kill its processes at random, and read while scans are replaced.
 
     python tools/stress_service.py [--kills 50] [--reads 100000] [--workers 4] [--seed 0]
 
-A kill hits a worker, the generator or the trainer itself by SIGKILL. Afterwards the trainer has to have ended or gone
-on within the time limit, with an error that names the dead, without a process or a segment of shared memory left and
-without one wrong scan. Linux only: processes are counted in /proc.
+A SIGKILL hits a worker, the generator or the trainer itself. Within the time limit the trainer has to continue or to
+end with an error that names the dead process, without a wrong scan and without leaving a process or a segment of shared
+memory behind. Linux only: processes are counted in /proc.
 """
 
 import argparse
@@ -40,7 +40,7 @@ LIMIT = 60.0
 
 
 def checksum(image: RangeImage) -> int:
-    """CRC-32 of all that a reader gets."""
+    """CRC-32 of all arrays that a reader gets."""
     value = zlib.crc32(image.range.data)
     for name in sorted(image.channels):
         value = zlib.crc32(np.ascontiguousarray(image.channels[name]).data, value)
@@ -48,7 +48,7 @@ def checksum(image: RangeImage) -> int:
 
 
 def known_checksums(model: Path) -> list[int]:
-    """The checksums of scans 0 .. SCANS - 1, straight from the generator."""
+    """The checksums of scans 0 .. SCANS - 1, directly from the generator."""
     generator = load_generator(model)
     encoding = Encoding(generator.sensor, generator.fields)
     images = (generator.range_images(0, [number])[0] for number in range(SCANS))
@@ -56,7 +56,7 @@ def known_checksums(model: Path) -> list[int]:
 
 
 class Reads(Dataset[int]):
-    """Reads in an order in which every slot is rewritten soon; an item is 1 where the scan was wrong."""
+    """Reads in an order that soon rewrites every slot; an item is 1 if the scan was wrong."""
 
     def __init__(self, bank: RollingBank, known: list[int], count: int) -> None:
         rng = np.random.default_rng(0)
@@ -77,7 +77,7 @@ def loader(bank: RollingBank, known: list[int], reads: int, workers: int) -> Dat
 
 
 def train(model: Path, known: list[int], workers: int) -> None:
-    """A trainer that reads on and on; says on its output what it meets."""
+    """A trainer that reads without end and prints the errors that it meets."""
     bank = RollingBank(model, slots=16, threads=1, timeout=LIMIT / 3)
     for reads in (10**6, 320):  # after the death of a worker the same bank serves the next loader
         batches = iter(loader(bank, known, reads, workers))
@@ -91,13 +91,13 @@ def train(model: Path, known: list[int], workers: int) -> None:
         except LidarSynthError as error:
             raise SystemExit(f"{type(error).__name__}: {error}") from None
         except RuntimeError as error:
-            print(f"went on after: {error}".replace("\n", " "), flush=True)
+            print(f"continued after: {error}".replace("\n", " "), flush=True)
             del batches
     print(json.dumps(bank.counts()), flush=True)
 
 
 def living(session: int) -> list[int]:
-    """The processes of a session that are not dead."""
+    """The living processes of a session."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -110,7 +110,7 @@ def living(session: int) -> list[int]:
 
 
 def kill_one(model: Path, known: list[int], victim: str, rng: random.Random) -> str:
-    """One trainer, one kill; what is wrong with the outcome, "" for nothing."""
+    """One trainer, one kill; returns what is wrong with the outcome, or ""."""
     call = [sys.executable, __file__, "--trainer", str(model), "--known", json.dumps(known), "--workers", "2"]
     trainer = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     assert trainer.stdout is not None
@@ -141,7 +141,7 @@ def kill_one(model: Path, known: list[int], victim: str, rng: random.Random) -> 
 
 
 def main() -> None:
-    """Prints what was found; exit code 1 where something was wrong."""
+    """Prints the outcome; exits with 1 if anything was wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--reads", type=int, default=100_000)

@@ -1,10 +1,10 @@
-"""Runs the tests of files and banks on the lowest versions of the dependencies that pyproject.toml declares.
+"""Run the tests of files and banks on the lowest versions of the dependencies that pyproject.toml declares.
 
     python tools/test_lowest_versions.py [--venv FOLDER] [TESTS...]
 
-It makes a virtual environment of its own, installs exactly those versions there, and takes everything else, which is
-torch, open3d and what only the tests need, from the environment that runs it: their lowest versions are gigabytes of
-CUDA libraries, or have no build for a processor alone. The table at the end says which versions were really at work.
+The script makes its own virtual environment and installs exactly those versions in it. Everything else (torch, open3d
+and the libraries that only the tests need) comes from the environment that runs the script: their lowest versions need
+gigabytes of CUDA libraries, or have no build for CPUs. The table at the end lists the versions that were used.
 """
 
 import argparse
@@ -37,7 +37,7 @@ def lowest() -> dict[str, str]:
 
 
 def install(folder: Path, wanted: dict[str, str]) -> Path:
-    """An environment with these versions before those of this one; its Python."""
+    """Make an environment in which these versions take precedence over the current ones; returns its Python."""
     venv.create(folder, with_pip=True, clear=True)
     python = folder / "bin" / "python"
     pins = [f"{name}=={text}" for name, text in wanted.items()]
@@ -52,20 +52,22 @@ def install(folder: Path, wanted: dict[str, str]) -> Path:
 def main() -> None:
     """Installs, tests, prints the table; the exit status is that of pytest."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--venv", type=Path, default=ROOT / ".venv-lowest", help="the environment's folder, made anew")
-    parser.add_argument("tests", nargs="*", help="test files, instead of those of files and banks")
+    parser.add_argument(
+        "--venv", type=Path, default=ROOT / ".venv-lowest", help="folder of the environment, which is replaced"
+    )
+    parser.add_argument("tests", nargs="*", help="test files [default: those of files and banks]")
     options = parser.parse_args()
     wanted = {name: text for name, text in lowest().items() if name not in KEPT}
     python = install(options.venv.absolute(), wanted)
     tests = options.tests or [f"tests/{name}" for name in TESTS if (ROOT / "tests" / name).exists()]
-    told = subprocess.run(
+    versions = subprocess.run(
         [python, "-c", "import sys; from importlib.metadata import version\n"
          "for name in sys.argv[1:]: print(version(name))", *wanted], check=True, capture_output=True, text=True,
     ).stdout.split()  # fmt: skip
     environment = os.environ | {"NUMBA_CACHE_DIR": str(options.venv.absolute() / "numba")}
     done = subprocess.run([python, "-m", "pytest", *tests], cwd=ROOT, env=environment, check=False)
     print(f"\nPython {sys.version.split()[0]}\n\n| dependency | declared from | tested |\n|---|---|---|")
-    for name, text in zip(wanted, told, strict=True):
+    for name, text in zip(wanted, versions, strict=True):
         print(f"| {name} | {wanted[name]} | {text} |")
     for name in KEPT:
         print(f"| {name} | {lowest()[name]} | {version(name)}: not at its lowest version, see above |")

@@ -1,4 +1,4 @@
-"""The pictures of docs/town.md: streets from above, what the camera sees, one scan as a sheet.
+"""Make the images of docs/town.md: streets from above, camera images, one scan as a sheet.
 
 python tools/town_pictures.py [OUT]            (OUT = docs/town)
 """
@@ -22,7 +22,7 @@ SIZE = (510, 330)
 
 
 def stretches(town: Town) -> list[int]:
-    """The first scan of a stretch of each kind of street, and of one more."""
+    """The number of the first scan of a stretch of each kind of street, and of one more stretch."""
     first: dict[str, int] = {}
     for k in range(40):
         first.setdefault(town.world(k * STRETCH_FRAMES).street.kind, k * STRETCH_FRAMES)
@@ -41,7 +41,7 @@ def from_above(town: Town, index: int) -> np.ndarray:
     right = np.cross(ahead, up)
     right /= np.linalg.norm(right)
     width, height = SIZE
-    # Four rays per pixel, as a plain way against jagged edges.
+    # Four rays per pixel against jagged edges.
     x, y = np.meshgrid((np.arange(2 * width) + 0.5) / width - 1, (np.arange(2 * height) + 0.5) / width - height / width)
     rays = ahead + 0.62 * (x[..., None] * right - y[..., None] * np.cross(right, ahead))
     rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
@@ -52,7 +52,7 @@ def from_above(town: Town, index: int) -> np.ndarray:
 
 
 def save(path: Path, pixels: np.ndarray, width: int, colours: int) -> None:
-    """A PNG of few colours and a given width: small enough for a repository."""
+    """Write a PNG with few colours and a given width, small enough for a repository."""
     image = Image.fromarray(pixels)
     image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
     image.quantize(colours, Image.Quantize.FASTOCTREE if colours > 128 else None, dither=Image.Dither.NONE).save(
@@ -61,7 +61,7 @@ def save(path: Path, pixels: np.ndarray, width: int, colours: int) -> None:
 
 
 def main() -> None:
-    """Writes the three pictures."""
+    """Writes the three images."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", nargs="?", type=Path, default=Path("docs/town"))
     out: Path = parser.parse_args().out

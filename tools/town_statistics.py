@@ -1,9 +1,9 @@
-"""The town beside real KITTI-360 scans: angles, ranges, reflectance and missing returns in one markdown table.
+"""Compare the town with real KITTI-360 scans: angles, ranges, reflectance and missing returns in one Markdown table.
 
     LIDAR_SYNTH_REAL_SCANS=FOLDER python tools/town_statistics.py [--scans 120] [--seed 0]
 
-FOLDER holds ``kitti360`` in the dataset's own layout. Without the variable the town stands alone. Every figure is a
-mean over scans; both sides are projected onto the same 64 x 1024 range image.
+FOLDER contains ``kitti360`` in the dataset's own layout. Without the variable the table has the town only. Every figure
+is a mean over scans; both sides are projected onto the same 64 x 1024 range image.
 """
 
 import argparse
@@ -47,7 +47,7 @@ def statistics(scan: Scan) -> dict[str, float]:
     figures = {"cells filled of 65,536": filled.sum()}
     for a, b in GROUPS:
         figures[f"empty cells, rows {a} to {b - 1}"] = 1 - filled[a:b].mean()
-    # A row that no beam meets is empty for another reason than a lost ray.
+    # A row that no beam reaches is empty, but not because returns were lost.
     lost = ~filled[:, 1:-1] & filled[:, :-2] & filled[:, 2:]
     figures["single lost cells (both neighbours filled)"] = lost.mean()
     elevation = np.degrees(np.arcsin(scan.points[:, 2] / distance))
@@ -86,7 +86,7 @@ def gather(scans: Iterable[Scan], count: int, name: str) -> dict[str, np.ndarray
 
 
 def number(value: float) -> str:
-    """Three digits that matter, large numbers whole."""
+    """A number with three significant digits; large numbers as integers."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.3f}"
 
 
@@ -96,7 +96,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=120, help="scans of the town, spread over stretches")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    # Three scans of each stretch: neighbours are alike, and a stretch has to be built for each.
+    # Three scans of each stretch: neighbouring scans are similar, and building a stretch takes time.
     stretches = -(-arguments.scans // 3)
     town = Town(arguments.seed, scans=STRETCH_FRAMES * stretches)
     picked = [STRETCH_FRAMES * k + f for k in range(stretches) for f in (2, 9, 16)][: arguments.scans]

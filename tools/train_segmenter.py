@@ -1,10 +1,10 @@
-"""A segmenter on your scans, with synthetic scans among them: does it help?
+"""Train a segmenter on real scans mixed with synthetic ones, and measure it on held-out scans.
 
     python tools/train_segmenter.py [ROOT] [--split train] [--val-split val] [--ratio 0.25] [--model town]
         [--steps 400] [--batch 4] [--workers 0] [--seed 0] [--save FILE.safetensors]
 
-Without ROOT, scans of the town stand for the real ones, and scans of another town are held out. ROOT is any dataset
-with labels per scan, SemanticKITTI for instance. The loop itself stands in lidar_synth/train/segmentation.py.
+Without ROOT, scans of the town take the place of real ones, and scans of another town are held out. ROOT is any dataset
+with labels per scan, SemanticKITTI for instance. The training loop is in lidar_synth/train/segmentation.py.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from lidar_synth.train.segmentation import endless_batches, train_segmenter
 
 
 def town(seed: int, count: int) -> list[Scan]:
-    """Scans of one town, a second apart, held in memory: a town is fast in order and slow in any other."""
+    """Scans of one town, a second apart, kept in memory: a town is fast to read in order only."""
     source = Town(seed, scans=count, interval=1.0)
     return [source[i] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
 
@@ -31,7 +31,7 @@ def town(seed: int, count: int) -> list[Scan]:
 def fit(
     train: MixedScans, validation: Source, steps: int, batch: int, workers: int, seed: int
 ) -> tuple[Judge, np.ndarray]:
-    """A trained segmenter and its confusion on held-out scans."""
+    """A trained segmenter and its confusion matrix on held-out scans."""
     torch.manual_seed(seed)
     sensor = train.collate.sensor
     height = torch.from_numpy(np.sin(sensor.ray_angles()[0]))
@@ -45,13 +45,13 @@ def fit(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("root", nargs="?", help="a labelled dataset; without it the town")
+    parser.add_argument("root", nargs="?", help="a labelled dataset [default: the town]")
     parser.add_argument("--split", default="train")
     parser.add_argument("--val-split", default="val")
-    parser.add_argument("--scans", type=int, default=400, help="of the town")
-    parser.add_argument("--held-out", type=int, default=200, help="of another town")
+    parser.add_argument("--scans", type=int, default=400, help="scans of the town")
+    parser.add_argument("--held-out", type=int, default=200, help="held-out scans, of another town")
     parser.add_argument("--ratio", type=float, default=0.0, help="share of synthetic scans")
-    parser.add_argument("--model", default="town", help="that makes them")
+    parser.add_argument("--model", default="town", help="model of the synthetic scans")
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--workers", type=int, default=0)

@@ -1,8 +1,8 @@
-"""Trains stock PointPillars and FRNet for a few iterations on a real and synthetic mixture and prints the losses.
+"""Train stock PointPillars and FRNet for a few iterations on real and synthetic scans, and print the losses.
 
-The synthetic scans are the town's. The real ones are those of KITTI's and SemanticKITTI's folders that are given, which
-are copied, or other scans of the town in their layouts. So this shows that the trainer takes the mixture, not that it
-helps. Run by ``try_mmdet3d.sh``.
+The synthetic scans are from the town. The real ones are copied from the given folders of KITTI and SemanticKITTI;
+without folders they are other scans of the town in these layouts. This shows that the trainer accepts the mixture, not
+that the mixture helps. ``try_mmdet3d.sh`` runs it.
 """
 
 import argparse
@@ -43,12 +43,12 @@ class Report(Hook):  # type: ignore[misc]
 
 
 def prepare(out: Path, scans: int, real: dict[str, Path | None]) -> None:
-    """Datasets, lists and GT database under ``out``; ``real`` has a folder, or none, for each layout."""
+    """Write datasets, lists and the GT database to ``out``; ``real`` has a folder or None for each layout."""
     for layout, given in real.items():
         if given is None:
             export_town(Town(seed=1, scans=scans), out / layout, layout, camera=False)
         else:
-            shutil.copytree(given, out / layout)  # planes and what a camera sees are written beside the scans
+            shutil.copytree(given, out / layout)  # planes and points in the camera's view are written beside the scans
     made = out / "synthetic"
     convert(Town(seed=2, scans=scans), WRITERS["npz"](made))
     settings = {"synthetic": made, "ratio": 0.5, "seed": 0}
@@ -94,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="folder for the scans")
     parser.add_argument("--iterations", type=int, default=4)
-    parser.add_argument("--scans", type=int, default=8, help="of the town, of each kind")
+    parser.add_argument("--scans", type=int, default=8, help="scans of the town, real and synthetic each")
     parser.add_argument("--kitti", type=Path, help="KITTI's object set, with training and ImageSets")
     parser.add_argument("--semantic-kitti", type=Path, help="SemanticKITTI's dataset, with sequences")
     parser.add_argument("--batch-size", type=int, default=2)

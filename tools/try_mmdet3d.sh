@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # Trains stock PointPillars (KITTI) and FRNet (SemanticKITTI) for a few iterations on the CPU, on a mixture of real scans
-# and the town's; without --kitti and --semantic-kitti another town takes the place of the real ones.
+# and scans of the town. Without --kitti and --semantic-kitti, another town takes the place of the real scans.
 #
 #   bash tools/install_mmdet3d.sh .venv --ops
 #   FRNET_ROOT=/path/to/FRNet bash tools/try_mmdet3d.sh .venv OUT [--iterations 4] [--scans 8] [--batch-size 2] \
 #       [--kitti /data/kitti] [--semantic-kitti /data/SemanticKITTI/dataset]
 #
-# FRNet is a repository of its own (github.com/Xiangxu-0103/FRNet). Where torch_scatter is not installed, tools/stand_ins
-# has the two functions of it that FRNet calls.
+# FRNet has its own repository (github.com/Xiangxu-0103/FRNet). If torch_scatter is not installed, tools/stand_ins provides
+# the two functions of it that FRNet calls.
 set -euo pipefail
 
 venv="${1:?usage: try_mmdet3d.sh VENV OUT [OPTIONS]}"

@@ -1,10 +1,10 @@
-"""How fast the networks of LiDAR-Flow's latent models are at full size, beside a plain large matrix product.
+"""Speed of the networks of LiDAR-Flow's latent models at full size, against a large matrix product.
 
     python tools/bench/latent.py [--rounds N] [--threads N] [--busy]
 
 LiDM's U-Net (257.8 M parameters, 171.7 GFLOP) on a latent of 8 x 16 x 128, its autoencoder (15.1 M; 93 GFLOP to encode
-and 120 to decode) at 64 x 1024, and the small ones of configs/town_*.yaml. Random weights. Everything takes turns with
-everything else. With --busy processor time is counted in place of the clock's, for a machine that does other things.
+and 120 to decode) at 64 x 1024, and the small ones of configs/town_*.yaml. Random weights. All measurements take turns.
+With --busy, processor time replaces wall-clock time, for a machine that does other work.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from lidar_synth.models import assemble, build_network
 
 
 def network(architecture: str, **arguments: Any) -> Any:
-    """With fresh weights, laid out in memory as a checkpoint's are."""
+    """A network with random weights, in the memory layout of a loaded checkpoint."""
     torch.manual_seed(0)
     fresh: nn.Module = build_network(architecture, arguments)
     return assemble(architecture, arguments, fresh.state_dict(), architecture)
@@ -31,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--busy", action="store_true", help="count processor time")
+    parser.add_argument("--busy", action="store_true", help="measure processor time")
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     full, codec = network("unet", resolution=(16, 128)), network("vqvae", resolution=(64, 1024))

@@ -1,11 +1,11 @@
-"""What mixing costs: samples per second of a mixed dataset beside those of the wrapped dataset alone.
+"""The cost of mixing: samples per second of a mixed dataset, and of the wrapped dataset alone.
 
     python tools/bench/mixing.py [--real SEMANTICKITTI_ROOT] [--scans 32] [--rounds 40]
 
-Targets: at ratio 0 at least 97 % of the dataset alone; from a bank at ratio 0.5 at least 90 % of real scans only, when
-both give the same output. Without ``--real``, the real scans are the town's, written as SemanticKITTI; the bank holds
-scans of the town. One process, so that nothing hides behind workers, and its processor time, so that other programs do
-not count; caches of the file system are warm.
+Targets: at ratio 0 at least 97 % of the dataset alone; from a bank at ratio 0.5 at least 90 % of real scans only, with
+the same output. Without ``--real``, the real scans are the town's, written as SemanticKITTI; the bank holds
+scans of the town. One process, so that workers hide nothing; processor time, so that other programs do not count. The
+caches of the file system are warm.
 """
 
 import argparse
@@ -34,7 +34,7 @@ BATCH = 4
 
 
 class Trainer:
-    """A trainer's own dataset: reads a scan and makes of it what the trainer wants."""
+    """A trainer's own dataset: reads a scan and makes the trainer's sample."""
 
     def __init__(self, scans: Source) -> None:
         self.scans = scans
@@ -79,14 +79,14 @@ def epoch(samples: Any, order: Sequence[int], collate: Callable[[list[Any]], Any
 
 
 def print_rates(title: str, samples: int, seconds: dict[str, float], base: str) -> None:
-    """A Markdown table of samples per second and of shares of one of the rows."""
+    """Print a Markdown table of samples per second, also relative to one of the rows."""
     print(f"\n### {title}\n\n{machine()}\n\n| what | samples/s | share of '{base}' |\n|---|---:|---:|")
     for name, value in seconds.items():
         print(f"| {name} | {samples / value:.1f} | {seconds[base] / value:.1%} |")
 
 
 def print_long_plan(bank: Bank, samples: int = 10**8) -> None:
-    """A Markdown line: how long a plan takes to its first batch, and the most memory that Python held meanwhile."""
+    """Print the time of a long plan to its first batch, and Python's peak memory meanwhile."""
     start = time.perf_counter()
     train = MixedScans.wrap(range(samples * 3 // 4), bank, 0.25, to_sample=to_item)
     next(iter(train.batches(BATCH)))
@@ -107,7 +107,7 @@ def main() -> None:
     """Times everything in turns and prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--real", type=Path, help="root of SemanticKITTI")
-    parser.add_argument("--scans", type=int, default=32, help="of each kind")
+    parser.add_argument("--scans", type=int, default=32, help="scans, real and synthetic each")
     parser.add_argument("--rounds", type=int, default=100)
     arguments = parser.parse_args()
     torch.set_num_threads(1)

@@ -1,11 +1,12 @@
-"""How fast the full HDiT (80.9 M parameters) evaluates at 64 x 1024, beside a plain large matrix product.
+"""Speed of the full HDiT (80.9 M parameters) at 64 x 1024, against a large matrix product.
 
     python tools/bench/networks.py [--rounds N] [--threads N] [--model FILE.safetensors]
 
-On a CPU: seconds of one evaluation, its share of the rate of the product, where the time goes, peak memory. On a
-GPU: scans per second by batch, latency of one scan, share of the product's rate, what bfloat16 and TF32 change.
-Rates count the operations that the network needs, not those that an implementation spends. The weights are random
-unless a checkpoint of the same size is given; a difference in metres says something only with trained ones.
+On a CPU: seconds of one evaluation, its rate relative to the product's, a profile by kind of operation, peak memory. On
+    a
+GPU: scans per second by batch, latency of one scan, rate relative to the product's, the errors of bfloat16 and TF32.
+Rates count the operations that the network needs, not those of an implementation. The weights are random unless a
+checkpoint of the same size is given; errors in metres are meaningful only with trained ones.
 """
 
 import argparse
@@ -45,7 +46,7 @@ KINDS = {
 
 
 def full_network(model: Path | None) -> nn.Module:
-    """The checkpoint's network, or one with random weights none of which is zero."""
+    """The checkpoint's network, or one with random nonzero weights."""
     if model is not None:
         return load_checkpoint(model).networks[VELOCITY]
     torch.manual_seed(0)
@@ -91,27 +92,27 @@ def on_cpu(net: nn.Module, rounds: int) -> None:
 
 
 def breakdown(net: nn.Module, y: Tensor) -> None:
-    """A table of where the time goes, by kind of operation."""
+    """Print the share of each kind of operation in the time."""
     with profile(activities=[ProfilerActivity.CPU]) as profiler:
         net(y, 0.5)
     spent: dict[str, float] = defaultdict(float)
     for event in profiler.key_averages():
         name = event.key.removeprefix("aten::").lstrip("_")
-        kind = next((k for k, names in KINDS.items() if any(name.startswith(n) for n in names)), "all else")
+        kind = next((k for k, names in KINDS.items() if any(name.startswith(n) for n in names)), "other")
         spent[kind] += event.self_cpu_time_total
-    print("\n| where the time goes | share |\n|---|---:|")
+    print("\n| kind of operation | share of the time |\n|---|---:|")
     for kind in sorted(spent, key=lambda k: -spent[k]):
         print(f"| {kind} | {spent[kind] / sum(spent.values()):.1%} |")
 
 
 def peak_memory() -> float:
-    """GB of a fresh process, all of Python and torch included."""
+    """Peak memory of a fresh process in GB, including Python and torch."""
     out = subprocess.run([sys.executable, __file__, "--peak"], check=True, capture_output=True, text=True)
     return float(out.stdout)
 
 
 def on_cuda(net: nn.Module, rounds: int) -> None:
-    """Throughput and latency of 4 steps in bfloat16, then what less precision changes."""
+    """Print throughput and latency of 4 steps in bfloat16, then the errors of lower precision."""
     card = torch.cuda.get_device_name()
     a = torch.randn(8192, 8192, device="cuda", dtype=torch.bfloat16)
     a @ a
@@ -127,7 +128,7 @@ def on_cuda(net: nn.Module, rounds: int) -> None:
         noise = torch.randn(batch, 2, 64, 1024, device="cuda")
         torch.compiler.reset()
         torch.cuda.reset_peak_memory_stats()
-        fast = torch.compile(half, mode="reduce-overhead")  # CUDA graphs: no launch of single kernels
+        fast = torch.compile(half, mode="reduce-overhead")  # CUDA graphs: kernels are not launched singly
         times = []
         for velocity in (half, fast):
             for _ in range(3):
@@ -142,7 +143,7 @@ def on_cuda(net: nn.Module, rounds: int) -> None:
 
 
 def precision(net: nn.Module, half: nn.Module) -> None:
-    """How far scans move from those in float32, from the same noise."""
+    """Print the differences of scans from those in float32, from the same noise."""
     noise = torch.randn(4, 2, 64, 1024, device="cuda")
     scans = {}
     torch.backends.cuda.matmul.allow_tf32 = False
@@ -159,12 +160,12 @@ def precision(net: nn.Module, half: nn.Module) -> None:
 
 
 def main() -> None:
-    """Prints the tables that this machine can give."""
+    """Prints the tables for the devices of this machine."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--model", type=Path, help="a checkpoint with a network of this size")
-    parser.add_argument("--peak", action="store_true", help="evaluate once and print the peak of memory in GB")
+    parser.add_argument("--peak", action="store_true", help="evaluate once and print the peak memory in GB")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     torch.set_grad_enabled(False)
@@ -173,7 +174,7 @@ def main() -> None:
         scale = 1 if sys.platform == "darwin" else 1024
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * scale / 1e9)
         return
-    peak = peak_memory()  # first of all: a child's peak begins with the memory of its parent
+    peak = peak_memory()  # first, because a child's peak starts with the memory of its parent
     net = full_network(options.model)
     on_cpu(net, options.rounds)
     print(f"\nPeak memory of a process that does one evaluation: {peak:.2f} GB (weights: 0.32 GB).")

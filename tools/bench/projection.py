@@ -1,8 +1,8 @@
-"""How fast points become a range image and back, on one core.
+"""Speed of projecting points to a range image and back, on one core.
 
     python tools/bench/projection.py [SCAN.bin]
 
-SCAN.bin is any KITTI or KITTI-360 scan; without one, a random scan of 120,000 points.
+SCAN.bin is any KITTI or KITTI-360 scan; the default is a random scan of 120,000 points.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Side-by-side timing for the benchmark scripts: what stands in one table was measured in one run, in turns."""
+"""Timing for the benchmark scripts: all rows of a table are measured in one run, in turns."""
 
 import platform
 import time
@@ -13,9 +13,9 @@ from tqdm import tqdm
 def time_in_turns(
     calls: Mapping[str, Callable[[], object]], rounds: int = 60, clock: Callable[[], float] = time.perf_counter
 ) -> dict[str, float]:
-    """Median seconds of each call; the calls take turns, so that a noisy machine is noisy for all of them.
+    """Median seconds of each call; the calls take turns, so that other load affects all of them alike.
 
-    On a machine that is busy with other things, ``clock=time.process_time`` counts this process's work only.
+    On a busy machine, ``clock=time.process_time`` measures only the work of this process.
     """
     for call in calls.values():
         call()
@@ -29,7 +29,7 @@ def time_in_turns(
 
 
 def machine() -> str:
-    """One line on what this ran on: processor, cores, AVX-512, Python and numpy."""
+    """A line that describes the machine: processor, cores, AVX-512, Python and numpy."""
     info = Path("/proc/cpuinfo")
     text = info.read_text() if info.exists() else ""
     model = next((line.split(":")[1].strip() for line in text.splitlines() if line.startswith("model name")), "")
@@ -42,7 +42,7 @@ def machine() -> str:
 
 
 def print_table(title: str, seconds: Mapping[str, float], base: str) -> None:
-    """A Markdown table of milliseconds and of ratios to one of the rows."""
-    print(f"\n### {title}\n\n{machine()}\n\n| what | ms | times '{base}' |\n|---|---:|---:|")
+    """Print a Markdown table of milliseconds, and of ratios to one of the rows."""
+    print(f"\n### {title}\n\n{machine()}\n\n| operation | ms | ratio to '{base}' |\n|---|---:|---:|")
     for name, value in seconds.items():
         print(f"| {name} | {1e3 * value:.3f} | {value / seconds[base]:.2f} |")

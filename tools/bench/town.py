@@ -1,15 +1,15 @@
-"""How fast the town makes scans: the parts of one on one core, and whole scans by as many processes as there are cores.
+"""Speed of the town: the parts of a scan on one core, and complete scans by one process per core.
 
     python tools/bench/town.py [--stretches 10] [--jobs 2]
 
-The town's target is 30 scans per second on 2 cores at 64 x 1024, labels and boxes included, pictures not.
+The town's target is 30 scans per second on 2 cores at 64 x 1024, with labels and boxes, without images.
 """
 
 import argparse
 import os
 import time
 
-# Before numpy is imported: one process per core does the work, and threads inside numpy would fight for the cores.
+# Set before numpy is imported: one process per core does the work, and numpy's threads would compete for the cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import multiprocessing
@@ -32,11 +32,14 @@ def make(stretches: list[int]) -> tuple[float, float]:
     return time.process_time() - used, time.perf_counter() - clock
 
 
+PARTS = ("sample and build the stretch", "its Embree BVH", "ray casting, returns, boxes", "image")
+
+
 def parts(stretches: int) -> dict[str, float]:
     """Seconds of processor time of each part, per scan."""
     town = Town(0, scans=10**6)
     town[10**6 - 1]
-    used = dict.fromkeys(("draw and build the stretch", "Embree's tree of it", "cast, measure, box", "picture"), 0.0)
+    used = dict.fromkeys(PARTS, 0.0)
     for k in range(stretches):
         start = time.process_time()
         world = build_world(0, k, town.interval)
@@ -48,19 +51,19 @@ def parts(stretches: int) -> dict[str, float]:
         for i in range(1, 6):
             town[STRETCH_FRAMES * k + i]
         cast = time.process_time()
-        used["draw and build the stretch"] += (built - start) / STRETCH_FRAMES / stretches
-        used["Embree's tree of it"] += (ready - built) / STRETCH_FRAMES / stretches
-        used["cast, measure, box"] += (cast - begin) / 5 / stretches
+        spent = ((built - start) / STRETCH_FRAMES, (ready - built) / STRETCH_FRAMES, (cast - begin) / 5)
+        for part, seconds in zip(PARTS, spent, strict=False):
+            used[part] += seconds / stretches
     start = time.process_time()
     town.image(0)
-    used["picture"] = time.process_time() - start
+    used["image"] = time.process_time() - start
     return used
 
 
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--stretches", type=int, default=10, help=f"of {STRETCH_FRAMES} scans each")
+    parser.add_argument("--stretches", type=int, default=10, help=f"stretches of {STRETCH_FRAMES} scans each")
     parser.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args()
     print(f"64 x 1024, {machine()}, load {os.getloadavg()[0]:.1f}\n")
@@ -68,8 +71,8 @@ def main() -> None:
     used = parts(arguments.stretches)
     for name, seconds in used.items():
         print(f"| {name} | {1e3 * seconds:.1f} |")
-    whole = sum(used.values()) - used["picture"]
-    print(f"| **a scan without picture** | **{1e3 * whole:.1f}** |")
+    whole = sum(used.values()) - used["image"]
+    print(f"| **a scan without image** | **{1e3 * whole:.1f}** |")
     shares = [list(range(j, arguments.stretches, arguments.jobs)) for j in range(arguments.jobs)]
     with multiprocessing.get_context("spawn").Pool(arguments.jobs) as pool:
         results = pool.map(make, shares, chunksize=1)
@@ -77,7 +80,7 @@ def main() -> None:
     seconds = sum(r[0] for r in results)
     rate, clock = arguments.jobs * count / seconds, count / max(r[1] for r in results)
     print(f"\n{count} scans by {arguments.jobs} processes: {1e3 * seconds / count:.1f} ms of processor time each")
-    print(f"{rate:.1f} scans/s on {arguments.jobs} cores of their own; {clock:.1f} scans/s by this machine's clock")
+    print(f"{rate:.1f} scans/s on {arguments.jobs} dedicated cores; {clock:.1f} scans/s of wall-clock time here")
 
 
 if __name__ == "__main__":

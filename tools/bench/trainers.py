@@ -1,8 +1,10 @@
-"""What an adapter adds to a trainer's own loading of a real sample, and what a synthetic sample costs beside it.
+"""The time that an adapter adds to a trainer's loading of a real sample, and the time of a synthetic sample.
 
-Measured in turns by processor time, each trainer in a process of its own: MMDetection3D where it is installed
-(``tools/install_mmdet3d.sh``; stock SemanticKITTI pipeline of points, labels, flip, turn, pack; scans of the town), the
-others where a variable names their checkout, as for the tests, whose small scans make the adapter's share the larger::
+Processor time, measured in turns, each trainer in its own process. MMDetection3D is measured where it is installed
+(``tools/install_mmdet3d.sh``; stock SemanticKITTI pipeline: points, labels, flip, rotation, packing; scans of the
+town). The others are measured where a variable names their checkout, as for the tests, on the small scans of the tests,
+which
+make the adapter's share larger::
 
     OPENPCDET_ROOT=/path/to/OpenPCDet python tools/bench/trainers.py
 """
@@ -31,7 +33,7 @@ VARIABLES = {"openpcdet": "OPENPCDET_ROOT", "pointcept": "POINTCEPT_ROOT", "rang
 
 
 def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
-    """The stock dataset and the mixed one, of the same real scans."""
+    """The stock dataset and the mixed one, with the same real scans."""
     import mmcv_ext
 
     mmcv_ext.install()
@@ -53,14 +55,14 @@ def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
     init_default_scope("mmdet3d")
     config = Config.fromfile(str(Path(__file__).parents[2] / "configs/mmdet3d/minkunet_semantickitti.py"))
     ours = config.train_dataloader.dataset.to_dict() | {"ann_file": str(mixed)}
-    ours["pipeline"] = [*ours["pipeline"][:3], *ours["pipeline"][-2:]]  # without partners drawn at random
+    ours["pipeline"] = [*ours["pipeline"][:3], *ours["pipeline"][-2:]]  # without random partners
     theirs = ours | {"ann_file": str(listed), "data_root": str(root / "real")}
     stock, dataset, slots = DATASETS.build(theirs), DATASETS.build(ours), iter(range(10**9))
     return {OWN: lambda: stock[0], MIXED: lambda: dataset[0], SYNTHETIC: lambda: dataset[SCANS + next(slots) % SCANS]}
 
 
 def of_tests(trainer: str, root: Path) -> dict[str, Callable[[], Any]]:
-    """The same of the datasets that a trainer's tests compare."""
+    """The same for the datasets that a trainer's tests compare."""
     tests = import_module(f"test_integrations_{trainer}")
     own, ours = tests.both(tests.make(root))
     where = [next(i for i in range(len(ours)) if ours.mixed.domain(i) == domain) for domain in (0, 1)]
@@ -71,7 +73,7 @@ def of_tests(trainer: str, root: Path) -> dict[str, Callable[[], Any]]:
 
 
 def main() -> None:
-    """Prints a table for each trainer that is there, or of the one that is named."""
+    """Prints a table for each installed trainer, or for the one that is named."""
     if sys.argv[1:]:
         with tempfile.TemporaryDirectory() as folder:
             calls = mmdet3d(Path(folder)) if sys.argv[1] == "mmdet3d" else of_tests(sys.argv[1], Path(folder))
@@ -81,7 +83,7 @@ def main() -> None:
         if os.environ.get(VARIABLES[trainer]) if trainer in VARIABLES else find_spec(trainer):
             subprocess.run([sys.executable, __file__, trainer], check=True)
         else:
-            print(f"{trainer} is not there (docs/trainers.md): not measured")
+            print(f"{trainer} is not installed (docs/trainers.md): not measured")
 
 
 if __name__ == "__main__":

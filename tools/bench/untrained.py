@@ -1,4 +1,4 @@
-"""A checkpoint with random weights: for what does not depend on what a model has learnt."""
+"""A checkpoint with random weights, to measure what training does not change."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from lidar_synth.models import build_network
 
 
 def write_untrained(path: Path) -> Path:
-    """A small, quick network of one step for 64 x 1024 scans with reflectance and labels; returns its path."""
+    """Write a small, fast network of one step for 64 x 1024 scans with reflectance and labels; returns its path."""
     sensor = load_sensor("hdl64e_kitti360")
     arguments = {
         "resolution": sensor.shape, "channels": sum(CHANNELS.values()), "width": 16, "time_width": 16,
@@ -20,7 +20,7 @@ def write_untrained(path: Path) -> Path:
     torch.manual_seed(0)
     network = build_network("hdit", arguments | {"angles": torch.from_numpy(sensor.ray_angles())})
     for parameter in network.parameters():
-        torch.nn.init.normal_(parameter, std=0.2)  # a fresh network answers zero
+        torch.nn.init.normal_(parameter, std=0.2)  # the output of a fresh network is zero
     header = Header(
         networks={VELOCITY: NetworkSpec("hdit", arguments)}, sensor=sensor, normalisation=NORMALISATIONS["r2flow"],
         channels=tuple(CHANNELS), time_grid=(1.0, 0.0),

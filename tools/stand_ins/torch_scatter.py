@@ -1,5 +1,7 @@
-"""What FRNet calls of torch_scatter, by torch's own operators: that library is source only and takes half an hour to
-compile. Put this folder on PYTHONPATH to try FRNet without it; on a GPU install the real one.
+"""The two functions of torch_scatter that FRNet calls, by torch's own operators.
+
+torch_scatter is distributed as source only and takes half an hour to compile. Put this folder on PYTHONPATH to try
+FRNet without it; on a GPU install the real library.
 """
 
 import torch
@@ -9,12 +11,12 @@ from torch import Tensor
 def scatter_max(
     src: Tensor, index: Tensor, dim: int = -1, out: None = None, dim_size: int | None = None
 ) -> list[Tensor]:
-    """The largest value for each index, and nothing in the place of its argument; gradients flow to the first."""
+    """The largest value for each index, and None for its position; gradients flow to the value."""
     return [_reduce(src, index, dim, dim_size, "amax")]
 
 
 def scatter_mean(src: Tensor, index: Tensor, dim: int = -1, out: None = None, dim_size: int | None = None) -> Tensor:
-    """The mean of the values for each index; 0 where there is none."""
+    """The mean of the values for each index; 0 for an index without values."""
     return _reduce(src, index, dim, dim_size, "mean")
 
 
