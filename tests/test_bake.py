@@ -1,6 +1,7 @@
 """Baking: the same bytes by every engine; what cannot be made is refused at once."""
 
 import itertools
+import re
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import torch
 import yaml
 from bakes import COUNT, SIZE, files, plan_in
 from layouts import some_scan, write_all
+from pydantic.fields import FieldInfo
 from test_generator import SENSOR, write
 from typer.testing import CliRunner
 
@@ -162,6 +164,14 @@ def test_engines_whose_library_is_missing(plan: BakePlan, engine: str, monkeypat
 def test_every_engine_is_named_in_the_help() -> None:
     text = CliRunner().invoke(app, ["bake", "--help"]).output
     assert all(engine in text for engine in ENGINES)
+
+
+@pytest.mark.parametrize(("name", "field"), BakeJob.model_fields.items())
+def test_every_setting_is_an_option_with_its_description_and_default(name: str, field: FieldInfo) -> None:
+    text = " ".join(CliRunner().invoke(app, ["bake", "--help"]).output.split())
+    description = f"{field.description}" + ("" if field.default is None else f" [{field.default}]")
+    option = re.escape(f"--{name.replace('_', '-')} ")
+    assert re.search(option + r"(<\w+>|NAME,\.\.\.) " + re.escape(description), text), text
 
 
 # Settings

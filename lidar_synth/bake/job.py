@@ -9,16 +9,16 @@ import platform
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import deflate
 import h5py
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
 
 import lidar_synth
 from lidar_synth.bake.conditions import conditions_for
+from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
 from lidar_synth.errors import ConfigError
@@ -26,56 +26,8 @@ from lidar_synth.flow.solvers import SOLVERS
 from lidar_synth.formats.source import choose
 from lidar_synth.generate.generator import BATCH, load_generator
 
-Count = Annotated[int, Field(ge=1)]
-
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 """What a network may compute in, by name."""
-
-
-class BakeJob(BaseModel):
-    """Settings of a bake; unknown keys are refused.
-
-    Args:
-        model: a shipped model's name or a checkpoint file.
-        count: scans.
-        seed: scan i is a function of the model, the seed and i.
-        first: the index of the first scan; for a bank that shall go on where another one ends.
-        condition: for a conditional model, a dataset whose scans have what it takes: labels, or camera images.
-        condition_layout, condition_split: of that dataset, as ``open_scans`` takes them.
-        guidance: scale of classifier-free guidance, 1 = none.
-        shard_size: scans per file.
-        steps: of a uniform time grid; by default the checkpoint's own grid.
-        solver: a name of ``SOLVERS``.
-        fields: what a scan carries beside its range: reflectance, label, confidence; by default all that the model
-            gives.
-        batch: scans at a time; by default what suits the device.
-        dtype: float32 or bfloat16, what the network computes in.
-        device: cpu or cuda.
-        threads: of torch in each worker, on the CPU. With one, all engines compute alike.
-        compression: gzip or blosc2.
-        layout: plain, or paged for reading over a network.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    model: str = "town"
-    count: Count = 1000
-    seed: int = Field(0, ge=0, lt=2**64)
-    first: int = Field(0, ge=0, lt=2**62)
-    condition: str | None = None
-    condition_layout: str | None = None
-    condition_split: str | None = None
-    guidance: float = Field(1.0, ge=0, le=100)
-    shard_size: Count = 1024
-    steps: Count | None = None
-    solver: str = "euler"
-    fields: tuple[str, ...] | None = None
-    batch: Count | None = None
-    dtype: str = "float32"
-    device: Literal["cpu", "cuda"] = "cpu"
-    threads: int = Field(1, ge=1, le=1024)
-    compression: Literal["gzip", "blosc2"] = "gzip"
-    layout: Literal["plain", "paged"] = "plain"
 
 
 @dataclass(frozen=True)

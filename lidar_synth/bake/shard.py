@@ -11,7 +11,8 @@ import torch
 
 from lidar_synth.bake.conditions import condition_names, conditions, open_conditions
 from lidar_synth.bake.folder import at_work, finished, publish
-from lidar_synth.bake.job import DTYPES, BakeJob, BakePlan
+from lidar_synth.bake.job import DTYPES, BakePlan
+from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import part_of

@@ -8,7 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import SETTINGS
-from lidar_synth.bake.job import BakeJob
+from lidar_synth.bake.options import BakeJob
 from lidar_synth.bake.shard import generate, load_checked, one_computer
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.card import CARD, CROISSANT

@@ -6,33 +6,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidar_synth.bake.options import BakeJob
+from lidar_synth.cli.options import options_from
+
 if TYPE_CHECKING:
     from lidar_synth.bake import BakePlan, Resources
 
 
+@options_from(BakeJob, after="config")
 def bake(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder of the bank")],
     config: Annotated[Path | None, typer.Option(help="YAML with these options; what is given here goes first")] = None,
-    model: Annotated[str | None, typer.Option(help="a shipped model's name or a .safetensors checkpoint")] = None,
-    count: Annotated[int | None, typer.Option(help="scans [1000]")] = None,
-    seed: Annotated[int | None, typer.Option(help="scan i is a function of the model, the seed and i [0]")] = None,
-    first: Annotated[int | None, typer.Option(help="index of the first scan [0]")] = None,
-    shard_size: Annotated[int | None, typer.Option(help="scans per file [1024]")] = None,
-    steps: Annotated[int | None, typer.Option(help="of a uniform time grid [the model's own grid]")] = None,
-    solver: Annotated[str | None, typer.Option(help="euler | heun [euler]")] = None,
-    condition: Annotated[
-        str | None, typer.Option(help="dataset that a conditional model takes its labels or images from")
-    ] = None,
-    condition_layout: Annotated[str | None, typer.Option(help="of that dataset, if not to be recognised")] = None,
-    condition_split: Annotated[str | None, typer.Option(help="of that dataset, r2flow/train for instance")] = None,
-    guidance: Annotated[float | None, typer.Option(help="of a conditional model [1 = none]")] = None,
-    fields: Annotated[str | None, typer.Option(help="reflectance,label,confidence [all that the model gives]")] = None,
-    batch: Annotated[int | None, typer.Option(help="scans at a time [1 on a CPU, 16 on a GPU]")] = None,
-    dtype: Annotated[str | None, typer.Option(help="float32 | bfloat16: what the network computes in")] = None,
-    device: Annotated[str | None, typer.Option(help="cpu | cuda [cpu]")] = None,
-    threads: Annotated[int | None, typer.Option(help="of a worker, on the CPU [1]")] = None,
-    compression: Annotated[str | None, typer.Option(help="gzip | blosc2 [gzip]")] = None,
-    layout: Annotated[str | None, typer.Option(help="plain | paged, for reading over a network [plain]")] = None,
     engine: Annotated[str, typer.Option(help="local | processes | ray | slurm | torchrun")] = "local",
     workers: Annotated[int | None, typer.Option(help="processes, actors or jobs [one per core, GPU or shard]")] = None,
     address: Annotated[str | None, typer.Option(help="of a Ray cluster, 'auto' for the running one")] = None,
@@ -40,6 +24,7 @@ def bake(
     shard_index: Annotated[int, typer.Option(help="make only every n-th shard, from this one on")] = 0,
     num_shards: Annotated[int, typer.Option(help="the n of --shard-index: how many runs share the work")] = 1,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be made, and how long it takes")] = False,
+    **settings: Any,
 ) -> None:
     """Bakes a bank: a folder of HDF5 files that any trainer reads. Run it again to go on where it stopped.
 
@@ -54,19 +39,12 @@ def bake(
       lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4
       torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 --device cuda --engine torchrun
     """
-    from lidar_synth.bake import BakeJob, Share, make_plan
+    from lidar_synth.bake import Share, make_plan
     from lidar_synth.bake import bake as run
     from lidar_synth.train.config import read_values, validated
 
-    chosen = {
-        "model": model, "count": count, "seed": seed, "first": first, "shard_size": shard_size, "steps": steps,
-        "solver": solver, "fields": None if fields is None else tuple(filter(None, fields.split(","))), "batch": batch,
-        "condition": condition, "condition_layout": condition_layout, "condition_split": condition_split,
-        "guidance": guidance, "dtype": dtype, "device": device, "threads": threads,
-        "compression": compression, "layout": layout,
-    }  # fmt: skip
     values = {} if config is None else read_values(config, BakeJob)
-    values |= {name: value for name, value in chosen.items() if value is not None}
+    values |= {name: value for name, value in settings.items() if value is not None}
     share = Share(shard_index, num_shards)
     plan = make_plan(out, validated(BakeJob, values, "bake" if config is None else str(config)))
     if dry_run:
