@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidar_synth.bake.folder import write_bank_files
-from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
+from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.projection import project
@@ -94,3 +94,16 @@ def numbers(bank: Bank, number: int) -> dict[str, Any]:
         "confidence": round(float(image.channels["confidence"].sum(dtype=np.float64)), 3),
         "labels": np.bincount(image.label.reshape(-1), minlength=256)[[*range(19), IGNORE]].tolist(),
     }
+
+
+def edit_index(root: Path, **changes: Any) -> None:
+    """Change values of a bank's index and write it with a matching checksum."""
+    index = Index.from_json((root / INDEX).read_bytes(), INDEX)
+    (root / INDEX).write_bytes(replace(index, **changes).to_json())
+
+
+def spoiled(name: str, value: float) -> RangeImage:
+    """A range image with one changed value in a channel."""
+    image = some_image()
+    (image.range if name == "range" else image.channels[name])[3, 4] = value
+    return image

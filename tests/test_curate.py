@@ -1,7 +1,6 @@
 """Curation: planted oddities are found, a rule means what it says, and a curated bank is whole without them."""
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,30 +8,24 @@ from pathlib import Path
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from banks import SENSOR, some_facts, some_image, write_bank
+from banks import SENSOR, some_image, write_bank
 from hypothesis import given, settings
 from layouts import write_all
-from test_generator import write
-from test_verify import baked, call, flip, names_and_points, shards
+from test_verify import call, names_and_points
 
 import lidar_synth.bake.curate.duplicates as duplicates
-from lidar_synth.bake import BakeJob, bake, make_plan
-from lidar_synth.bake.curate import FILE, MEANINGS, matching, read_scores, score, write_scores
+from lidar_synth.bake.curate import FILE, MEANINGS, read_scores, score, write_scores
 from lidar_synth.bake.curate.features import MEASURES, features
 from lidar_synth.bake.curate.scores import FARTHEST
-from lidar_synth.bake.edit import drop, head, merge, split
-from lidar_synth.bake.repair import repair
-from lidar_synth.bake.verify import verify
-from lidar_synth.bank import INDEX, Bank, Entry, Index
+from lidar_synth.bank import Bank
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.viz import histograms
 
 ALL = ("reflectance", "label", "confidence")
 ROAD, BUILDING = TRAIN_ID["road"], TRAIN_ID["building"]
-KEPT = [0, 2, 3, 6, 7]
 
 
 def plain_image(seed: int) -> RangeImage:
@@ -83,24 +76,6 @@ def images_with(name: str) -> list[RangeImage]:
         PLANTED[name](images[13])
         images[13].channels["confidence"][~images[13].mask] = 0
     return images
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("model") / "small.safetensors")
-
-
-@pytest.fixture(scope="module")
-def original(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight scans in shards of three."""
-    return baked(tmp_path_factory.mktemp("original") / "bank", model)
-
-
-@pytest.fixture
-def good(original: Path, tmp_path: Path) -> Path:
-    """Without scans 1, 4 and 5: the first shard has lost one in the middle, the second one its last two."""
-    drop(Bank(original), [1, 4, 5], "by hand", tmp_path / "good", progress=False)
-    return tmp_path / "good"
 
 
 # Scores
@@ -197,172 +172,6 @@ def test_processes_score_alike_and_the_file_keeps_it(tmp_path: Path) -> None:
     np.savez(tmp_path / FILE, bank=np.array(""), reference=np.array(""), twin=np.zeros(3), range=np.zeros(2))
     with pytest.raises(DataError, match=r"expected the scores of a bank. Remove it"):
         read_scores(tmp_path / FILE)
-
-
-# Rules
-
-
-SCORES = {"confidence": np.array([0.1, 0.5, 0.9]), "empty": np.array([0.3, 0.2, 0.1])}
-
-
-@pytest.mark.parametrize(
-    ("rule", "means"),
-    [
-        ("confidence < 0.5", [True, False, False]),
-        ("confidence<=.5", [True, True, False]),
-        (" empty > 1e-1 ", [True, True, False]),
-        ("empty >= 0.1", [True, True, True]),
-        ("confidence > 0.2 and empty > 0.1", [False, True, False]),
-        ("confidence > -1 and empty < +2. and empty < 0.15", [False, False, True]),
-    ],
-)
-def test_rules(rule: str, means: list[bool]) -> None:
-    assert matching(rule, SCORES).tolist() == means
-
-
-@pytest.mark.parametrize(
-    ("rule", "message"),
-    [
-        ("", "rule ''; expected a score"),
-        ("confidence", "rule 'confidence'; expected a score"),
-        ("confidence = 0.5", "expected a score, < <= > or >=, and a number"),
-        ("0.5 < confidence", "expected a score, < <= > or >=, and a number"),
-        ("confidence < 0.5 or empty > 0", "expected a score"),
-        ("confidence < nan", "expected a score"),
-        ("confidence < 0.5 and", "expected a score"),
-        ("confidence < 0.5); print(1", "expected a score"),
-        ("__import__('os') < 1", "expected a score"),
-        ("colour < 1", "score 'colour' in rule 'colour < 1'; expected one of confidence, empty"),
-    ],
-)
-def test_what_is_no_rule(rule: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        matching(rule, SCORES)
-
-
-# Curated banks
-
-
-@settings(max_examples=50)
-@given(scans=st.integers(1, 40), data=st.data())
-def test_positions_of_what_is_kept(scans: int, data: st.DataObject) -> None:
-    dropped = sorted(data.draw(st.sets(st.integers(0, scans - 1), max_size=scans - 1)))
-    entry = Entry("a.h5", 0, 0, scans, dropped=tuple(dropped))
-    kept = np.setdiff1d(np.arange(scans), dropped).tolist()
-    assert (entry.kept, [entry.position(rank) for rank in range(entry.kept)]) == (len(kept), kept)
-
-
-def test_a_curated_bank_is_the_bank_without_some_scans(original: Path, good: Path) -> None:
-    expected = [names_and_points(original)[i] for i in KEPT]
-    bank = Bank(good)
-    assert len(bank) == 5 and names_and_points(good) == expected
-    assert list(bank.ids) == [f"small/0/{i}" for i in KEPT]
-    assert np.array_equal(bank.image(4).range, Bank(original).image(7).range)
-    assert (bank.index.curation, bank.index.sources) == (("by hand",), Bank(original).index.sources)
-    assert verify(good, progress=False) == [] and bank.identity != Bank(original).identity
-    for path in good.glob("*.h5"):  # the same files, not copies
-        assert path.stat().st_ino == (original / path.name.replace(".curated", "")).stat().st_ino
-    assert Index.from_json((good / INDEX).read_bytes(), "") == bank.index
-    assert "| curation | by hand |" in (good / "README.md").read_text()
-
-
-def test_an_index_without_curation_says_nothing_of_it(original: Path) -> None:
-    """Older versions read it, and an index that leaves scans out none of them reads as if it did not."""
-    text = (original / INDEX).read_text()
-    assert "dropped" not in text and "curation" not in text
-
-
-def test_a_shard_of_which_nothing_is_kept_is_not_there(original: Path, tmp_path: Path) -> None:
-    index = drop(Bank(original), [0, 3, 4, 5], "by hand", tmp_path / "few", progress=False)
-    assert [entry.dropped for entry in index.shards] == [(0,), ()]
-    assert len(list((tmp_path / "few").glob("*.h5"))) == 2 and verify(tmp_path / "few", progress=False) == []
-    assert names_and_points(tmp_path / "few") == [names_and_points(original)[i] for i in (1, 2, 6, 7)]
-    with pytest.raises(ConfigError, match=r"all 4 scans of .*few left out \(all\); expected a rule that leaves some"):
-        drop(Bank(tmp_path / "few"), range(4), "all", tmp_path / "none", progress=False)
-    with pytest.raises(ConfigError, match=r"scans \[-1, 4\] to leave out; expected 0 to 3"):
-        drop(Bank(tmp_path / "few"), [1, 4, -1], "some", tmp_path / "none", progress=False)
-    assert not (tmp_path / "none").exists()
-
-
-def test_curating_again(good: Path, original: Path, tmp_path: Path) -> None:
-    index = drop(Bank(good), [0, 2], "once more", tmp_path / "better", progress=False)
-    assert (index.curation, index.scans) == (("by hand", "once more"), 3)
-    assert names_and_points(tmp_path / "better") == [names_and_points(original)[i] for i in (2, 6, 7)]
-    with pytest.raises(ConfigError, match="good holds a bank; expected a folder of its own"):
-        drop(Bank(original), [0], "elsewhere", good, progress=False)
-
-
-@pytest.mark.parametrize("shares", [(0.2, 0.2, 0.6), (0.4, 0.6), (0.8, 0.2)])
-def test_parts_of_a_curated_bank_are_curated(good: Path, tmp_path: Path, shares: tuple[float, ...]) -> None:
-    parts = split(Bank(good), {tmp_path / str(i): share for i, share in enumerate(shares)}, progress=False)
-    assert names_and_points(*parts) == names_and_points(good)
-    assert all(verify(part, progress=False) == [] for part in parts)
-    assert all(index.curation == ("by hand",) for index in parts.values())
-    merge([Bank(part) for part in parts], tmp_path / "merged", progress=False)
-    assert names_and_points(tmp_path / "merged") == names_and_points(good)
-    assert Bank(tmp_path / "merged").index.curation == ("by hand",)
-    assert all(path.name.endswith(".curated.h5") for path in (tmp_path / "merged").glob("*.h5"))
-    assert head(Bank(good), 3, tmp_path / "head", progress=False).scans == 3
-    assert names_and_points(tmp_path / "head") == names_and_points(good)[:3]
-
-
-def test_a_part_of_a_shard_keeps_what_is_dropped_in_it(tmp_path: Path) -> None:
-    write_bank(tmp_path / "bank", [some_image(i) for i in range(9)], shard_size=9)
-    drop(Bank(tmp_path / "bank"), [2, 4, 5], "by hand", tmp_path / "good", progress=False)
-    parts = split(Bank(tmp_path / "good"), {tmp_path / "a": 2 / 6, tmp_path / "b": 4 / 6}, progress=False)
-    [a], [b] = (index.shards for index in parts.values())
-    assert (a.first, a.scans, a.dropped, b.first, b.scans, b.dropped) == (0, 2, (), 3, 6, (1, 2))
-    assert [list(Bank(part).ids) for part in parts] == [
-        ["small/5/0", "small/5/1"],
-        list(Bank(tmp_path / "good").ids)[2:],
-    ]
-    assert names_and_points(*parts) == names_and_points(tmp_path / "good")
-    assert all(verify(part, progress=False) == [] for part in parts)
-
-
-def test_repair_keeps_the_curation(good: Path, original: Path, model: Path) -> None:
-    before, index = shards(good), (good / INDEX).read_bytes()
-    (good / "shard-00000.curated.h5").unlink()  # not the original: a second name for it
-    flip_copy(good / "shard-00001.curated.h5")
-    assert [problem.file for problem in verify(good, progress=False)][:2] == [
-        "shard-00000.curated.h5",
-        "shard-00001.curated.h5",
-    ]
-    assert set(repair(good, str(model), progress=False)) == {"shard-00000.curated.h5", "shard-00001.curated.h5"}
-    assert (shards(good), (good / INDEX).read_bytes()) == (before, index)
-    assert verify(original, progress=False) == []
-
-
-def flip_copy(path: Path) -> None:
-    """Damage a file, but not the others that share its content."""
-    copy = path.with_suffix(".copy")
-    shutil.copyfile(path, copy)
-    copy.replace(path)
-    flip(path, 8 * 5000)
-
-
-def test_a_lost_index_never_brings_back_what_was_dropped(good: Path, original: Path, model: Path) -> None:
-    (good / INDEX).unlink()
-    with pytest.raises(FileError, match="holds no bank"):
-        Bank(good)
-    with pytest.raises(DataError, match=r"are not one bake's; expected a copy of the index"):
-        repair(good, str(model), progress=False)
-    shutil.copyfile(original / INDEX, good / INDEX)
-    with pytest.raises(FileError, match="shard-00000.h5 is missing"):
-        Bank(good)
-
-
-def test_a_curated_bank_is_not_baked_into(good: Path, model: Path) -> None:
-    with pytest.raises(ConfigError, match="holds a bank that no bake made"):
-        bake(make_plan(good, BakeJob(model=str(model), count=8, shard_size=3)), progress=False)
-
-
-@pytest.mark.parametrize("dropped", [(0, 0), (2, 1), (0, 1, 2), (3,), (-1,)])
-def test_an_index_that_leaves_out_what_is_not_there(dropped: tuple[int, ...]) -> None:
-    with pytest.raises(DataError, match="ascending positions that leave a scan"):
-        Index((some_facts(),), (Entry("a.h5", 0, 0, 3, dropped=dropped),), curation=("by hand",))
-    with pytest.raises(DataError, match="and what dropped them"):
-        Index((some_facts(),), (Entry("a.h5", 0, 0, 3, dropped=(1,)),))
 
 
 # The command
