@@ -42,7 +42,7 @@ def test_a_chunk_that_passed_by_a_filter_is_refused(root: Path) -> None:
     with h5py.File(path, "r+") as file:
         chunk = bytes(file["range"].id.read_direct_chunk((1, 0, 0))[1])
         file["range"].id.write_direct_chunk((1, 0, 0), chunk + b"0", filter_mask=1)
-    with pytest.raises(DataError, match=r"scan 1 cannot be read \(filters 1 were left out\)"):
+    with pytest.raises(DataError, match=r"scan 1 cannot be read \(filters 1 were not applied\)"):
         ShardReader(path, str(path)).read(1)
 
 

@@ -62,7 +62,7 @@ def test_a_missing_shard_and_a_missing_index(root: Path) -> None:
     with pytest.raises(FileError, match=r"shard shard-00002.h5 is missing .*lidar-synth repair"):
         Bank(root)
     (root / INDEX).unlink()
-    with pytest.raises(FileError, match=r"holds no bank: index.json cannot be read .*goes on by the same command"):
+    with pytest.raises(FileError, match=r"holds no bank: index.json cannot be read .*Run an interrupted bake again"):
         open_scans(root)
 
 
@@ -80,10 +80,10 @@ def test_files_that_are_no_shard_of_the_bank(root: Path, tmp_path: Path) -> None
     foreign = tmp_path / "foreign.h5"
     with h5py.File(foreign, "w") as file:
         file["range"] = np.zeros((2, 8, 32), np.uint16)
-    with pytest.raises(DataError, match=r"shard-00000.h5 is no part of a bank \(format ''\)"):
+    with pytest.raises(DataError, match=r"shard-00000.h5 is not part of a bank \(format ''\)"):
         with_shard(root, foreign)[0]
     foreign.write_text("no HDF5 at all, but as long as two scans")
-    with pytest.raises(DataError, match="shard-00000.h5 is cut, damaged or no HDF5 file"):
+    with pytest.raises(DataError, match="shard-00000.h5 is truncated, damaged or not an HDF5 file"):
         with_shard(root, foreign)[0]
     with pytest.raises(DataError, match="shard-00000.h5 holds scans 2 to 3 of seed 5; expected scans 0 to 1 of seed 5"):
         with_shard(root, root / "shard-00001.h5")[0]
@@ -97,7 +97,7 @@ def test_files_that_are_no_shard_of_the_bank(root: Path, tmp_path: Path) -> None
         with ShardWriter(foreign, facts, Entry("shard-00000.h5", 5, 0, 2)) as writer:
             for image in images:
                 writer.append(image)
-        with pytest.raises(DataError, match=f"shard-00000.h5: .*{name} are not those of the bank's index"):
+        with pytest.raises(DataError, match=f"shard-00000.h5: .*{name} differ from the bank's index"):
             with_shard(root, foreign)[0]
 
 
@@ -124,10 +124,10 @@ def test_another_version_is_refused(root: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"scans": 5', '"scans": 6', "does not have its own checksum"),
-        ('"seed": 5', '"seed": 4', "does not have its own checksum"),
+        ('"scans": 5', '"scans": 6', "does not match its checksum"),
+        ('"seed": 5', '"seed": 4', "does not match its checksum"),
         ("{", "", "is damaged"),
-        ('"format"', '"gormat"', "is no part of a bank"),
+        ('"format"', '"gormat"', "is not part of a bank"),
     ],
 )
 def test_a_damaged_index(root: Path, old: str, new: str, message: str) -> None:
@@ -141,7 +141,7 @@ def test_an_index_that_leads_elsewhere(root: Path) -> None:
     for change in ({"file": "../other.h5"}, {"file": ".hidden.h5"}, {"source": 1}, {"scans": 0}):
         with pytest.raises(DataError, match="a bank"):
             edit_index(root, shards=(replace(first, **change),))
-    with pytest.raises(DataError, match="at least one, each once"):
+    with pytest.raises(DataError, match="at least one, each only once"):
         edit_index(root, shards=(first, first))
 
 

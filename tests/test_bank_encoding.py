@@ -158,7 +158,7 @@ def test_a_chunk_that_is_none_is_refused() -> None:
 
     with pytest.raises(ValueError, match="does not hold 256 bytes"):
         inflate(chunk, array.shape, np.dtype(np.uint8))
-    with pytest.raises(ValueError, match="it holds 512 bytes and not 1024"):
+    with pytest.raises(ValueError, match="it holds 512 bytes instead of 1024"):
         inflate(chunk, array.shape, np.dtype(np.uint32))
     for packed in (b"no zlib at all", chunk[:-9], zlib.compress(array.tobytes())[:40]):
         with pytest.raises(ValueError):

@@ -45,7 +45,7 @@ def _read(path: Path, index: int, count: int, sensor: str | None) -> "list[Scan]
     """Scans index, index + 1 .. of what is at the path.
 
     Raises:
-        ConfigError: where the index leads outside.
+        ConfigError: if the index leads outside.
     """
     from tqdm import tqdm
 
