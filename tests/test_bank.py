@@ -1,4 +1,4 @@
-"""Banks: what is written is read, the bytes repeat, and whatever is damaged is found before a scan is handed out."""
+"""Banks: scans are read as they were written, by every process, and the same scans give the same bytes."""
 
 import json
 import multiprocessing
@@ -37,7 +37,7 @@ def root(tmp_path: Path) -> Path:
 # Shards
 
 
-def test_a_chunk_that_passed_by_a_filter_is_refused(root: Path) -> None:
+def test_a_chunk_that_skipped_a_filter_is_refused(root: Path) -> None:
     path = root / "shard-00000.h5"
     with h5py.File(path, "r+") as file:
         chunk = bytes(file["range"].id.read_direct_chunk((1, 0, 0))[1])
@@ -64,15 +64,15 @@ def test_plain_hdf5_reads_a_shard(tmp_path: Path) -> None:
             assert np.array_equal(dataset[:], expected)
 
 
-def test_bytes_repeat(tmp_path: Path) -> None:
+def test_the_same_scans_give_the_same_bytes(tmp_path: Path) -> None:
     images = [some_image(i) for i in range(3)]
     first = [path.read_bytes() for path in write_bank(tmp_path / "a", images)]
-    time.sleep(1.1)  # HDF5 counts time in seconds
+    time.sleep(1.1)  # HDF5 stores times in seconds
     assert [path.read_bytes() for path in write_bank(tmp_path / "b", images)] == first
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_threads_change_nothing(tmp_path: Path, threads: int) -> None:
+def test_the_number_of_threads_changes_no_byte(tmp_path: Path, threads: int) -> None:
     facts, entry = some_facts(), Entry("shard-00000.h5", 5, 0, 40)
     with ShardWriter(tmp_path / entry.file, facts, entry, threads=threads) as writer:
         for i in range(40):
@@ -95,7 +95,7 @@ def test_a_shard_with_too_few_scans_or_a_bad_one_is_not_left_behind(tmp_path: Pa
 # Reading
 
 
-def test_scans_come_back(root: Path) -> None:
+def test_a_bank_returns_the_scans_that_were_written(root: Path) -> None:
     bank = Bank(root)
     assert isinstance(bank, Source)
     assert (len(bank), bank.length, bank.sensor, bank.fields) == (5, 5, SENSOR, {"reflectance", "label"})
@@ -129,7 +129,7 @@ def points(bank: Bank, queue: Any) -> None:
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
-def test_banks_go_into_workers(root: Path, method: str) -> None:
+def test_workers_read_a_bank(root: Path, method: str) -> None:
     bank = Bank(root)
     expected = sum(len(scan) for scan in bank)  # the parent has its shards open
     context = multiprocessing.get_context(method)
@@ -144,7 +144,7 @@ def test_banks_go_into_workers(root: Path, method: str) -> None:
         assert sum(len(scan) for scan in loader) == expected
 
 
-def test_conditions_stand_by_name(tmp_path: Path) -> None:
+def test_conditions_are_stored_by_name(tmp_path: Path) -> None:
     facts = some_facts(condition={"kind": "semantic", "source": "kitti360", "split": "r2flow/train"})
     entry = Entry("shard-00000.h5", 5, 7, 2)
     with ShardWriter(tmp_path / entry.file, facts, entry, conditions=["drive/0000000007", "drive/8"]) as writer:
@@ -163,7 +163,7 @@ def test_conditions_stand_by_name(tmp_path: Path) -> None:
         ShardReader(path, str(path)).read(1)
 
 
-def test_a_bank_is_a_source_among_the_others(root: Path, tmp_path: Path) -> None:
+def test_a_bank_can_be_opened_and_converted_like_any_source(root: Path, tmp_path: Path) -> None:
     scans = open_scans(root)
     assert type(scans) is BankScans and scans.ids[4] == "small/5/4"
     with pytest.raises(ConfigError, match="sensor os1_128 for .*; expected 'small'"):
@@ -190,7 +190,7 @@ def test_a_paged_bank_reads_over_a_network(tmp_path: Path) -> None:
         Bank("nosuch://bank")
 
 
-def test_missing_libraries_say_so(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_libraries_are_reported(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec", None)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
     with pytest.raises(LibraryError, match=r"s3://bucket/bank/index.json cannot be opened .*fsspec.*pip install"):
@@ -200,7 +200,7 @@ def test_missing_libraries_say_so(root: Path, monkeypatch: pytest.MonkeyPatch) -
         ShardWriter(root / "new.h5", facts, Entry("new.h5", 0, 0, 1))
 
 
-def test_blosc2(tmp_path: Path) -> None:
+def test_blosc2_banks_are_read(tmp_path: Path) -> None:
     pytest.importorskip("hdf5plugin")
     write_bank(tmp_path, [some_image(i) for i in range(3)], compression="blosc2")
     encoding = Encoding(SENSOR, ("reflectance", "label"))
@@ -208,10 +208,10 @@ def test_blosc2(tmp_path: Path) -> None:
         assert np.array_equal(Bank(tmp_path).image(i).range, encoding.decode(encoding.encode(some_image(i))).range)
 
 
-# What goes with a bank
+# Identity, card and golden bank
 
 
-def test_an_index_is_known_by_its_content(root: Path) -> None:
+def test_the_identity_depends_on_the_content_of_the_index(root: Path) -> None:
     before = Bank(root).identity
     write_bank_files(root, Bank(root).index)
     assert Bank(root).identity == before

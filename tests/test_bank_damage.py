@@ -28,23 +28,23 @@ def read_all(root: Path) -> list[bytes]:
 
 
 def test_no_flipped_bit_gives_a_wrong_scan(root: Path) -> None:
-    whole = read_all(root)
+    expected = read_all(root)
     path = root / "shard-00001.h5"
-    content, rng, found = path.read_bytes(), np.random.default_rng(0), 0
+    content, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
     for bit in rng.choice(8 * len(content), 300, replace=False):
         damaged = bytearray(content)
         damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
         try:
-            assert read_all(root) == whole, f"bit {bit}: a wrong scan"
+            assert read_all(root) == expected, f"bit {bit}: a wrong scan"
         except DataError as error:
             assert "shard-00001.h5" in str(error), error
-            found += 1
-        assert sha256(path) != Index.from_json((root / INDEX).read_bytes(), "").shards[1].sha256  # what verify looks at
-    assert found > 90  # of so small a shard half is room for metadata, in which nothing stands
+            refused += 1
+        assert sha256(path) != Index.from_json((root / INDEX).read_bytes(), "").shards[1].sha256  # as verify does
+    assert refused > 90  # half of such a small shard is unused space for metadata
 
 
-def test_a_cut_shard_is_found(root: Path) -> None:
+def test_a_truncated_shard_is_found(root: Path) -> None:
     path = root / "shard-00001.h5"
     content, rng = path.read_bytes(), np.random.default_rng(0)
     index = Index.from_json((root / INDEX).read_bytes(), INDEX)
@@ -57,7 +57,7 @@ def test_a_cut_shard_is_found(root: Path) -> None:
             shard.read(0), shard.read(1)
 
 
-def test_a_missing_shard_and_a_missing_index(root: Path) -> None:
+def test_a_missing_shard_and_a_missing_index_are_reported(root: Path) -> None:
     (root / "shard-00002.h5").unlink()
     with pytest.raises(FileError, match=r"shard shard-00002.h5 is missing .*lidar-synth repair"):
         Bank(root)
@@ -76,7 +76,7 @@ def with_shard(root: Path, path: Path) -> Bank:
     return Bank(root)
 
 
-def test_files_that_are_no_shard_of_the_bank(root: Path, tmp_path: Path) -> None:
+def test_files_that_do_not_belong_to_the_bank_are_refused(root: Path, tmp_path: Path) -> None:
     foreign = tmp_path / "foreign.h5"
     with h5py.File(foreign, "w") as file:
         file["range"] = np.zeros((2, 8, 32), np.uint16)
@@ -101,7 +101,7 @@ def test_files_that_are_no_shard_of_the_bank(root: Path, tmp_path: Path) -> None
             with_shard(root, foreign)[0]
 
 
-def test_scale_and_sensor_have_to_agree(root: Path) -> None:
+def test_scale_and_sensor_must_agree(root: Path) -> None:
     path = root / "shard-00000.h5"
     with h5py.File(path, "r+") as file:
         file.attrs["scale"] = 0.002
@@ -130,13 +130,13 @@ def test_another_version_is_refused(root: Path) -> None:
         ('"format"', '"gormat"', "is not part of a bank"),
     ],
 )
-def test_a_damaged_index(root: Path, old: str, new: str, message: str) -> None:
+def test_a_damaged_index_is_refused(root: Path, old: str, new: str, message: str) -> None:
     (root / INDEX).write_text((root / INDEX).read_text().replace(old, new, 1))
     with pytest.raises(DataError, match=f"index.json {message}"):
         Bank(root)
 
 
-def test_an_index_that_leads_elsewhere(root: Path) -> None:
+def test_an_index_with_invalid_shards_is_refused(root: Path) -> None:
     [first, *_] = Index.from_json((root / INDEX).read_bytes(), INDEX).shards
     for change in ({"file": "../other.h5"}, {"file": ".hidden.h5"}, {"source": 1}, {"scans": 0}):
         with pytest.raises(DataError, match="a bank"):
@@ -146,7 +146,7 @@ def test_an_index_that_leads_elsewhere(root: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "code"), [("label", 127), ("label", 19), ("confidence", 16)])
-def test_codes_that_no_writer_writes_are_refused_whatever_the_checksum(tmp_path: Path, name: str, code: int) -> None:
+def test_invalid_codes_are_refused_despite_a_matching_checksum(tmp_path: Path, name: str, code: int) -> None:
     [path] = write_bank(tmp_path, [some_image()], fields=("reflectance", "label", "confidence"))
     with h5py.File(path, "r+") as file:
         values = file[name][0]
@@ -158,7 +158,7 @@ def test_codes_that_no_writer_writes_are_refused_whatever_the_checksum(tmp_path:
         shard.read(0)
 
 
-def test_a_number_in_the_place_of_text_takes_no_memory(tmp_path: Path) -> None:
+def test_a_number_in_place_of_text_allocates_no_memory(tmp_path: Path) -> None:
     """bytes(2**40) would be a terabyte of zeros."""
     [path] = write_bank(tmp_path, [some_image()])
     with h5py.File(path, "r+") as file:

@@ -25,7 +25,7 @@ ALL = ("reflectance", "label", "confidence")
 # Encoding
 
 
-def test_an_image_comes_back_to_half_a_step(sensor: Sensor) -> None:
+def test_decoded_images_differ_by_at_most_half_a_step(sensor: Sensor) -> None:
     image = some_image(1, sensor)
     image.range[0, :4] = sensor.range_min, sensor.range_max, max(sensor.range_min, 1e-6), sensor.range_max * (1 - 1e-7)
     encoding = Encoding(sensor, ALL)
@@ -56,7 +56,7 @@ def test_encode_is_the_inverse_of_decode(seed: int, near: float, far: float) -> 
         assert again[name].dtype == TYPES[name]
 
 
-def test_the_numbers_of_the_format() -> None:
+def test_codes_and_checksums_match_the_format() -> None:
     """Exact: a bank of today is read by every later version."""
     sensor = Sensor("x", 2, 0.0, 65.535, rows=2, fov_up=3.0, fov_down=-25.0)
     image = RangeImage(
@@ -77,7 +77,7 @@ def test_the_numbers_of_the_format() -> None:
     assert checksum(7, 2**40, arrays, b"seq/0001") == expected
 
 
-def test_encoding_into_given_memory() -> None:
+def test_encoding_into_existing_arrays() -> None:
     encoding = Encoding(SENSOR, ("label",))
     slots = {name: np.zeros((3, *shape), dtype) for name, (shape, dtype) in encoding.arrays().items()}
     encoding.encode(some_image(), {name: values[1] for name, values in slots.items()})
@@ -102,12 +102,12 @@ def test_encoding_into_given_memory() -> None:
         (some_image(0, Sensor("other", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)), r"of \(8, 64\); expected"),
     ],
 )
-def test_what_has_no_code_is_refused(image: RangeImage, message: str) -> None:
+def test_values_without_a_code_are_refused(image: RangeImage, message: str) -> None:
     with pytest.raises(DataError, match=message):
         Encoding(SENSOR, ALL).encode(image)
 
 
-def test_unknown_fields() -> None:
+def test_unknown_fields_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"fields \['ring'\] of a bank; expected some of range, reflectance"):
         Encoding(SENSOR, ("label", "ring"))
 
@@ -117,7 +117,7 @@ def test_unknown_fields() -> None:
 
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 719, 720, 721, 50_001])
 @pytest.mark.parametrize("fill", [None, 0, 255])
-def test_fletcher32_is_that_of_hdf5(size: int, fill: int | None) -> None:
+def test_fletcher32_matches_hdf5(size: int, fill: int | None) -> None:
     data = np.random.default_rng(size).integers(0, 256, size) if fill is None else np.full(size, fill)
     with h5py.File("any", "w", driver="core", backing_store=False) as file:
         dataset = file.create_dataset("x", data=data.astype(np.uint8), chunks=(size,), fletcher32=True)
@@ -141,7 +141,7 @@ def test_inflate_is_the_inverse_of_deflate(
     assert again.dtype == dtype and np.array_equal(again, array)
 
 
-def test_a_chunk_that_is_none_is_refused() -> None:
+def test_invalid_chunks_are_refused() -> None:
     array = np.random.default_rng(0).integers(0, 9, (8, 32)).astype(np.uint16)
     chunk, dtype = deflate(array), array.dtype
     for bit in range(8 * len(chunk)):

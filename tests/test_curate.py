@@ -1,4 +1,4 @@
-"""Curation: planted oddities are found, a rule means what it says, and a curated bank is whole without them."""
+"""Curation: planted outliers get the highest scores, and the command lists, plots and drops scans."""
 
 import json
 from collections.abc import Callable
@@ -29,7 +29,7 @@ ROAD, BUILDING = TRAIN_ID["road"], TRAIN_ID["building"]
 
 
 def plain_image(seed: int) -> RangeImage:
-    """Four walls on a road, at distances of their own; every scan another place."""
+    """Four walls on a road at random distances; each seed gives another scan."""
     metres = np.tile(np.repeat(np.random.default_rng(seed).uniform(6, 38, 4), 8), (8, 1)).astype(np.float32)
     metres[:, seed % 32] = 0
     seen = metres > 0
@@ -68,7 +68,7 @@ PLANTED: dict[str, Callable[[RangeImage], object]] = {
 
 
 def images_with(name: str) -> list[RangeImage]:
-    """Twenty scans, of which number 13 is odd."""
+    """Twenty scans; number 13 is the outlier."""
     images = [plain_image(seed) for seed in range(20)]
     if name == "duplicate":
         images[13] = replace(plain_image(4), range=plain_image(4).range * np.float32(1.002))
@@ -82,7 +82,7 @@ def images_with(name: str) -> list[RangeImage]:
 
 
 @pytest.mark.parametrize("name", MEANINGS)
-def test_a_planted_oddity_has_the_highest_score(name: str, tmp_path: Path) -> None:
+def test_a_planted_outlier_has_the_highest_score(name: str, tmp_path: Path) -> None:
     write_bank(tmp_path, images_with(name), shard_size=8, fields=ALL)
     scores = score(Bank(tmp_path), progress=False)
     assert list(scores.values) == list(MEANINGS)
@@ -93,7 +93,7 @@ def test_a_planted_oddity_has_the_highest_score(name: str, tmp_path: Path) -> No
         assert scores.twin[13] == 4 and values[13] > 0.99 and scores.twin[0] == -1
 
 
-def test_the_measures_are_what_they_say() -> None:
+def test_the_measures_match_their_definitions() -> None:
     image = plain_image(0)
     scan = unproject(image)
     assert MEASURES["empty"].of(image, scan) == pytest.approx(1 / 32)
@@ -109,7 +109,7 @@ def test_the_measures_are_what_they_say() -> None:
     assert MEASURES["speckle"].of(image, unproject(image)) == pytest.approx(2 / pairs)
 
 
-def test_a_scan_without_a_return_is_far_from_everything(tmp_path: Path) -> None:
+def test_a_scan_without_returns_has_the_largest_distance(tmp_path: Path) -> None:
     images = [plain_image(seed) for seed in range(3)]
     images[1] = RangeImage(np.zeros_like(images[1].range), SENSOR, {"label": np.full_like(images[1].label, IGNORE)})
     write_bank(tmp_path, images, fields=("label",))
@@ -119,7 +119,7 @@ def test_a_scan_without_a_return_is_far_from_everything(tmp_path: Path) -> None:
     assert [values[name][1] for name in ("unlabelled", "floating", "speckle", "duplicate")] == [0, 0, 0, 0]
 
 
-def test_signatures_are_unit_vectors_of_what_is_near() -> None:
+def test_signatures_are_unit_vectors_of_the_near_returns() -> None:
     points = features(plain_image(3)).signature.astype(np.float64)
     assert points.shape == (1024,) and np.linalg.norm(points) == pytest.approx(1, abs=1e-3)
     far = plain_image(3)
@@ -129,7 +129,7 @@ def test_signatures_are_unit_vectors_of_what_is_near() -> None:
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 12), block=st.integers(1, 5))
-def test_the_most_alike_of_the_earlier_ones(seed: int, count: int, block: int) -> None:
+def test_the_most_similar_earlier_scan_is_found(seed: int, count: int, block: int) -> None:
     rng = np.random.default_rng(seed)
     signatures = rng.random((count, 6)) * (rng.random((count, 6)) < 0.5)
     signatures = (signatures / np.linalg.norm(signatures, axis=1).clip(1e-9)[:, None]).astype(np.float16)
@@ -143,7 +143,7 @@ def test_the_most_alike_of_the_earlier_ones(seed: int, count: int, block: int) -
         assert products[i, twin[i]] == pytest.approx(products[i, :i].max(), abs=1e-6)
 
 
-def test_a_reference_takes_the_place_of_the_mean(tmp_path: Path) -> None:
+def test_a_reference_replaces_the_mean_histograms(tmp_path: Path) -> None:
     write_bank(tmp_path / "bank", images_with("range"), fields=ALL)
     write_bank(tmp_path / "odd", [images_with("range")[13]], fields=ALL)
     bank, odd = Bank(tmp_path / "bank"), Bank(tmp_path / "odd")
@@ -157,7 +157,7 @@ def test_a_reference_takes_the_place_of_the_mean(tmp_path: Path) -> None:
             score(bank, **wrong)  # type: ignore[arg-type]
 
 
-def test_processes_score_alike_and_the_file_keeps_it(tmp_path: Path) -> None:
+def test_scores_do_not_depend_on_processes_and_are_saved(tmp_path: Path) -> None:
     write_bank(tmp_path, images_with("empty"), shard_size=8, fields=ALL)
     one, two = (score(Bank(tmp_path), jobs=jobs, progress=False) for jobs in (1, 2))
     for name, values in one.values.items():
@@ -213,7 +213,7 @@ def test_the_plot_counts_every_scan_and_marks_some() -> None:
         assert (plain, orange) == ((~marked).sum(), marked.sum())
 
 
-def test_the_command_as_json_and_with_a_reference(bank: Path, tmp_path: Path) -> None:
+def test_the_command_prints_json_and_takes_a_reference(bank: Path, tmp_path: Path) -> None:
     found = json.loads(call("curate", bank, "--json", "--sort", "-empty", "--limit", 3, "--drop", "empty >= 0")[1])
     assert (found["scans"], found["dropped"], len(found["listed"])) == (20, 20, 3)
     assert {"number", "id", "twin", "dropped", *MEANINGS} == set(found["listed"][0])
@@ -224,7 +224,7 @@ def test_the_command_as_json_and_with_a_reference(bank: Path, tmp_path: Path) ->
     assert scores.reference == f"1 scans of {tmp_path / 'real'}" and not np.allclose(scores.values["range"], before)
 
 
-def test_scores_of_another_bank_are_of_no_use(bank: Path) -> None:
+def test_scores_of_another_bank_are_not_reused(bank: Path) -> None:
     call("curate", bank, "--json")
     write_bank(bank, [some_image(i) for i in range(3)], fields=ALL)
     call("curate", bank, "--json")
@@ -234,9 +234,9 @@ def test_scores_of_another_bank_are_of_no_use(bank: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--out", "x"], "--out x without a rule; expected --drop, too"),
+        (["--out", "x"], "--out x without a rule; expected --drop as well"),
         (["--plot", "x.jpg"], "--plot x.jpg; expected a file that ends in .png"),
-        (["--split", "train"], "--split train of nothing; expected --reference, too"),
+        (["--split", "train"], "--split train without a reference; expected --reference as well"),
         (["--sort", "beauty"], "score 'beauty'; expected one of 'range', 'labels'"),
         (["--drop", "beauty > 1", "--out", "x"], "score 'beauty' in rule"),
         (["--drop", "empty >= 0", "--out", "x"], "all 20 scans of .* left out"),

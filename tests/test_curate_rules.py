@@ -10,7 +10,7 @@ SCORES = {"confidence": np.array([0.1, 0.5, 0.9]), "empty": np.array([0.3, 0.2, 
 
 
 @pytest.mark.parametrize(
-    ("rule", "means"),
+    ("rule", "selected"),
     [
         ("confidence < 0.5", [True, False, False]),
         ("confidence<=.5", [True, True, False]),
@@ -20,8 +20,8 @@ SCORES = {"confidence": np.array([0.1, 0.5, 0.9]), "empty": np.array([0.3, 0.2, 
         ("confidence > -1 and empty < +2. and empty < 0.15", [False, False, True]),
     ],
 )
-def test_rules(rule: str, means: list[bool]) -> None:
-    assert matching(rule, SCORES).tolist() == means
+def test_rules_select_scans(rule: str, selected: list[bool]) -> None:
+    assert matching(rule, SCORES).tolist() == selected
 
 
 @pytest.mark.parametrize(
@@ -39,6 +39,6 @@ def test_rules(rule: str, means: list[bool]) -> None:
         ("colour < 1", "score 'colour' in rule 'colour < 1'; expected one of confidence, empty"),
     ],
 )
-def test_what_is_no_rule(rule: str, message: str) -> None:
+def test_invalid_rules_are_refused(rule: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         matching(rule, SCORES)

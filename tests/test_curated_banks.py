@@ -34,14 +34,14 @@ def original(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def good(original: Path, tmp_path: Path) -> Path:
-    """Without scans 1, 4 and 5: the first shard has lost one in the middle, the second one its last two."""
+    """Scans 1, 4 and 5 are dropped: one in the middle of the first shard, the last two of the second one."""
     drop(Bank(original), [1, 4, 5], "by hand", tmp_path / "good", progress=False)
     return tmp_path / "good"
 
 
 @settings(max_examples=50)
 @given(scans=st.integers(1, 40), data=st.data())
-def test_positions_of_what_is_kept(scans: int, data: st.DataObject) -> None:
+def test_positions_of_kept_scans(scans: int, data: st.DataObject) -> None:
     dropped = sorted(data.draw(st.sets(st.integers(0, scans - 1), max_size=scans - 1)))
     entry = Entry("a.h5", 0, 0, scans, dropped=tuple(dropped))
     kept = np.setdiff1d(np.arange(scans), dropped).tolist()
@@ -56,19 +56,19 @@ def test_a_curated_bank_is_the_bank_without_some_scans(original: Path, good: Pat
     assert np.array_equal(bank.image(4).range, Bank(original).image(7).range)
     assert (bank.index.curation, bank.index.sources) == (("by hand",), Bank(original).index.sources)
     assert verify(good, progress=False) == [] and bank.identity != Bank(original).identity
-    for path in good.glob("*.h5"):  # the same files, not copies
+    for path in good.glob("*.h5"):  # hard links, not copies
         assert path.stat().st_ino == (original / path.name.replace(".curated", "")).stat().st_ino
     assert Index.from_json((good / INDEX).read_bytes(), "") == bank.index
     assert "| curation | by hand |" in (good / "README.md").read_text()
 
 
-def test_an_index_without_curation_says_nothing_of_it(original: Path) -> None:
-    """Older versions read it, and an index that leaves scans out none of them reads as if it did not."""
+def test_an_index_without_curation_has_no_keys_for_it(original: Path) -> None:
+    """Older versions can read it, but refuse the index of a curated bank."""
     text = (original / INDEX).read_text()
     assert "dropped" not in text and "curation" not in text
 
 
-def test_a_shard_of_which_nothing_is_kept_is_not_there(original: Path, tmp_path: Path) -> None:
+def test_a_fully_dropped_shard_is_omitted(original: Path, tmp_path: Path) -> None:
     index = drop(Bank(original), [0, 3, 4, 5], "by hand", tmp_path / "few", progress=False)
     assert [entry.dropped for entry in index.shards] == [(0,), ()]
     assert len(list((tmp_path / "few").glob("*.h5"))) == 2 and verify(tmp_path / "few", progress=False) == []
@@ -80,11 +80,11 @@ def test_a_shard_of_which_nothing_is_kept_is_not_there(original: Path, tmp_path:
     assert not (tmp_path / "none").exists()
 
 
-def test_curating_again(good: Path, original: Path, tmp_path: Path) -> None:
+def test_a_curated_bank_can_be_curated_again(good: Path, original: Path, tmp_path: Path) -> None:
     index = drop(Bank(good), [0, 2], "once more", tmp_path / "better", progress=False)
     assert (index.curation, index.scans) == (("by hand", "once more"), 3)
     assert names_and_points(tmp_path / "better") == [names_and_points(original)[i] for i in (2, 6, 7)]
-    with pytest.raises(ConfigError, match="good holds a bank; expected a folder of its own"):
+    with pytest.raises(ConfigError, match="good holds a bank; expected an empty folder"):
         drop(Bank(original), [0], "elsewhere", good, progress=False)
 
 
@@ -102,7 +102,7 @@ def test_parts_of_a_curated_bank_are_curated(good: Path, tmp_path: Path, shares:
     assert names_and_points(tmp_path / "head") == names_and_points(good)[:3]
 
 
-def test_a_part_of_a_shard_keeps_what_is_dropped_in_it(tmp_path: Path) -> None:
+def test_a_part_of_a_shard_keeps_its_dropped_scans(tmp_path: Path) -> None:
     write_bank(tmp_path / "bank", [some_image(i) for i in range(9)], shard_size=9)
     drop(Bank(tmp_path / "bank"), [2, 4, 5], "by hand", tmp_path / "good", progress=False)
     parts = split(Bank(tmp_path / "good"), {tmp_path / "a": 2 / 6, tmp_path / "b": 4 / 6}, progress=False)
@@ -118,7 +118,7 @@ def test_a_part_of_a_shard_keeps_what_is_dropped_in_it(tmp_path: Path) -> None:
 
 def test_repair_keeps_the_curation(good: Path, original: Path, model: Path) -> None:
     before, index = shards(good), (good / INDEX).read_bytes()
-    (good / "shard-00000.curated.h5").unlink()  # not the original: a second name for it
+    (good / "shard-00000.curated.h5").unlink()  # removes a hard link, not the original
     flip_copy(good / "shard-00001.curated.h5")
     assert [problem.file for problem in verify(good, progress=False)][:2] == [
         "shard-00000.curated.h5",
@@ -130,31 +130,31 @@ def test_repair_keeps_the_curation(good: Path, original: Path, model: Path) -> N
 
 
 def flip_copy(path: Path) -> None:
-    """Damage a file, but not the others that share its content."""
+    """Damage a file, but not its hard links."""
     copy = path.with_suffix(".copy")
     shutil.copyfile(path, copy)
     copy.replace(path)
     flip(path, 8 * 5000)
 
 
-def test_a_lost_index_never_brings_back_what_was_dropped(good: Path, original: Path, model: Path) -> None:
+def test_a_lost_index_never_restores_dropped_scans(good: Path, original: Path, model: Path) -> None:
     (good / INDEX).unlink()
     with pytest.raises(FileError, match="holds no bank"):
         Bank(good)
-    with pytest.raises(DataError, match=r"are not one bake's; expected a copy of the index"):
+    with pytest.raises(DataError, match=r"are of different bakes; expected a copy of the index"):
         repair(good, str(model), progress=False)
     shutil.copyfile(original / INDEX, good / INDEX)
     with pytest.raises(FileError, match="shard-00000.h5 is missing"):
         Bank(good)
 
 
-def test_a_curated_bank_is_not_baked_into(good: Path, model: Path) -> None:
-    with pytest.raises(ConfigError, match="holds a bank that no bake made"):
+def test_a_bake_refuses_the_folder_of_a_curated_bank(good: Path, model: Path) -> None:
+    with pytest.raises(ConfigError, match="holds a bank that was not made by a bake"):
         bake(make_plan(good, BakeJob(model=str(model), count=8, shard_size=3)), progress=False)
 
 
 @pytest.mark.parametrize("dropped", [(0, 0), (2, 1), (0, 1, 2), (3,), (-1,)])
-def test_an_index_that_leaves_out_what_is_not_there(dropped: tuple[int, ...]) -> None:
+def test_an_index_with_invalid_dropped_positions_is_refused(dropped: tuple[int, ...]) -> None:
     with pytest.raises(DataError, match="ascending positions that leave a scan"):
         Index((some_facts(),), (Entry("a.h5", 0, 0, 3, dropped=dropped),), curation=("by hand",))
     with pytest.raises(DataError, match="and the rule"):
