@@ -294,9 +294,9 @@ def test_a_dry_run_writes_nothing_and_estimates_the_size(model: Path, tmp_path: 
     output = CliRunner().invoke(app, call).output
     assert "50 scans in 3 shards of up to 20" in output and "scans/s" in output and "label policy" in output
     assert not out.exists()
-    whole = CliRunner().invoke(app, [*call[:-1]]).output  # the estimate is close to the actual size
-    estimated, made = (float(text.split(" MB")[0].split()[-1]) for text in (output, whole))
-    assert estimated == pytest.approx(made, rel=0.4)
+    actual = CliRunner().invoke(app, [*call[:-1]]).output  # the estimate is close to the actual size
+    estimated, written = (float(text.split(" MB")[0].split()[-1]) for text in (output, actual))
+    assert estimated == pytest.approx(written, rel=0.4)
 
 
 def test_the_index_needs_a_record_of_every_shard(plan: BakePlan) -> None:

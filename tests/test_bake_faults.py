@@ -80,12 +80,12 @@ def test_a_signal_keeps_finished_shards(
     with pytest.raises(KeyboardInterrupt):
         stop_after(plan, scans, lambda: os.kill(os.getpid(), stop))
     assert signal.getsignal(signal.SIGTERM) == before
-    whole = sorted(path.name for path in plan.out.glob("*.h5"))
-    assert len(whole) == (scans - 1) // SIZE and not list(plan.out.glob(".*.part")) and not (plan.out / INDEX).exists()
-    times = {name: (plan.out / name).stat().st_mtime_ns for name in whole}
+    kept = sorted(path.name for path in plan.out.glob("*.h5"))
+    assert len(kept) == (scans - 1) // SIZE and not list(plan.out.glob(".*.part")) and not (plan.out / INDEX).exists()
+    times = {name: (plan.out / name).stat().st_mtime_ns for name in kept}
     bake(plan, progress=False)
     assert files(plan.out) == expected
-    assert times == {name: (plan.out / name).stat().st_mtime_ns for name in whole}  # not written twice
+    assert times == {name: (plan.out / name).stat().st_mtime_ns for name in kept}  # not written twice
 
 
 def start(out: Path, model: Path, *options: str, **others: Any) -> subprocess.Popen[str]:
@@ -101,8 +101,8 @@ def wait_for_shards(process: subprocess.Popen[str], out: Path, count: int) -> No
 
 
 def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path) -> None:
-    whole = plan_in(tmp_path / "whole" / "bank", model, count=60, shard_size=5)
-    bake(whole, progress=False)
+    reference = plan_in(tmp_path / "reference" / "bank", model, count=60, shard_size=5)
+    bake(reference, progress=False)
     out = tmp_path / "bank"
     process = start(out, model)
     wait_for_shards(process, out, 2)
@@ -117,7 +117,7 @@ def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path) -> None:
     assert f"stopped; finished shards are kept in {out}, and the same command resumes" in errors
     assert "Traceback" not in errors
     bake(plan_in(out, model, count=60, shard_size=5), progress=False)
-    assert files(out) == files(whole.out)
+    assert files(out) == files(reference.out)
 
 
 def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
@@ -189,13 +189,13 @@ SHARES = {"all": [()] * 3, "shares": [("--shard-index", str(k), "--num-shards", 
 @pytest.mark.parametrize("shares", ["all", pytest.param("shares", marks=pytest.mark.slow)])
 def test_three_concurrent_bakes_write_the_same_bytes(model: Path, tmp_path: Path, shares: str) -> None:
     """Three processes; none removes a file that another one is writing."""
-    whole = plan_in(tmp_path / "whole" / "bank", model, count=60, shard_size=5)
-    bake(whole, progress=False)
+    reference = plan_in(tmp_path / "reference" / "bank", model, count=60, shard_size=5)
+    bake(reference, progress=False)
     out = tmp_path / "bank"
     processes = [start(out, model, *options) for options in SHARES[shares]]
     ended = [(process.communicate()[1], process.returncode) for process in processes]
     assert [code for _, code in ended] == [0, 0, 0], ended
-    assert files(out) == files(whole.out)
+    assert files(out) == files(reference.out)
 
 
 def test_a_bake_that_ends_leaves_the_open_shard_of_another_one(plan: BakePlan, expected: dict[str, bytes]) -> None:

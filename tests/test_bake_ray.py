@@ -85,16 +85,16 @@ def test_the_engine_starts_and_stops_its_own_cluster(plan: BakePlan, model: Path
         bake(plan, "ray", Resources(1, "auto"), progress=False)
     assert bake(plan, "ray", Resources(2), progress=False) is not None
     assert not ray.is_initialized()
-    whole = plan_in(tmp_path / "whole" / "bank", model)
-    bake(whole, progress=False)
-    assert files(plan.out) == files(whole.out)
+    reference = plan_in(tmp_path / "reference" / "bank", model)
+    bake(reference, progress=False)
+    assert files(plan.out) == files(reference.out)
 
 
 @pytest.mark.timeout(900)
 def test_a_bake_survives_lost_actors_and_nodes(cluster: Any, model: Path, tmp_path: Path) -> None:
     """A second node joins; an actor of the first node and later the second node are killed while they write a shard."""
-    whole, plan = (plan_in(tmp_path / name / "bank", model, count=1200, shard_size=40) for name in ("whole", "upset"))
-    bake(whole, progress=False)
+    single, plan = (plan_in(tmp_path / name / "bank", model, count=1200, shard_size=40) for name in ("single", "upset"))
+    bake(single, progress=False)
     prepare(plan)
     reported: list[int] = []
     first: set[int] = set()
@@ -124,7 +124,7 @@ def test_a_bake_survives_lost_actors_and_nodes(cluster: Any, model: Path, tmp_pa
     assert upsets == ["a node joined", "an actor was killed", "another started", "a node left"]
     assert len(first) == 1 and len(second) == 1 and sum(reported) == 1200
     assert finish(plan) is not None
-    assert files(plan.out) == files(whole.out)
+    assert files(plan.out) == files(single.out)
 
 
 def test_an_error_of_an_actor_is_raised(cluster: Any, plan: BakePlan) -> None:

@@ -34,10 +34,10 @@ def plan(model: Path, tmp_path: Path) -> BakePlan:
 
 
 def test_jobs_write_the_same_bytes(plan: BakePlan, model: Path, tmp_path: Path) -> None:
-    whole = plan_in(tmp_path / "whole" / "bank", model)
-    bake(whole, progress=False)
+    reference = plan_in(tmp_path / "reference" / "bank", model)
+    bake(reference, progress=False)
     assert bake(plan, "slurm", Resources(3, slurm=LOCAL), progress=False) is not None
-    assert files(plan.out) == files(whole.out)
+    assert files(plan.out) == files(reference.out)
     assert not (plan.out / LOGS).exists()  # a finished bank needs no logs
 
 

@@ -136,10 +136,10 @@ def test_the_most_similar_earlier_scan_is_found(seed: int, count: int, block: in
     products = signatures.astype(np.float32) @ signatures.astype(np.float32).T
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(duplicates, "BLOCK", block)
-        likeness, twin = duplicates.most_alike(signatures, progress=False)
-    assert (likeness[0], twin[0]) == (0, -1)
+        similarity, twin = duplicates.most_similar(signatures, progress=False)
+    assert (similarity[0], twin[0]) == (0, -1)
     for i in range(1, count):
-        assert 0 <= twin[i] < i and likeness[i] == pytest.approx(min(products[i, :i].max(), 1), abs=1e-6)
+        assert 0 <= twin[i] < i and similarity[i] == pytest.approx(min(products[i, :i].max(), 1), abs=1e-6)
         assert products[i, twin[i]] == pytest.approx(products[i, :i].max(), abs=1e-6)
 
 

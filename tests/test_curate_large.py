@@ -23,9 +23,9 @@ import lidar_synth.bake.curate.duplicates as duplicates
 import lidar_synth.bake.curate.neighbours as neighbours
 import lidar_synth.bake.curate.store as store_module
 from lidar_synth.bake.curate import FILE, kept_in, read_scores, score
-from lidar_synth.bake.curate.duplicates import compare_all, most_alike
+from lidar_synth.bake.curate.duplicates import compare_all, most_similar
 from lidar_synth.bake.curate.features import SIGNATURE
-from lidar_synth.bake.curate.neighbours import find_alike
+from lidar_synth.bake.curate.neighbours import find_similar
 from lidar_synth.bake.curate.store import FOLDER, Store
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry
@@ -59,11 +59,11 @@ def some_signatures(count: int, rng: np.random.Generator, scenes: int = 30, own:
     return unit
 
 
-def like(signature: NDArray[np.float32], likeness: float, rng: np.random.Generator) -> NDArray[np.float32]:
+def like(signature: NDArray[np.float32], similarity: float, rng: np.random.Generator) -> NDArray[np.float32]:
     """Another unit vector with about this similarity."""
     noise = rng.normal(size=SIGNATURE) * signature
     noise -= signature * (noise @ signature)
-    noise *= np.sqrt(1 / likeness**2 - 1) / np.linalg.norm(noise)
+    noise *= np.sqrt(1 / similarity**2 - 1) / np.linalg.norm(noise)
     other = np.clip(signature + noise, 0, None)
     unit: NDArray[np.float32] = (other / np.linalg.norm(other)).astype(np.float32)
     return unit
@@ -94,31 +94,31 @@ def many() -> Planted:
 def test_near_duplicates_are_found(scenes: int) -> None:
     """At least 95 % of the scans with a similarity at the threshold, and every copy."""
     signatures, near, copies = planted(8_000, scenes, scenes=scenes)
-    likeness, twin = find_alike(signatures, progress=False)
+    similarity, twin = find_similar(signatures, progress=False)
     true = [float(signatures[a].astype(float) @ signatures[b].astype(float)) for a, b in near.items()]
     assert min(true) > 0.9895 and max(true) < 0.9915
     assert np.mean([twin[a] == b for a, b in near.items()]) >= 0.95
-    assert all(twin[a] == b and likeness[a] > 0.999 for a, b in copies.items())
+    assert all(twin[a] == b and similarity[a] > 0.999 for a, b in copies.items())
 
 
 def test_the_approximate_similarity_never_exceeds_the_exact_one(many: Planted) -> None:
     signatures = many.signatures[:4000]
-    likeness, twin = find_alike(signatures, progress=False)
+    similarity, twin = find_similar(signatures, progress=False)
     exact, _ = compare_all(signatures, progress=False)
-    assert (likeness <= exact + 1e-5).all() and (likeness[0], twin[0]) == (0, -1)
-    assert ((twin < np.arange(4000)) & (likeness >= 0)).all()
+    assert (similarity <= exact + 1e-5).all() and (similarity[0], twin[0]) == (0, -1)
+    assert ((twin < np.arange(4000)) & (similarity >= 0)).all()
     found = twin >= 0
     products = np.einsum("nd,nd->n", signatures.astype(np.float64), signatures[twin].astype(np.float64))
-    assert np.allclose(likeness[found], products.clip(max=1)[found], atol=1e-5)
-    assert np.median(exact - likeness) < 0.03
+    assert np.allclose(similarity[found], products.clip(max=1)[found], atol=1e-5)
+    assert np.median(exact - similarity) < 0.03
 
 
 def test_the_block_size_changes_nothing(many: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = find_alike(many.signatures, progress=False)
+    expected = find_similar(many.signatures, progress=False)
     for rows in (97, 5000):
         monkeypatch.setattr(neighbours, "ROWS", rows)
         monkeypatch.setattr(neighbours, "PAIRS", 300 * rows)
-        for one, other in zip(expected, find_alike(many.signatures, progress=False), strict=True):
+        for one, other in zip(expected, find_similar(many.signatures, progress=False), strict=True):
             assert np.array_equal(one, other)
 
 
@@ -129,11 +129,11 @@ def test_nearly_identical_scans_are_found(monkeypatch: pytest.MonkeyPatch) -> No
     same = np.stack([like(one, 0.9999, rng) for _ in range(1500)])
     signatures = np.concatenate([some_signatures(500, rng), same]).astype(np.float16)
     monkeypatch.setattr(neighbours, "CROWD", 8)
-    likeness, _ = find_alike(signatures, progress=False)
-    assert np.mean(likeness[501:] > 0.999) >= 0.95 and (likeness[:500] < 0.99).all()
+    similarity, _ = find_similar(signatures, progress=False)
+    assert np.mean(similarity[501:] > 0.999) >= 0.95 and (similarity[:500] < 0.99).all()
     empty = np.zeros((100, SIGNATURE), np.float16)
-    likeness, twin = find_alike(empty, progress=False)
-    assert not likeness.any() and twin.tolist() == [-1] + [0] * 99
+    similarity, twin = find_similar(empty, progress=False)
+    assert not similarity.any() and twin.tolist() == [-1] + [0] * 99
 
 
 @settings(max_examples=30)
@@ -143,9 +143,9 @@ def test_the_search_among_few_scans(seed: int, count: int) -> None:
     signatures = rng.random((count, SIGNATURE)) * (rng.random((count, SIGNATURE)) < 0.05)
     signatures = (signatures / np.linalg.norm(signatures, axis=1)[:, None]).astype(np.float16)
     signatures[rng.random(count) < 0.3] = signatures[0]
-    likeness, twin = find_alike(signatures, progress=False)
+    similarity, twin = find_similar(signatures, progress=False)
     exact, _ = compare_all(signatures, progress=False)
-    assert (likeness <= exact + 1e-5).all() and (twin < np.arange(count)).all()
+    assert (similarity <= exact + 1e-5).all() and (twin < np.arange(count)).all()
     for number in range(1, count):
         if any(np.array_equal(signatures[number], signatures[i]) for i in range(number)):
             assert np.array_equal(signatures[number], signatures[twin[number]])
@@ -154,14 +154,14 @@ def test_the_search_among_few_scans(seed: int, count: int) -> None:
 def test_large_banks_use_the_approximate_search(many: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(duplicates, "compare_all", None)
     monkeypatch.setattr(duplicates, "ALL_PAIRS", len(many.signatures) - 1)
-    assert np.array_equal(most_alike(many.signatures, False)[1], find_alike(many.signatures, False)[1])
+    assert np.array_equal(most_similar(many.signatures, False)[1], find_similar(many.signatures, False)[1])
 
 
 def peak(store: Store) -> int:
     """Peak memory of a search in bytes."""
     tracemalloc.start()
     try:
-        find_alike(store, progress=False)
+        find_similar(store, progress=False)
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -202,12 +202,12 @@ def bank(tmp_path: Path) -> Bank:
 
 
 def test_the_size_of_the_files_changes_no_score(bank: Bank, request: pytest.FixtureRequest) -> None:
-    whole = score(bank, progress=False)
+    expected = score(bank, progress=False)
     request.getfixturevalue("small_files")
     for jobs in (1, 2):
         parts = score(bank, jobs=jobs, progress=False)
-        assert list(parts.values) == list(whole.values) and np.array_equal(parts.twin, whole.twin)
-        assert all(np.array_equal(parts.values[name], values) for name, values in whole.values.items())
+        assert list(parts.values) == list(expected.values) and np.array_equal(parts.twin, expected.twin)
+        assert all(np.array_equal(parts.values[name], values) for name, values in expected.values.items())
 
 
 @pytest.mark.usefixtures("small_files")

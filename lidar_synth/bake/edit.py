@@ -39,7 +39,7 @@ def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
                 f"{bank.root} holds {bank.facts.fields} of sensor {bank.sensor.name!r}",
                 f"{first.fields} of sensor {first.sensor.name!r}, as {banks[0].root}",
             )
-    _check_apart(banks)
+    _check_disjoint(banks)
     return _write(out, [(bank, 0, len(bank)) for bank in banks], progress)
 
 
@@ -135,12 +135,12 @@ def _write(out: Path, parts: Sequence[tuple[Bank, int, int]], progress: bool) ->
                 if facts not in sources:
                     sources.append(facts)
                 new = replace(entry, file=_name(len(entries), bool(curation)), source=sources.index(facts))
-                entries.append(_take(bank, number, new, first, last, out))
+                entries.append(_copy_part(bank, number, new, first, last, out))
                 bar.update(last - first)
     return write_bank_files(out, Index(tuple(sources), tuple(entries), curation=curation))
 
 
-def _take(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path) -> Entry:
+def _copy_part(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path) -> Entry:
     """Write the kept scans ``first`` to ``last`` - 1 of a shard as the shard ``entry.file`` of another bank."""
     path = out / entry.file
     if (first, last) == (0, entry.kept):
@@ -184,7 +184,7 @@ def _check_empty(out: Path) -> None:
         raise FileError(f"{out} cannot be created ({error.strerror})", "a writable folder") from error
 
 
-def _check_apart(banks: Sequence[Bank]) -> None:
+def _check_disjoint(banks: Sequence[Bank]) -> None:
     """Refuse banks that share a scan: the same checkpoint, settings, seed and index."""
     taken: dict[tuple[str, str, int], list[tuple[int, int, str | Path]]] = {}
     for bank in banks:

@@ -4,7 +4,7 @@ import time
 from typing import NamedTuple
 
 from lidar_synth.bake.job import BakePlan
-from lidar_synth.bake.shard import generate, load_checked, one_computer
+from lidar_synth.bake.shard import generate, load_checked, torch_threads
 from lidar_synth.bank.chunks import deflate
 from lidar_synth.bank.layout import metadata_size
 
@@ -29,7 +29,7 @@ def estimate(plan: BakePlan) -> Estimate:
     """
     job = plan.job
     generator, batch = load_checked(job, plan.facts), job.batch or 1
-    with one_computer(job.threads):
+    with torch_threads(job.threads):
         for _ in range(2):
             start = time.perf_counter()
             images = generate(generator, job, range(job.first, job.first + batch))

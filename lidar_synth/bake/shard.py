@@ -68,7 +68,7 @@ def write_shard(generator: Generator, path: Path, job: BakeJob, facts: Facts, en
     # One thread compresses 250 scans/s, more than a CPU generates; the number of threads changes no byte.
     compressors = job.threads if job.device == "cpu" else min(16, os.cpu_count() or 1)
     writer = ShardWriter(path, facts, entry, conditions=names, threads=compressors)
-    with one_computer(job.threads), writer:
+    with torch_threads(job.threads), writer:
         for image in images(generator, job, entry):
             writer.append(image)
             progress(1)
@@ -98,7 +98,7 @@ def _source(job: BakeJob) -> ScanFiles | None:
 
 
 @contextmanager
-def one_computer(threads: int) -> Iterator[None]:
+def torch_threads(threads: int) -> Iterator[None]:
     """Set torch's number of threads, on which the computed bits depend, so that all engines compute the same."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from lidar_synth.bake.folder import SETTINGS
 from lidar_synth.bake.options import BakeJob
-from lidar_synth.bake.shard import generate, load_checked, one_computer
+from lidar_synth.bake.shard import generate, load_checked, torch_threads
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.card import CARD, CROISSANT
 from lidar_synth.errors import DataError, FileError
@@ -134,7 +134,7 @@ def regenerate(
         facts = bank.facts_of(number)
         job = job_of(facts, model)
         generator = load_checked(job, facts)
-        with one_computer(job.threads):
+        with torch_threads(job.threads):
             index = int(name.rpartition("/")[2])
             [again] = generate(generator, job, [index])
         shares[name] = agreement(bank.image(number), again)

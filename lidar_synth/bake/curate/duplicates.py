@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lidar_synth.bake.curate.neighbours import Signatures, find_alike
+from lidar_synth.bake.curate.neighbours import Signatures, find_similar
 
 ALL_PAIRS = 20_000
 """Largest number of scans for the exact search over all pairs."""
@@ -13,7 +13,7 @@ BLOCK = 2048
 """Signatures compared with one another at a time: 16 MB of products."""
 
 
-def most_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def most_similar(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The most similar earlier scan of each scan; approximate for more than ``ALL_PAIRS`` scans.
 
     Only earlier scans count, so that the first of a group of similar scans has no duplicate and stays when the others
@@ -26,11 +26,11 @@ def most_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[n
     Returns:
         (N,) similarity in [0, 1], 0 for the first scan; (N,) number of the most similar scan, -1 for the first.
     """
-    return (compare_all if len(signatures) <= ALL_PAIRS else find_alike)(signatures, progress)
+    return (compare_all if len(signatures) <= ALL_PAIRS else find_similar)(signatures, progress)
 
 
 def compare_all(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Like ``most_alike``, over all pairs; the time grows with the square of the number of scans."""
+    """Like ``most_similar``, over all pairs; the time grows with the square of the number of scans."""
     count = len(signatures)
     best, twin = np.zeros(count), np.full(count, -1)
     starts = range(0, count, BLOCK)
@@ -40,7 +40,7 @@ def compare_all(signatures: Signatures, progress: bool = True) -> tuple[NDArray[
         products = later @ earlier.T
         products[np.arange(a, a + len(later))[:, None] <= np.arange(b, b + len(earlier))] = -1
         found = products.argmax(1)
-        likeness = products[np.arange(len(later)), found].clip(max=1)
-        better = likeness > np.where(twin[a : a + BLOCK] < 0, -0.5, best[a : a + BLOCK])
-        best[a : a + BLOCK][better], twin[a : a + BLOCK][better] = likeness[better], found[better] + b
+        similarity = products[np.arange(len(later)), found].clip(max=1)
+        better = similarity > np.where(twin[a : a + BLOCK] < 0, -0.5, best[a : a + BLOCK])
+        best[a : a + BLOCK][better], twin[a : a + BLOCK][better] = similarity[better], found[better] + b
     return best, twin

@@ -60,15 +60,15 @@ class Signatures(Protocol):
         ...
 
 
-def find_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """For each signature, approximately the most similar earlier one; like ``most_alike``.
+def find_similar(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """For each signature, approximately the most similar earlier one; like ``most_similar``.
 
     Returns:
         (N,) similarity in [0, 1], never more than that of the exact nearest neighbour; (N,) number of the earlier scan,
         -1 where none was found.
     """
     count = len(signatures)
-    likeness, twin = np.zeros(count), np.full(count, -1)
+    similarity, twin = np.zeros(count), np.full(count, -1)
     with tqdm(total=PROBES + 3, desc="duplicates", unit="step", disable=not progress, delay=2) as steps:
         first = _first_copies(signatures)
         steps.update()
@@ -81,9 +81,9 @@ def find_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[n
             found = np.where(candidates < 0, -1, own[candidates])  # to numbers among all signatures
             copies = first[part] < np.arange(part.start, part.stop)
             found[copies] = first[part][copies, None]
-            likeness[part], twin[part] = _best(signatures, part, found)
+            similarity[part], twin[part] = _best(signatures, part, found)
         steps.update()
-    return likeness, twin
+    return similarity, twin
 
 
 def _parts(count: int, size: int | None = None) -> Iterator[slice]:
@@ -179,10 +179,10 @@ def _best(
     numbers, places = np.unique(found, return_inverse=True)
     others = signatures[numbers.clip(0)].astype(np.float32)
     own = signatures[part].astype(np.float32)
-    likeness = np.full(found.shape, -1.0)
+    similarity = np.full(found.shape, -1.0)
     for column, place in enumerate(places.reshape(found.shape).T):
-        likeness[:, column] = np.einsum("nd,nd->n", own, others[place])
-    likeness[found < 0] = -1
-    best = likeness.argmax(1)
+        similarity[:, column] = np.einsum("nd,nd->n", own, others[place])
+    similarity[found < 0] = -1
+    best = similarity.argmax(1)
     rows = np.arange(len(found))
-    return likeness[rows, best].clip(0, 1), found[rows, best]
+    return similarity[rows, best].clip(0, 1), found[rows, best]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lidar_synth.bake.curate.duplicates import most_alike
+from lidar_synth.bake.curate.duplicates import most_similar
 from lidar_synth.bake.curate.features import MEASURES, RANGE_BINS, features
 from lidar_synth.bake.curate.store import Store, measure
 from lidar_synth.bank import Bank
@@ -103,7 +103,7 @@ def score(
             values["labels"] = _distances(store, "classes", classes)
         numbers = np.concatenate([rows["numbers"] for rows in store.blocks()])
         values |= dict(zip(store.names, numbers.T.copy(), strict=True))
-        values["duplicate"], twin = most_alike(store, progress)
+        values["duplicate"], twin = most_similar(store, progress)
     return Scores(bank.identity, name, {n: values[n] for n in MEANINGS if n in values}, twin)
 
 

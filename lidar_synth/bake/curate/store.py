@@ -93,7 +93,7 @@ class Store:
         """
         write_file(self._path(block), lambda file: np.save(file, rows, allow_pickle=False), durable=True)
 
-    def there(self) -> int:
+    def stored(self) -> int:
         """Number of rows in the existing files, up to the first missing or damaged one."""
         for block in range(-(-self.count // BLOCK)):
             try:
@@ -114,7 +114,7 @@ def measure(bank: Bank, folder: Path, jobs: int, progress: bool) -> Store:
     """
     own = folder / f"{bank.identity[:16]}-{lidar_synth.__version__}"  # not reused by others
     store = Store(own, len(bank), measured(bank.fields))
-    start = store.there()
+    start = store.stored()
     spans = [range(a, min(a + _UNIT, len(bank))) for a in range(start, len(bank), _UNIT)]
     waiting: list[NDArray[Any]] = []
     with (
