@@ -255,7 +255,7 @@ def test_invalid_options_are_refused(options: list[str], message: str, model: Pa
 
 def test_unsuitable_models_are_refused(tmp_path: Path) -> None:
     plain = write(tmp_path / "plain.safetensors", ("range", "reflectance"))
-    with pytest.raises(ConfigError, match=r"fields \['label'\] of model .*some of \['reflectance'\].*channels"):
+    with pytest.raises(ConfigError, match=r"fields \['label'\] of model .*some of \['reflectance'\].*channel"):
         plan_in(tmp_path / "bank", plain, fields=("reflectance", "label"))
     assert plan_in(tmp_path / "bank", plain).facts.label_policy == "none"
     with pytest.raises(ConfigError, match="condition here for model .*takes no condition; expected none"):

@@ -114,7 +114,7 @@ def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path) -> None:
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate()
     assert process.returncode == 1
-    assert f"stopped; finished shards are kept in {out}, and the same command resumes" in errors
+    assert f"stopped; finished shards are kept in {out}, the same command resumes" in errors
     assert "Traceback" not in errors
     bake(plan_in(out, model, count=60, shard_size=5), progress=False)
     assert files(out) == files(reference.out)
