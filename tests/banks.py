@@ -1,4 +1,4 @@
-"""Small banks for tests, with facts that nobody has to bake for."""
+"""Small banks for tests, written without a bake."""
 
 import json
 import zipfile
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidar_synth.bake.folder import write_bank_files
-from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
+from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.projection import project
@@ -22,7 +22,7 @@ SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 
 
 def some_facts(sensor: Sensor = SENSOR, **others: Any) -> Facts:
-    """Facts of a bank that no model made."""
+    """Facts of a bank without a model."""
     known = {
         "sensor": sensor, "fields": ("reflectance", "label"), "model": "small", "checkpoint": "c" * 64,
         "settings": {"seed": 5}, "label_policy": "generated", "licence": "MIT", "data_licence": "none",
@@ -31,7 +31,7 @@ def some_facts(sensor: Sensor = SENSOR, **others: Any) -> Facts:
 
 
 def some_image(seed: int = 0, sensor: Sensor = SENSOR) -> RangeImage:
-    """A range image with everything that a bank can hold, a third of it empty."""
+    """A random range image with every field of a bank; a third of its cells are empty."""
     rng = np.random.default_rng(seed)
     seen = rng.random(sensor.shape) < 0.67
     metres = rng.uniform(sensor.range_min, sensor.range_max, sensor.shape)
@@ -44,7 +44,7 @@ def some_image(seed: int = 0, sensor: Sensor = SENSOR) -> RangeImage:
 
 
 def write_bank(root: Path, images: Sequence[RangeImage], shard_size: int = 2, **others: Any) -> list[Path]:
-    """A bank of these images; the file of each shard."""
+    """Write a bank with these images; returns the files of its shards."""
     facts = some_facts(images[0].sensor, **others)
     root.mkdir(parents=True, exist_ok=True)
     entries = []
@@ -61,7 +61,7 @@ def write_bank(root: Path, images: Sequence[RangeImage], shard_size: int = 2, **
 
 
 def add_stray(path: Path) -> None:
-    """What numpy before 2.2 makes of ``savez(file, allow_pickle=False)``."""
+    """Add the stray entry that numpy before 2.2 writes for ``savez(file, allow_pickle=False)``."""
     content = BytesIO()
     np.save(content, np.array(False))
     with zipfile.ZipFile(path, "a") as file:
@@ -69,7 +69,7 @@ def add_stray(path: Path) -> None:
 
 
 def write_golden_bank(root: Path) -> None:
-    """The bank in tests/golden, and beside it the numbers by which a reader knows that it reads it right."""
+    """Write the bank in tests/golden, and numbers.json with the expected statistics of its scans."""
     from lidar_synth.town import Town
 
     sensor = load_sensor(Path(__file__).parents[1] / "configs" / "tiny_sensor.yaml")
@@ -83,7 +83,7 @@ def write_golden_bank(root: Path) -> None:
 
 
 def numbers(bank: Bank, number: int) -> dict[str, Any]:
-    """What a scan of a bank sums up to."""
+    """Statistics of a scan of a bank."""
     image = bank.image(number)
     assert image.label is not None and image.reflectance is not None
     return {
@@ -94,3 +94,16 @@ def numbers(bank: Bank, number: int) -> dict[str, Any]:
         "confidence": round(float(image.channels["confidence"].sum(dtype=np.float64)), 3),
         "labels": np.bincount(image.label.reshape(-1), minlength=256)[[*range(19), IGNORE]].tolist(),
     }
+
+
+def edit_index(root: Path, **changes: Any) -> None:
+    """Change values of a bank's index and write it with a matching checksum."""
+    index = Index.from_json((root / INDEX).read_bytes(), INDEX)
+    (root / INDEX).write_bytes(replace(index, **changes).to_json())
+
+
+def spoiled(name: str, value: float) -> RangeImage:
+    """A range image with one changed value in a channel."""
+    image = some_image()
+    (image.range if name == "range" else image.channels[name])[3, 4] = value
+    return image

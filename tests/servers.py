@@ -1,4 +1,4 @@
-"""A web server for files, with ranges, that counts what it serves."""
+"""A web server for files with support for byte ranges, which records its requests."""
 
 import re
 from collections.abc import Iterator
@@ -11,13 +11,13 @@ from threading import Thread
 
 @dataclass
 class Served:
-    """What a server was asked for.
+    """State and requests of a server.
 
     Args:
-        url: of its folder.
-        ranges: whether it serves parts of files.
-        requests: (file, bytes of the answer's body), in order.
-        broken: names of files for which it answers with an error of its own.
+        url: URL of its folder.
+        ranges: whether it supports byte ranges.
+        requests: (file, size of the response body), in order.
+        broken: names of files for which it responds with status 500.
     """
 
     url: str = ""

@@ -1,6 +1,7 @@
-"""Baking: the same bytes by every engine; what cannot be made is refused at once."""
+"""Baking: every engine writes the same bytes; invalid settings are refused before any work."""
 
 import itertools
+import re
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import torch
 import yaml
 from bakes import COUNT, SIZE, files, plan_in
 from layouts import some_scan, write_all
+from pydantic.fields import FieldInfo
 from test_generator import SENSOR, write
 from typer.testing import CliRunner
 
@@ -68,7 +70,7 @@ def test_a_bank_holds_the_models_scans(plan: BakePlan, model: Path, expected: di
 
 
 def write_conditioned(path: Path) -> Path:
-    """A checkpoint with random weights that makes ranges from label maps."""
+    """A checkpoint with random weights that generates ranges from label maps."""
     arguments = {
         "resolution": SENSOR.shape, "channels": 1, "width": 16, "time_width": 16, "depths": (1, 1), "heads": (2, 2),
         "patch": (2, 2), "window": (3, 3), "condition_channels": 3,
@@ -107,31 +109,33 @@ def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
     assert np.array_equal(bank.image(5).label, expected.label)
     assert min(regenerate(plan.out, str(model), progress=False).values()) == 1
     (plan.out / "shard-00001.h5").unlink()
-    assert repair(plan.out, str(model), progress=False) == {"shard-00001.h5": "made again"}
+    assert repair(plan.out, str(model), progress=False) == {"shard-00001.h5": "regenerated"}
 
 
 # The same bytes
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
-def test_processes(plan: BakePlan, expected: dict[str, bytes], workers: int) -> None:
+def test_processes_write_the_same_bytes(plan: BakePlan, expected: dict[str, bytes], workers: int) -> None:
     prepare(plan)
-    told: list[int] = []
-    ENGINES["processes"](plan, range(4), Resources(workers), told.append)
-    assert sum(told) == COUNT  # the bar counts every scan once
+    reported: list[int] = []
+    ENGINES["processes"](plan, range(4), Resources(workers), reported.append)
+    assert sum(reported) == COUNT  # the bar counts every scan once
     finish(plan)
     assert files(plan.out) == expected
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(4)))[::5])
-def test_shares_in_any_order(plan: BakePlan, expected: dict[str, bytes], order: tuple[int, ...]) -> None:
-    found = [bake(plan, share=Share(k, 4), progress=False) for k in order]
-    assert found[:3] == [None, None, None] and found[3] is not None
+def test_shares_in_any_order_write_the_same_bytes(
+    plan: BakePlan, expected: dict[str, bytes], order: tuple[int, ...]
+) -> None:
+    indices = [bake(plan, share=Share(k, 4), progress=False) for k in order]
+    assert indices[:3] == [None, None, None] and indices[3] is not None
     assert files(plan.out) == expected
 
 
 @pytest.mark.parametrize("ranks", [(0,), (1, 0), (1, 2, 0)])
-def test_ranks_of_torchrun_in_turn(
+def test_ranks_of_torchrun_one_after_another_write_the_same_bytes(
     plan: BakePlan, expected: dict[str, bytes], ranks: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ConfigError, match="engine 'torchrun' without 'RANK'.*torchrun --nproc-per-node"):
@@ -144,8 +148,8 @@ def test_ranks_of_torchrun_in_turn(
     assert index is not None and files(plan.out) == expected
 
 
-def test_torchrun(plan: BakePlan, model: Path, expected: dict[str, bytes]) -> None:
-    """Two processes at once, as its own command starts them."""
+def test_torchrun_writes_the_same_bytes(plan: BakePlan, model: Path, expected: dict[str, bytes]) -> None:
+    """Two concurrent processes, started by torchrun itself."""
     options = ["--model", model, "--count", COUNT, "--shard-size", SIZE, "--seed", 4, "--engine", "torchrun"]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2]
     subprocess.run([str(a) for a in (*command, "-m", "lidar_synth", "bake", plan.out, *options)], check=True)
@@ -153,7 +157,9 @@ def test_torchrun(plan: BakePlan, model: Path, expected: dict[str, bytes]) -> No
 
 
 @pytest.mark.parametrize("engine", ["ray", "slurm"])
-def test_engines_whose_library_is_missing(plan: BakePlan, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_of_an_engine_is_reported(
+    plan: BakePlan, engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, {"ray": "ray", "slurm": "submitit"}[engine], None)
     with pytest.raises(LibraryError, match=rf"engine '{engine}', but .* pip install 'lidar_synth\[{engine}\]'"):
         bake(plan, engine, progress=False)
@@ -162,6 +168,14 @@ def test_engines_whose_library_is_missing(plan: BakePlan, engine: str, monkeypat
 def test_every_engine_is_named_in_the_help() -> None:
     text = CliRunner().invoke(app, ["bake", "--help"]).output
     assert all(engine in text for engine in ENGINES)
+
+
+@pytest.mark.parametrize(("name", "field"), BakeJob.model_fields.items())
+def test_every_setting_is_an_option_with_its_description_and_default(name: str, field: FieldInfo) -> None:
+    text = " ".join(CliRunner().invoke(app, ["bake", "--help"]).output.split())
+    description = f"{field.description}" + ("" if field.default is None else f" [{field.default}]")
+    option = re.escape(f"--{name.replace('_', '-')} ")
+    assert re.search(option + r"(<\w+>|NAME,\.\.\.) " + re.escape(description), text), text
 
 
 # Settings
@@ -177,7 +191,7 @@ def test_every_engine_is_named_in_the_help() -> None:
         ({"batch": 2}, r"'batch': 1.*'batch': 2"),
     ],
 )
-def test_another_setting_is_refused_and_shown(
+def test_a_different_setting_is_refused_and_shown(
     plan: BakePlan, model: Path, change: dict[str, Any], message: str
 ) -> None:
     bake(plan, share=Share(0, 4), progress=False)
@@ -187,7 +201,7 @@ def test_another_setting_is_refused_and_shown(
     assert before == {path: path.read_bytes() for path in plan.out.glob("*.h5")}
 
 
-def test_another_checkpoint_is_refused(plan: BakePlan, tmp_path: Path) -> None:
+def test_a_different_checkpoint_is_refused(plan: BakePlan, tmp_path: Path) -> None:
     bake(plan, share=Share(0, 4), progress=False)
     other = write(tmp_path / "other.safetensors", ("range", "reflectance", "label")[:2])
     with pytest.raises(ConfigError, match="'checkpoint'"):
@@ -200,10 +214,10 @@ def test_another_checkpoint_is_refused(plan: BakePlan, tmp_path: Path) -> None:
         bake(changed, progress=False)
 
 
-def test_a_bank_that_no_bake_made(plan: BakePlan) -> None:
+def test_a_bank_without_bake_settings_is_refused(plan: BakePlan) -> None:
     bake(plan, progress=False)
     (plan.out / SETTINGS).unlink()
-    with pytest.raises(ConfigError, match="holds a bank that no bake made"):
+    with pytest.raises(ConfigError, match="holds a bank that was not made by a bake"):
         bake(plan, progress=False)
 
 
@@ -232,16 +246,16 @@ def test_a_bank_that_no_bake_made(plan: BakePlan) -> None:
         (["--model", "city"], "model 'city'; expected a shipped one"),
     ],
 )
-def test_options_that_cannot_be_served(options: list[str], message: str, model: Path, tmp_path: Path) -> None:
+def test_invalid_options_are_refused(options: list[str], message: str, model: Path, tmp_path: Path) -> None:
     call = ["bake", str(tmp_path / "bank"), "--model", str(model), *options]
     with pytest.raises(ConfigError, match=message):
         CliRunner().invoke(app, call, catch_exceptions=False)
     assert not (tmp_path / "bank").exists()
 
 
-def test_models_that_cannot_serve(tmp_path: Path) -> None:
+def test_unsuitable_models_are_refused(tmp_path: Path) -> None:
     plain = write(tmp_path / "plain.safetensors", ("range", "reflectance"))
-    with pytest.raises(ConfigError, match=r"fields \['label'\] of model .*some of \['reflectance'\].*channels"):
+    with pytest.raises(ConfigError, match=r"fields \['label'\] of model .*some of \['reflectance'\].*channel"):
         plan_in(tmp_path / "bank", plain, fields=("reflectance", "label"))
     assert plan_in(tmp_path / "bank", plain).facts.label_policy == "none"
     with pytest.raises(ConfigError, match="condition here for model .*takes no condition; expected none"):
@@ -256,7 +270,7 @@ def test_models_that_cannot_serve(tmp_path: Path) -> None:
     assert not (tmp_path / "bank").exists()
 
 
-def test_a_configuration_file(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
+def test_options_override_a_configuration_file(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
     config = tmp_path / "bake.yaml"
     config.write_text(yaml.safe_dump({"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 9}))
     result = CliRunner().invoke(app, ["bake", str(tmp_path / "bank"), "--config", str(config), "--seed", "4"])
@@ -274,19 +288,19 @@ def test_published_configurations_load(path: Path) -> None:
     assert validated(BakeJob, read_values(path, BakeJob), str(path)).count >= 1000
 
 
-def test_a_dry_run_makes_nothing(model: Path, tmp_path: Path) -> None:
+def test_a_dry_run_writes_nothing_and_estimates_the_size(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "bank"
     call = ["bake", str(out), "--model", str(model), "--count", "50", "--shard-size", "20", "--dry-run"]
     output = CliRunner().invoke(app, call).output
     assert "50 scans in 3 shards of up to 20" in output and "scans/s" in output and "label policy" in output
     assert not out.exists()
-    whole = CliRunner().invoke(app, [*call[:-1]]).output  # what was estimated is near what comes
-    estimated, made = (float(text.split(" MB")[0].split()[-1]) for text in (output, whole))
-    assert estimated == pytest.approx(made, rel=0.4)
+    actual = CliRunner().invoke(app, [*call[:-1]]).output  # the estimate is close to the actual size
+    estimated, written = (float(text.split(" MB")[0].split()[-1]) for text in (output, actual))
+    assert estimated == pytest.approx(written, rel=0.4)
 
 
-def test_an_index_waits_for_every_shard(plan: BakePlan) -> None:
+def test_the_index_needs_a_record_of_every_shard(plan: BakePlan) -> None:
     bake(plan, share=Share(0, 2), progress=False)
     bake(plan, share=Share(1, 2), progress=False)
     (plan.out / INDEX).unlink()
-    assert finish(plan) is None  # the notes went with the index: the same command looks, and makes again
+    assert finish(plan) is None  # a finished bake has removed the records, so a rerun checks the shards

@@ -1,4 +1,4 @@
-"""Baking that is disturbed: signals, kills, full disks, lost folders. What is finished stays, a rerun ends it."""
+"""Interrupted bakes: signals, kills, full disks, lost folders. Finished shards are kept, a rerun completes the bank."""
 
 import multiprocessing
 import os
@@ -43,14 +43,14 @@ def plan(model: Path, tmp_path: Path) -> BakePlan:
 
 @pytest.fixture(scope="module")
 def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The files of the bank, baked in one go in this process."""
+    """The files of the bank, baked without interruption in this process."""
     plan = plan_in(tmp_path_factory.mktemp("expected") / "bank", model)
     bake(plan, progress=False)
     return files(plan.out)
 
 
 def stop_after(plan: BakePlan, scans: int, stop: Callable[[], object]) -> None:
-    """Bake in this process; call ``stop`` when so many scans are made."""
+    """Bake in this process; call ``stop`` after this many scans."""
     made = 0
 
     def progress(number: int) -> None:
@@ -80,12 +80,12 @@ def test_a_signal_keeps_finished_shards(
     with pytest.raises(KeyboardInterrupt):
         stop_after(plan, scans, lambda: os.kill(os.getpid(), stop))
     assert signal.getsignal(signal.SIGTERM) == before
-    whole = sorted(path.name for path in plan.out.glob("*.h5"))
-    assert len(whole) == (scans - 1) // SIZE and not list(plan.out.glob(".*.part")) and not (plan.out / INDEX).exists()
-    times = {name: (plan.out / name).stat().st_mtime_ns for name in whole}
+    kept = sorted(path.name for path in plan.out.glob("*.h5"))
+    assert len(kept) == (scans - 1) // SIZE and not list(plan.out.glob(".*.part")) and not (plan.out / INDEX).exists()
+    times = {name: (plan.out / name).stat().st_mtime_ns for name in kept}
     bake(plan, progress=False)
     assert files(plan.out) == expected
-    assert times == {name: (plan.out / name).stat().st_mtime_ns for name in whole}  # not made twice
+    assert times == {name: (plan.out / name).stat().st_mtime_ns for name in kept}  # not written twice
 
 
 def start(out: Path, model: Path, *options: str, **others: Any) -> subprocess.Popen[str]:
@@ -100,9 +100,9 @@ def wait_for_shards(process: subprocess.Popen[str], out: Path, count: int) -> No
         time.sleep(0.01)
 
 
-def test_killed_and_terminated_runs_go_on(model: Path, tmp_path: Path) -> None:
-    whole = plan_in(tmp_path / "whole" / "bank", model, count=60, shard_size=5)
-    bake(whole, progress=False)
+def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path) -> None:
+    reference = plan_in(tmp_path / "reference" / "bank", model, count=60, shard_size=5)
+    bake(reference, progress=False)
     out = tmp_path / "bank"
     process = start(out, model)
     wait_for_shards(process, out, 2)
@@ -114,14 +114,14 @@ def test_killed_and_terminated_runs_go_on(model: Path, tmp_path: Path) -> None:
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate()
     assert process.returncode == 1
-    assert f"stopped; finished shards are kept in {out}, and the same command goes on" in errors
+    assert f"stopped; finished shards are kept in {out}, the same command resumes" in errors
     assert "Traceback" not in errors
     bake(plan_in(out, model, count=60, shard_size=5), progress=False)
-    assert files(out) == files(whole.out)
+    assert files(out) == files(reference.out)
 
 
 def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
-    """A terminal sends it to every process of the group; one of them answers."""
+    """A terminal sends the signal to every process of the group; only the parent reports it."""
     process = start(tmp_path / "bank", model, "--engine", "processes", "--workers", "2", process_group=0)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     while len(children.read_text().split()) < 3:  # the workers, and Python's own for what they share
@@ -133,7 +133,7 @@ def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
     assert "stopped; finished shards are kept" in errors and "Traceback" not in errors
 
 
-def test_a_killed_worker_is_told_of(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
+def test_a_killed_worker_is_reported(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
     plan = plan_in(tmp_path / "bank", model, count=300, shard_size=100)
 
     def kill(scans: int) -> None:
@@ -147,14 +147,14 @@ def test_a_killed_worker_is_told_of(model: Path, tmp_path: Path, expected: dict[
     assert multiprocessing.active_children() == []
 
 
-def test_what_a_worker_raises_arrives(plan: BakePlan, model: Path) -> None:
+def test_an_error_of_a_worker_is_raised(plan: BakePlan, model: Path) -> None:
     prepare(plan)
     (plan.out / SETTINGS).unlink()
     with pytest.raises(FileError, match="has vanished or lost its .bake.json"):
         ENGINES["processes"](plan, range(4), Resources(1), lambda scans: None)
 
 
-def test_a_finished_shard_that_rots_is_made_again(plan: BakePlan, expected: dict[str, bytes]) -> None:
+def test_a_damaged_finished_shard_is_regenerated(plan: BakePlan, expected: dict[str, bytes]) -> None:
     bake(plan, progress=False)
     path = plan.out / "shard-00001.h5"
     content = bytearray(path.read_bytes())
@@ -165,8 +165,8 @@ def test_a_finished_shard_that_rots_is_made_again(plan: BakePlan, expected: dict
     assert files(plan.out) == expected
 
 
-def test_halves_of_killed_processes_are_removed(plan: BakePlan, expected: dict[str, bytes]) -> None:
-    """Not while another process is at work in the folder, and then whoever began them, here or elsewhere."""
+def test_temporary_files_of_killed_processes_are_removed(plan: BakePlan, expected: dict[str, bytes]) -> None:
+    """Only after the last process in the folder has ended, whichever process wrote them."""
     prepare(plan)
     halves = [plan.out / f".shard-0000{k}.h5.abcd.part" for k in range(2)]
     for path in halves:
@@ -178,7 +178,7 @@ def test_halves_of_killed_processes_are_removed(plan: BakePlan, expected: dict[s
         assert other.stdout is not None and other.stdout.readline() == "\n"
         assert bake(plan, progress=False) is not None
         assert all(path.exists() for path in halves) and (plan.out / NOTES).exists()
-        other.kill()  # it gives nothing back itself
+        other.kill()  # the system releases its lock
     bake(plan, progress=False)
     assert files(plan.out) == expected
 
@@ -187,19 +187,19 @@ SHARES = {"all": [()] * 3, "shares": [("--shard-index", str(k), "--num-shards", 
 
 
 @pytest.mark.parametrize("shares", ["all", pytest.param("shares", marks=pytest.mark.slow)])
-def test_three_bakes_at_once(model: Path, tmp_path: Path, shares: str) -> None:
-    """Three processes as one starts them; none clears away what another is just writing."""
-    whole = plan_in(tmp_path / "whole" / "bank", model, count=60, shard_size=5)
-    bake(whole, progress=False)
+def test_three_concurrent_bakes_write_the_same_bytes(model: Path, tmp_path: Path, shares: str) -> None:
+    """Three processes; none removes a file that another one is writing."""
+    reference = plan_in(tmp_path / "reference" / "bank", model, count=60, shard_size=5)
+    bake(reference, progress=False)
     out = tmp_path / "bank"
     processes = [start(out, model, *options) for options in SHARES[shares]]
     ended = [(process.communicate()[1], process.returncode) for process in processes]
     assert [code for _, code in ended] == [0, 0, 0], ended
-    assert files(out) == files(whole.out)
+    assert files(out) == files(reference.out)
 
 
-def test_one_that_ends_while_another_begins_a_shard(plan: BakePlan, expected: dict[str, bytes]) -> None:
-    """The other one is between the first scan of its shard and the last when a whole bake comes and goes."""
+def test_a_bake_that_ends_leaves_the_open_shard_of_another_one(plan: BakePlan, expected: dict[str, bytes]) -> None:
+    """A complete bake starts and ends while another one is in the middle of a shard."""
     ended: list[subprocess.CompletedProcess[str]] = []
 
     def another() -> None:
@@ -214,8 +214,8 @@ def test_one_that_ends_while_another_begins_a_shard(plan: BakePlan, expected: di
     assert files(plan.out) == expected
 
 
-def test_two_folders_claimed_at_once(plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both see an empty folder; the one that is a moment late finds out."""
+def test_two_concurrent_claims_of_a_folder(plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both see an empty folder; the later one detects the conflict."""
     late = plan_in(plan.out, model, seed=5)
     looked = Path.is_file
 
@@ -231,10 +231,10 @@ def test_two_folders_claimed_at_once(plan: BakePlan, model: Path, monkeypatch: p
         prepare(late)
 
 
-def test_two_that_end_at_the_same_time(
+def test_two_bakes_may_end_at_the_same_time(
     plan: BakePlan, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each writes the same files; neither needs the notes that the other one clears away."""
+    """Both write the same files, and neither needs the records that the other one removes."""
     prepare(plan)
     for number in range(4):
         bake_shard(plan, number)
@@ -256,7 +256,7 @@ SHARD = b"shard".ljust(64)
 def test_a_rerun_over_many_shards_parses_the_index_once(
     plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """10,000 shards, all but 20 of them complete. What a shard holds is not read then; a few bytes do."""
+    """10,000 shards, of which 20 are missing. A few bytes stand in for each shard, because its content is not read."""
     many = plan_in(plan.out, model, count=10_000, shard_size=1)
     prepare(many)
     for entry in many.shards:
@@ -305,14 +305,14 @@ def test_a_full_disk_by_limit(plan: BakePlan, expected: dict[str, bytes], share:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 44 kB, where one may be mounted."""
+    """A file system of 44 kB; skips the test where mounting is not permitted."""
     folder = tmp_path / "disk"
     folder.mkdir()
     mounted = shutil.which("mount") and subprocess.run(
         ["mount", "-t", "tmpfs", "-o", "size=44k", "tmpfs", folder], capture_output=True, check=False
     )
     if not mounted or mounted.returncode:
-        pytest.skip("no file system may be mounted here")
+        pytest.skip("mounting a file system is not permitted")
     yield folder
     subprocess.run(["umount", folder], check=True)
 
@@ -320,7 +320,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk(
     small_disk: Path, model: Path, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shard_module, "_PACKED", 0)  # the look at free space before a shard
+    monkeypatch.setattr(shard_module, "_PACKED", 0)  # disables the check of free space before a shard
     plan = plan_in(small_disk / "bank", model)
     with pytest.raises(FileError, match=r"No space left on device.*finished shards are kept"):
         bake(plan, progress=False)
@@ -332,7 +332,7 @@ def test_a_full_disk(
     assert files(plan.out) == expected
 
 
-def test_space_is_looked_at_before_a_shard(plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_free_space_is_checked_before_a_shard(plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = namedtuple("usage", "total used free")
     need = 3 * 8 * 32 * 5 * 0.6
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need - 1))
@@ -343,7 +343,7 @@ def test_space_is_looked_at_before_a_shard(plan: BakePlan, monkeypatch: pytest.M
     assert bake(plan, progress=False) is not None
 
 
-def test_a_folder_that_cannot_be_written(model: Path, tmp_path: Path) -> None:
+def test_an_unwritable_folder_is_reported(model: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for out in (tmp_path / "file", tmp_path / "file" / "bank", Path("/proc/bank")):
         with pytest.raises(FileError, match=r"cannot be written \(.*Choose another output folder"):
@@ -352,7 +352,7 @@ def test_a_folder_that_cannot_be_written(model: Path, tmp_path: Path) -> None:
 
 @contextmanager
 def no_privileges() -> Iterator[None]:
-    """Rights count for root, too, while it has another user's."""
+    """Drop root's privileges, so that file permissions apply."""
     user = os.geteuid()
     if user == 0:
         os.seteuid(65534)
@@ -362,8 +362,8 @@ def no_privileges() -> Iterator[None]:
         os.seteuid(user)
 
 
-def test_a_folder_that_may_not_be_written_any_more(model: Path, expected: dict[str, bytes]) -> None:
-    with tempfile.TemporaryDirectory() as folder:  # pytest's own are closed to other users
+def test_a_folder_that_becomes_read_only(model: Path, expected: dict[str, bytes]) -> None:
+    with tempfile.TemporaryDirectory() as folder:  # pytest's own folders are not accessible to other users
         plan = plan_in(Path(folder) / "bank", model)
         bake(plan, share=Share(0, 4), progress=False)
         Path(folder).chmod(0o755)
@@ -388,8 +388,8 @@ def test_a_folder_that_vanishes(plan: BakePlan, expected: dict[str, bytes]) -> N
     assert files(plan.out) == expected
 
 
-def test_a_disk_that_is_not_mounted_any_more(plan: BakePlan) -> None:
-    """An empty folder stands where the bank was; nothing is to be written into it."""
+def test_a_disk_that_is_unmounted_during_a_bake(plan: BakePlan) -> None:
+    """An empty folder replaces the bank's folder; nothing must be written into it."""
     prepare(plan)
     bake_shard(plan, 0)
     shutil.rmtree(plan.out)

@@ -1,4 +1,4 @@
-"""Engine ``ray`` on real clusters on this machine: actors are killed, nodes come and go, the bytes stay the same."""
+"""Engine ``ray`` on real local clusters: actors are killed, nodes join and leave, the bytes stay the same."""
 
 import os
 import signal
@@ -34,7 +34,7 @@ def plan(model: Path, tmp_path: Path) -> BakePlan:
 
 @pytest.fixture(scope="module", autouse=True)
 def settings() -> Iterator[None]:
-    """Ray tells nobody, and its workers do not wait behind everything else that a machine does."""
+    """No usage statistics, and workers with normal scheduling priority."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("RAY_worker_niceness", "0")
@@ -54,80 +54,80 @@ def cluster(settings: None) -> Iterator[Any]:
 
 
 def actors() -> set[int]:
-    """Processes of actors that are up on this machine."""
-    found = set()
+    """Process ids of the running actors on this machine."""
+    running = set()
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             name = path.read_bytes()
         except OSError:
             continue  # it has ended
         if name.startswith(b"ray::Baker"):
-            found.add(int(path.parent.name))
-    return found
+            running.add(int(path.parent.name))
+    return running
 
 
-def comes(what: Callable[[], bool], seconds: float = 200) -> bool:
-    """Whether it is so within the time."""
+def becomes_true(condition: Callable[[], bool], seconds: float = 200) -> bool:
+    """Wait until a condition holds, at most this long; whether it holds."""
     end = time.monotonic() + seconds
-    while not (so := what()) and time.monotonic() < end:
+    while not (holds := condition()) and time.monotonic() < end:
         time.sleep(0.05)
-    return so
+    return holds
 
 
 def writing(plan: BakePlan) -> set[int]:
-    """Processes that are in the middle of a shard, by the halves in the folder."""
+    """Ids of the processes that are writing a shard, from the temporary files in the folder."""
     return {int(part.name.removesuffix(".part").rpartition("-")[2]) for part in plan.out.glob(".*.part")}
 
 
-def test_a_cluster_of_its_own(plan: BakePlan, model: Path, tmp_path: Path) -> None:
-    """Without an address the engine starts Ray and ends it; where none is running, 'auto' is refused."""
-    with pytest.raises(ConfigError, match="Ray address 'auto' .*; expected a cluster that is up"):
+def test_the_engine_starts_and_stops_its_own_cluster(plan: BakePlan, model: Path, tmp_path: Path) -> None:
+    """Without an address the engine starts Ray and stops it; without a running cluster 'auto' is refused."""
+    with pytest.raises(ConfigError, match="Ray address 'auto' .*; expected a running cluster"):
         bake(plan, "ray", Resources(1, "auto"), progress=False)
     assert bake(plan, "ray", Resources(2), progress=False) is not None
     assert not ray.is_initialized()
-    whole = plan_in(tmp_path / "whole" / "bank", model)
-    bake(whole, progress=False)
-    assert files(plan.out) == files(whole.out)
+    reference = plan_in(tmp_path / "reference" / "bank", model)
+    bake(reference, progress=False)
+    assert files(plan.out) == files(reference.out)
 
 
 @pytest.mark.timeout(900)
-def test_actors_and_nodes_that_come_and_go(cluster: Any, model: Path, tmp_path: Path) -> None:
-    """A second node joins, an actor of the first is killed within a shard, the second node is taken away within one."""
-    whole, plan = (plan_in(tmp_path / name / "bank", model, count=1200, shard_size=40) for name in ("whole", "upset"))
-    bake(whole, progress=False)
+def test_a_bake_survives_lost_actors_and_nodes(cluster: Any, model: Path, tmp_path: Path) -> None:
+    """A second node joins; an actor of the first node and later the second node are killed while they write a shard."""
+    single, plan = (plan_in(tmp_path / name / "bank", model, count=1200, shard_size=40) for name in ("single", "upset"))
+    bake(single, progress=False)
     prepare(plan)
-    told: list[int] = []
+    reported: list[int] = []
     first: set[int] = set()
     second: set[int] = set()
     nodes: list[Any] = []
     upsets: list[str] = []
 
     def progress(scans: int) -> None:
-        told.append(scans)
+        reported.append(scans)
         if not upsets:
             first.update(actors())
             nodes.append(cluster.add_node(**NODE))
-            assert comes(lambda: len(actors()) == 2)
+            assert becomes_true(lambda: len(actors()) == 2)
             second.update(actors() - first)
-            upsets.append("a node came")
-        elif upsets == ["a node came"] and (busy := writing(plan) & first):
+            upsets.append("a node joined")
+        elif upsets == ["a node joined"] and (busy := writing(plan) & first):
             os.kill(busy.pop(), signal.SIGKILL)
             upsets.append("an actor was killed")
-        elif upsets[-1] == "an actor was killed" and comes(lambda: len(actors() - first) == 2, 10):
-            upsets.append("another came")  # not before this returns and the engine hears of the loss
-        elif upsets[-1] == "another came" and writing(plan) & second:
+        elif upsets[-1] == "an actor was killed" and becomes_true(lambda: len(actors() - first) == 2, 10):
+            upsets.append("another started")  # not before this returns and the engine hears of the loss
+        elif upsets[-1] == "another started" and writing(plan) & second:
             cluster.remove_node(nodes.pop(), allow_graceful=False)
-            assert comes(lambda: not actors() & second)
-            upsets.append("a node went")
+            assert becomes_true(lambda: not actors() & second)
+            upsets.append("a node left")
 
     ENGINES["ray"](plan, range(30), Resources(2), progress)
-    assert upsets == ["a node came", "an actor was killed", "another came", "a node went"]
-    assert len(first) == 1 and len(second) == 1 and sum(told) == 1200
+    assert upsets == ["a node joined", "an actor was killed", "another started", "a node left"]
+    assert len(first) == 1 and len(second) == 1 and sum(reported) == 1200
     assert finish(plan) is not None
-    assert files(plan.out) == files(whole.out)
+    assert files(plan.out) == files(single.out)
 
 
-def test_what_an_actor_raises_arrives(cluster: Any, plan: BakePlan) -> None:
+def test_an_error_of_an_actor_is_raised(cluster: Any, plan: BakePlan) -> None:
     prepare(plan)
     (plan.out / SETTINGS).unlink()
     with pytest.raises(FileError, match="has vanished or lost its .bake.json"):
@@ -141,11 +141,13 @@ class Dying(module.Baker):
         os._exit(1)
 
 
-def test_actors_that_never_make_a_shard(cluster: Any, plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_actors_that_never_finish_a_shard_stop_the_bake(
+    cluster: Any, plan: BakePlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "_LOSSES", 1)
     monkeypatch.setattr(module, "Baker", Dying)
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     prepare(plan)
-    with pytest.raises(FileError, match=r"(?s)2 Ray actors were lost and no shard was made.*finished shards are kept"):
+    with pytest.raises(FileError, match=r"(?s)2 Ray actors were lost without a finished.*finished shards are kept"):
         ENGINES["ray"](plan, range(4), Resources(1), lambda scans: None)
     assert not list(plan.out.glob("*.h5"))

@@ -1,4 +1,4 @@
-"""Engine ``slurm`` by submitit's executor for one machine: real jobs, their logs, and what happens when they fail."""
+"""Engine ``slurm`` with submitit's executor for one machine: real jobs, their logs, and failures."""
 
 import os
 import signal
@@ -34,15 +34,15 @@ def plan(model: Path, tmp_path: Path) -> BakePlan:
 
 
 def test_jobs_write_the_same_bytes(plan: BakePlan, model: Path, tmp_path: Path) -> None:
-    whole = plan_in(tmp_path / "whole" / "bank", model)
-    bake(whole, progress=False)
+    reference = plan_in(tmp_path / "reference" / "bank", model)
+    bake(reference, progress=False)
     assert bake(plan, "slurm", Resources(3, slurm=LOCAL), progress=False) is not None
-    assert files(plan.out) == files(whole.out)
+    assert files(plan.out) == files(reference.out)
     assert not (plan.out / LOGS).exists()  # a finished bank needs no logs
 
 
 class Slow(SlurmTask):
-    """A part that waits until it is told that its time is over, once, after its first shard."""
+    """A task that waits after its first shard for the signal of a timeout; it does so only once."""
 
     def __call__(self, plan: BakePlan, numbers: Sequence[int]) -> int:
         if (plan.out / "waited").exists():
@@ -53,8 +53,8 @@ class Slow(SlurmTask):
         raise AssertionError("no signal came")
 
 
-def test_a_job_that_runs_out_of_time_goes_on(plan: BakePlan) -> None:
-    """What Slurm does before it takes a node away: a signal; submitit puts the job back by its checkpoint."""
+def test_a_job_that_runs_out_of_time_resumes(plan: BakePlan) -> None:
+    """Slurm sends a signal before it takes a node away; submitit then requeues the job."""
     prepare(plan)
     executor = submitit.AutoExecutor(plan.out / LOGS, "local")
     executor.update_parameters(timeout_min=10)
@@ -66,20 +66,20 @@ def test_a_job_that_runs_out_of_time_goes_on(plan: BakePlan) -> None:
     first = (plan.out / "shard-00000.h5").stat()
     os.kill(int((plan.out / "waited").read_text()), signal.SIGUSR2)
     assert job.result() == COUNT, job.stderr()
-    assert (plan.out / "shard-00000.h5").stat().st_mtime_ns == first.st_mtime_ns  # not made twice
+    assert (plan.out / "shard-00000.h5").stat().st_mtime_ns == first.st_mtime_ns  # not written twice
 
 
-def test_a_job_that_fails_is_told_of(plan: BakePlan) -> None:
+def test_a_failed_job_is_reported(plan: BakePlan) -> None:
     prepare(plan)
     (plan.out / SETTINGS).unlink()
     with pytest.raises(FileError, match=r"(?s)Slurm job \d+.* failed .*has vanished or lost its .bake.json"):
         ENGINES["slurm"](plan, range(4), Resources(2, slurm=LOCAL), lambda scans: None)
-    assert len(list((plan.out / LOGS).glob("*.out"))) == 2  # kept, to see why
+    assert len(list((plan.out / LOGS).glob("*.out"))) == 2  # kept for diagnosis
     bake(plan, progress=False)
     assert not (plan.out / LOGS).exists()
 
 
-def test_what_cannot_be_submitted(plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_slurm_and_unknown_options_are_refused(plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", os.devnull)
     with pytest.raises(ConfigError, match=r'Could not detect "srun".*expected a machine that submits to Slurm'):
         bake(plan, "slurm", progress=False)

@@ -1,4 +1,4 @@
-"""Banks that were made to do harm: no file beside a shard is read, and no memory is given for what is declared."""
+"""Malicious banks: no other file is read, and no memory is allocated for mere declarations."""
 
 import json
 import subprocess
@@ -17,7 +17,7 @@ from lidar_synth.bank.card import dataset_card
 from lidar_synth.bank.index import _sum
 from lidar_synth.errors import DataError, LidarSynthError
 
-LIMIT = 50 << 20  # bytes that a refusal may take
+LIMIT = 50 << 20  # bytes of memory that a refusal may use
 
 CHILD = """
 import resource, sys
@@ -51,7 +51,7 @@ Change = Callable[[h5py.File, Path], None]
 
 
 def replaced(name: str, make: Callable[[h5py.File, Path], Any]) -> Change:
-    """Another dataset in the place of ``name``."""
+    """Replace the dataset ``name`` by another one."""
 
     def change(file: h5py.File, beside: Path) -> None:
         file.pop(name, None)
@@ -61,7 +61,7 @@ def replaced(name: str, make: Callable[[h5py.File, Path], Any]) -> Change:
 
 
 def declared(name: str, dtype: str, **options: Any) -> Change:
-    """10^9 values that nobody wrote, in a shard that says it has so many scans."""
+    """10^9 declared but unwritten values, in a shard that declares as many scans."""
 
     def make(file: h5py.File, _: Path) -> None:
         file.create_dataset(name, (10**9,), dtype, **options)
@@ -71,7 +71,7 @@ def declared(name: str, dtype: str, **options: Any) -> Change:
 
 
 def outside(file: h5py.File, beside: Path, name: str = "range") -> np.ndarray[Any, Any]:
-    """A file beside the shard that holds the right values."""
+    """Write a file beside the shard with the correct values."""
     values: np.ndarray[Any, Any] = file[name][:]
     with h5py.File(beside / "other.h5", "w") as other:
         other[name] = values
@@ -105,7 +105,7 @@ def soft_linked(file: h5py.File, _: Path) -> None:
 
 
 def repacked(**options: Any) -> Change:
-    """The ranges as they are, but stored in another way."""
+    """The same ranges, stored in another way."""
 
     def change(file: h5py.File, _: Path) -> None:
         values = file["range"][:]
@@ -172,8 +172,8 @@ HARMFUL: dict[str, Change] = {
 }
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is measured as Linux tells it")
-def test_harmful_shards_take_no_memory(tmp_path: Path) -> None:
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux to measure the memory")
+def test_malicious_shards_allocate_no_memory(tmp_path: Path) -> None:
     made = [harmful(tmp_path / str(number), what) for number, what in enumerate(HARMFUL)]
     assert all(path.stat().st_size < 100_000 for _, path in made)
     given = [made[0][0], str(LIMIT), *(path for _, path in made)]
@@ -184,7 +184,7 @@ def test_harmful_shards_take_no_memory(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", HARMFUL)
-def test_a_harmful_shard_is_refused(tmp_path: Path, what: str) -> None:
+def test_a_malicious_shard_is_refused(tmp_path: Path, what: str) -> None:
     good, path = harmful(tmp_path, what)
     with ShardReader(good, "good") as shard:
         assert shard.read(1)["range"].any()
@@ -193,7 +193,7 @@ def test_a_harmful_shard_is_refused(tmp_path: Path, what: str) -> None:
 
 
 def harmful(folder: Path, what: str) -> tuple[Path, Path]:
-    """A good shard and a harmful one."""
+    """A valid shard and a malicious one."""
     good, path = (write_bank(folder / name, [some_image(i) for i in range(2)])[0] for name in ("good", "bad"))
     path = path.rename(path.with_name("bad.h5"))
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
@@ -208,7 +208,7 @@ WRONG: list[Any] = [1e30, -1, 0, 0.5, 1e400, float("nan"), 10**30, 1 << 63, True
 
 
 def places(values: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Every place in a JSON text."""
+    """The path of every value in a JSON document."""
     found = [path] if path else []
     for key, child in values.items() if isinstance(values, dict) else enumerate(values):
         found += places(child, (*path, key)) if isinstance(child, dict | list) else [(*path, key)]
@@ -225,7 +225,7 @@ def with_value(values: Any, path: tuple[Any, ...], value: Any) -> Any:
 
 
 def use(root: Path) -> None:
-    """What is done with a bank: read, named, described, written again."""
+    """Use a bank in every way: read scans and names, describe it, write its index."""
     bank = Bank(root)
     bank[0], bank.condition(0), bank[len(bank) - 1], list(bank.ids[:3])
     bank.facts_of(0).to_attributes()
@@ -252,13 +252,13 @@ def test_an_edited_index_is_read_or_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["[" * 10**6, '{"a":' * 10**5, "1" * 5000, "null", "[]", "1e400", "\ufeff{}", ""])
-def test_text_that_is_no_index(text: str) -> None:
+def test_invalid_index_texts_are_refused(text: str) -> None:
     with pytest.raises(LidarSynthError, match="index"):
         Index.from_json(text.encode("utf-8", "surrogatepass"), "index.json")
 
 
 def test_a_deeply_nested_index_is_refused(tmp_path: Path) -> None:
-    """Nested less deep than JSON can read, but deeper than all that is done with it later."""
+    """JSON can parse this depth, but later steps could not process it."""
     write_bank(tmp_path, [some_image(0)])
     values = json.loads((tmp_path / INDEX).read_text())
     del values["checksum"]

@@ -1,4 +1,4 @@
-"""Banks at a URL: what is read over a network, and what is said where that fails."""
+"""Banks at a URL: what is read over a network, and the errors when that fails."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -34,11 +34,11 @@ def served(tmp_path: Path) -> Iterator[Served]:
 
 
 @pytest.mark.parametrize("layout", ["plain", "paged", "before"])
-def test_random_scans_cost_little_more_than_their_bytes(
+def test_random_access_transfers_little_more_than_the_scans(
     tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Index, opened shards and scans together: at most 1.3 times the scans' own bytes, and 4 requests for any scan."""
-    if layout == "before":  # files whose metadata are scattered, as they were written before
+    """Index, shard metadata and scans: at most 1.3 times the scans' bytes, and at most 4 requests per scan."""
+    if layout == "before":  # files of older versions, whose metadata is scattered
         monkeypatch.setattr(writer, "metadata_size", lambda *_: 2048)
     images = [some_image(i, LARGE) for i in range(6)]
     facts = {"layout": "plain" if layout == "before" else layout, "provenance": {"recipe": "x" * 20_000}}
@@ -68,7 +68,7 @@ def test_a_new_shard_takes_two_requests(tmp_path: Path) -> None:
         ]
 
 
-def test_scans_of_a_url_are_those_of_the_folder(served: Served, tmp_path: Path) -> None:
+def test_a_url_gives_the_same_scans_as_the_folder(served: Served, tmp_path: Path) -> None:
     near, far = open_scans(tmp_path / "bank"), open_scans(f"{served.url}/bank")
     for a, b in zip(near, far, strict=True):
         assert a.id == b.id and np.array_equal(a.points, b.points) and np.array_equal(a.label, b.label)
@@ -76,7 +76,7 @@ def test_scans_of_a_url_are_those_of_the_folder(served: Served, tmp_path: Path) 
 
 def test_forked_workers_read_from_a_url(served: Served) -> None:
     bank = Bank(f"{served.url}/bank")
-    expected = sum(len(scan) for scan in bank)  # the parent has connections of its own
+    expected = sum(len(scan) for scan in bank)  # the parent process has open connections
     loader = DataLoader(bank, batch_size=None, num_workers=2, multiprocessing_context="fork")  # type: ignore[arg-type]
     assert sum(len(scan) for scan in loader) == expected
 
@@ -87,8 +87,8 @@ def test_a_server_without_ranges_is_refused(served: Served) -> None:
         Bank(f"{served.url}/bank").image(0)
 
 
-def test_what_cannot_be_fetched_is_no_damage(served: Served, tmp_path: Path) -> None:
-    """A network that fails does not make anybody repair a bank."""
+def test_a_failed_request_is_not_reported_as_damage(served: Served, tmp_path: Path) -> None:
+    """A network failure must not suggest a repair."""
     bank = Bank(f"{served.url}/bank")
     served.broken.add("shard-00000.h5")
     with pytest.raises(FileError, match="shard-00000.h5 cannot be read .*500"):
@@ -97,7 +97,7 @@ def test_what_cannot_be_fetched_is_no_damage(served: Served, tmp_path: Path) -> 
     served.broken.clear()
     assert bank.image(0).mask.any()
     served.broken.add("shard-00000.h5")
-    with pytest.raises(FileError, match="shard-00000.h5 cannot be read .*500"):  # of a shard that is open
+    with pytest.raises(FileError, match="shard-00000.h5 cannot be read .*500"):  # an open shard
         bank.image(1)
     (tmp_path / "bank" / "shard-00002.h5").unlink()
     with pytest.raises(FileError, match="shard-00002.h5 cannot be read"):
@@ -106,7 +106,7 @@ def test_what_cannot_be_fetched_is_no_damage(served: Served, tmp_path: Path) -> 
         Bank(f"{served.url}/elsewhere")
 
 
-def test_a_cut_shard_at_a_url(served: Served, tmp_path: Path) -> None:
+def test_a_truncated_shard_at_a_url_is_refused(served: Served, tmp_path: Path) -> None:
     path = tmp_path / "bank" / "shard-00001.h5"
     content = path.read_bytes()
     for length in (0, 100, len(content) // 2, len(content) - 1):
@@ -116,7 +116,7 @@ def test_a_cut_shard_at_a_url(served: Served, tmp_path: Path) -> None:
             bank.image(2), bank.image(3)
 
 
-def test_an_index_that_promises_too_much(served: Served, tmp_path: Path) -> None:
+def test_an_index_with_exaggerated_sizes_is_refused(served: Served, tmp_path: Path) -> None:
     bank = Bank(f"{served.url}/bank")
     shards = tuple(replace(entry, bytes=1 << 40, scans=1 << 34) for entry in bank.index.shards)
     (tmp_path / "bank" / "index.json").write_bytes(replace(bank.index, shards=shards).to_json())
@@ -130,7 +130,7 @@ def test_an_index_that_promises_too_much(served: Served, tmp_path: Path) -> None
     head=st.integers(0, 6000),
     reads=st.lists(st.tuples(st.integers(0, 5200), st.integers(0, 3000)), max_size=12),
 )
-def test_a_view_is_the_file(
+def test_a_view_reads_like_the_file(
     tmp_path_factory: pytest.TempPathFactory, size: int, head: int, reads: list[tuple[int, int]]
 ) -> None:
     path = tmp_path_factory.mktemp("view") / "file"
@@ -152,7 +152,7 @@ def test_a_view_is_the_file(
 
 
 @given(st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(1, 1 << 18)), max_size=6))
-def test_chunks_side_by_side_are_read_at_once(spans: list[tuple[int, int]]) -> None:
+def test_adjacent_chunks_are_read_at_once(spans: list[tuple[int, int]]) -> None:
     places = {str(i): (start, start + size) for i, (start, size) in enumerate(spans)}
     groups = _side_by_side(places)
     assert sorted(name for group in groups for name in group) == sorted(places)

@@ -1,4 +1,4 @@
-"""Curation of banks that do not fit into memory: near duplicates found among very many, features kept on disk."""
+"""Curation of banks that do not fit into memory: approximate search for near duplicates, features on disk."""
 
 import os
 import signal
@@ -23,9 +23,9 @@ import lidar_synth.bake.curate.duplicates as duplicates
 import lidar_synth.bake.curate.neighbours as neighbours
 import lidar_synth.bake.curate.store as store_module
 from lidar_synth.bake.curate import FILE, kept_in, read_scores, score
-from lidar_synth.bake.curate.duplicates import compare_all, most_alike
+from lidar_synth.bake.curate.duplicates import compare_all, most_similar
 from lidar_synth.bake.curate.features import SIGNATURE
-from lidar_synth.bake.curate.neighbours import find_alike
+from lidar_synth.bake.curate.neighbours import find_similar
 from lidar_synth.bake.curate.store import FOLDER, Store
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry
@@ -40,8 +40,8 @@ class Planted(NamedTuple):
 
     Args:
         signatures: (N, SIGNATURE).
-        near: {number: number of the earlier one that it is like}, the likeness about 0.99.
-        copies: the same of exact copies.
+        near: {number: number of the similar earlier scan}, with a similarity of about 0.99.
+        copies: the same for exact copies.
     """
 
     signatures: NDArray[np.float16]
@@ -50,7 +50,7 @@ class Planted(NamedTuple):
 
 
 def some_signatures(count: int, rng: np.random.Generator, scenes: int = 30, own: float = 1.0) -> NDArray[np.float32]:
-    """As those of the town: two of them have a likeness of 0.76 to 0.91, the most similar ones of 0.92 to 0.95."""
+    """Like the town's: the similarity of two is 0.76 to 0.91, that of the most similar ones 0.92 to 0.95."""
     side = np.arange(32) - 15.5
     profile = 1 / (1 + side**2 + side[:, None] ** 2).reshape(-1)
     scene = np.random.default_rng(9).gamma(0.6, 1, (scenes, SIGNATURE))[rng.integers(0, scenes, count)]
@@ -59,11 +59,11 @@ def some_signatures(count: int, rng: np.random.Generator, scenes: int = 30, own:
     return unit
 
 
-def like(signature: NDArray[np.float32], likeness: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Another unit vector, of about this likeness."""
+def like(signature: NDArray[np.float32], similarity: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Another unit vector with about this similarity."""
     noise = rng.normal(size=SIGNATURE) * signature
     noise -= signature * (noise @ signature)
-    noise *= np.sqrt(1 / likeness**2 - 1) / np.linalg.norm(noise)
+    noise *= np.sqrt(1 / similarity**2 - 1) / np.linalg.norm(noise)
     other = np.clip(signature + noise, 0, None)
     unit: NDArray[np.float32] = (other / np.linalg.norm(other)).astype(np.float32)
     return unit
@@ -92,83 +92,83 @@ def many() -> Planted:
 
 @pytest.mark.parametrize("scenes", [1, 30, 1000])
 def test_near_duplicates_are_found(scenes: int) -> None:
-    """At least 95 of 100 that are just as alike as the threshold, and every copy."""
+    """At least 95 % of the scans with a similarity at the threshold, and every copy."""
     signatures, near, copies = planted(8_000, scenes, scenes=scenes)
-    likeness, twin = find_alike(signatures, progress=False)
+    similarity, twin = find_similar(signatures, progress=False)
     true = [float(signatures[a].astype(float) @ signatures[b].astype(float)) for a, b in near.items()]
     assert min(true) > 0.9895 and max(true) < 0.9915
     assert np.mean([twin[a] == b for a, b in near.items()]) >= 0.95
-    assert all(twin[a] == b and likeness[a] > 0.999 for a, b in copies.items())
+    assert all(twin[a] == b and similarity[a] > 0.999 for a, b in copies.items())
 
 
-def test_what_is_found_is_never_more_alike_than_the_most_similar(many: Planted) -> None:
+def test_the_approximate_similarity_never_exceeds_the_exact_one(many: Planted) -> None:
     signatures = many.signatures[:4000]
-    likeness, twin = find_alike(signatures, progress=False)
+    similarity, twin = find_similar(signatures, progress=False)
     exact, _ = compare_all(signatures, progress=False)
-    assert (likeness <= exact + 1e-5).all() and (likeness[0], twin[0]) == (0, -1)
-    assert ((twin < np.arange(4000)) & (likeness >= 0)).all()
+    assert (similarity <= exact + 1e-5).all() and (similarity[0], twin[0]) == (0, -1)
+    assert ((twin < np.arange(4000)) & (similarity >= 0)).all()
     found = twin >= 0
     products = np.einsum("nd,nd->n", signatures.astype(np.float64), signatures[twin].astype(np.float64))
-    assert np.allclose(likeness[found], products.clip(max=1)[found], atol=1e-5)
-    assert np.median(exact - likeness) < 0.03
+    assert np.allclose(similarity[found], products.clip(max=1)[found], atol=1e-5)
+    assert np.median(exact - similarity) < 0.03
 
 
-def test_rows_at_a_time_change_nothing(many: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = find_alike(many.signatures, progress=False)
+def test_the_block_size_changes_nothing(many: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = find_similar(many.signatures, progress=False)
     for rows in (97, 5000):
         monkeypatch.setattr(neighbours, "ROWS", rows)
         monkeypatch.setattr(neighbours, "PAIRS", 300 * rows)
-        for one, other in zip(expected, find_alike(many.signatures, progress=False), strict=True):
+        for one, other in zip(expected, find_similar(many.signatures, progress=False), strict=True):
             assert np.array_equal(one, other)
 
 
-def test_a_bank_of_almost_the_same_scan(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As of a model that has collapsed: one cell holds most, and only its first scans are compared with."""
+def test_nearly_identical_scans_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Like the scans of a collapsed model: one cell holds most scans, and only its first ones are compared."""
     rng = np.random.default_rng(3)
     one = some_signatures(1, rng)[0]
     same = np.stack([like(one, 0.9999, rng) for _ in range(1500)])
     signatures = np.concatenate([some_signatures(500, rng), same]).astype(np.float16)
     monkeypatch.setattr(neighbours, "CROWD", 8)
-    likeness, _ = find_alike(signatures, progress=False)
-    assert np.mean(likeness[501:] > 0.999) >= 0.95 and (likeness[:500] < 0.99).all()
+    similarity, _ = find_similar(signatures, progress=False)
+    assert np.mean(similarity[501:] > 0.999) >= 0.95 and (similarity[:500] < 0.99).all()
     empty = np.zeros((100, SIGNATURE), np.float16)
-    likeness, twin = find_alike(empty, progress=False)
-    assert not likeness.any() and twin.tolist() == [-1] + [0] * 99
+    similarity, twin = find_similar(empty, progress=False)
+    assert not similarity.any() and twin.tolist() == [-1] + [0] * 99
 
 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 40))
-def test_few_scans(seed: int, count: int) -> None:
+def test_the_search_among_few_scans(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     signatures = rng.random((count, SIGNATURE)) * (rng.random((count, SIGNATURE)) < 0.05)
     signatures = (signatures / np.linalg.norm(signatures, axis=1)[:, None]).astype(np.float16)
     signatures[rng.random(count) < 0.3] = signatures[0]
-    likeness, twin = find_alike(signatures, progress=False)
+    similarity, twin = find_similar(signatures, progress=False)
     exact, _ = compare_all(signatures, progress=False)
-    assert (likeness <= exact + 1e-5).all() and (twin < np.arange(count)).all()
+    assert (similarity <= exact + 1e-5).all() and (twin < np.arange(count)).all()
     for number in range(1, count):
         if any(np.array_equal(signatures[number], signatures[i]) for i in range(number)):
             assert np.array_equal(signatures[number], signatures[twin[number]])
 
 
-def test_pairs_are_not_compared_in_large_banks(many: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_banks_use_the_approximate_search(many: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(duplicates, "compare_all", None)
     monkeypatch.setattr(duplicates, "ALL_PAIRS", len(many.signatures) - 1)
-    assert np.array_equal(most_alike(many.signatures, False)[1], find_alike(many.signatures, False)[1])
+    assert np.array_equal(most_similar(many.signatures, False)[1], find_similar(many.signatures, False)[1])
 
 
 def peak(store: Store) -> int:
-    """Bytes of memory that a search takes at most."""
+    """Peak memory of a search in bytes."""
     tracemalloc.start()
     try:
-        find_alike(store, progress=False)
+        find_similar(store, progress=False)
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
 
 
 def stored(folder: Path, count: int) -> Store:
-    """So many signatures on disk."""
+    """A store with this many signatures."""
     store, rng = Store(folder, count, NAMES), np.random.default_rng(0)
     for block, start in enumerate(range(0, count, store_module.BLOCK)):
         rows = np.zeros(min(store_module.BLOCK, count - start), store.dtype)
@@ -180,8 +180,8 @@ def stored(folder: Path, count: int) -> Store:
 @pytest.mark.parametrize(
     "counts", [(15_000, 30_000), pytest.param((50_000, 100_000), marks=[pytest.mark.slow, pytest.mark.timeout(900)])]
 )
-def test_memory_grows_by_little(tmp_path: Path, counts: tuple[int, int]) -> None:
-    """By at most 400 bytes a scan, where its signature alone has 2,048."""
+def test_memory_grows_slowly_with_the_number_of_scans(tmp_path: Path, counts: tuple[int, int]) -> None:
+    """By at most 400 bytes per scan, although a signature has 2,048 bytes."""
     few, more = (peak(stored(tmp_path / str(count), count)) for count in counts)
     assert (more - few) / (counts[1] - counts[0]) < 400
 
@@ -202,12 +202,12 @@ def bank(tmp_path: Path) -> Bank:
 
 
 def test_the_size_of_the_files_changes_no_score(bank: Bank, request: pytest.FixtureRequest) -> None:
-    whole = score(bank, progress=False)
+    expected = score(bank, progress=False)
     request.getfixturevalue("small_files")
     for jobs in (1, 2):
         parts = score(bank, jobs=jobs, progress=False)
-        assert list(parts.values) == list(whole.values) and np.array_equal(parts.twin, whole.twin)
-        assert all(np.array_equal(parts.values[name], values) for name, values in whole.values.items())
+        assert list(parts.values) == list(expected.values) and np.array_equal(parts.twin, expected.twin)
+        assert all(np.array_equal(parts.values[name], values) for name, values in expected.values.items())
 
 
 @pytest.mark.usefixtures("small_files")
@@ -227,7 +227,7 @@ def test_a_stopped_run_resumes(bank: Bank, tmp_path: Path, monkeypatch: pytest.M
         score(bank, progress=False, folder=tmp_path / "kept")
     read.clear()
     scores = score(bank, progress=False, folder=tmp_path / "kept")
-    assert read == [16, 17, 18, 19]  # two files of eight scans were there
+    assert read == [16, 17, 18, 19]  # two files of eight scans existed
     assert all(np.array_equal(scores.values[name], values) for name, values in expected.values.items())
     damaged = next((tmp_path / "kept").rglob("features-000001.npy"))
     damaged.write_bytes(damaged.read_bytes()[:-50])
@@ -237,7 +237,7 @@ def test_a_stopped_run_resumes(bank: Bank, tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.usefixtures("small_files")
-def test_features_of_another_bank_are_of_no_use(bank: Bank, tmp_path: Path) -> None:
+def test_features_of_another_bank_are_not_reused(bank: Bank, tmp_path: Path) -> None:
     score(bank, progress=False, folder=tmp_path / "kept")
     write_bank(tmp_path / "other", [some_image(seed) for seed in range(20)], shard_size=7, fields=ALL)
     other = Bank(tmp_path / "other")
@@ -245,7 +245,7 @@ def test_features_of_another_bank_are_of_no_use(bank: Bank, tmp_path: Path) -> N
     assert np.array_equal(scores.values["empty"], score(other, progress=False).values["empty"])
 
 
-def test_the_command_leaves_no_features_behind(bank: Bank) -> None:
+def test_the_command_removes_its_features(bank: Bank) -> None:
     root = Path(bank.root)
     with kept_in(root) as other:  # another run is at work
         curate(root, as_json=True)
@@ -256,7 +256,7 @@ def test_the_command_leaves_no_features_behind(bank: Bank) -> None:
     assert not (root / FOLDER).exists()
 
 
-def test_a_file_of_features_that_is_damaged_later(tmp_path: Path) -> None:
+def test_a_damaged_file_of_features_is_reported(tmp_path: Path) -> None:
     store = stored(tmp_path, 10)
     np.save(tmp_path / "features-000000.npy", np.zeros(10))
     with pytest.raises(DataError, match=r"holds \(10,\) of float64; expected what was measured"):
@@ -272,7 +272,7 @@ def wait_for(path: Path, pattern: str, process: subprocess.Popen[bytes]) -> None
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_killed_command_resumes(tmp_path: Path) -> None:
-    """Killed when one file of 4,096 scans is there."""
+    """Killed as soon as one file of 4,096 scans exists."""
     root = tmp_path / "bank"
     write_bank(root, [plain_image(seed) for seed in range(20)], shard_size=20, fields=ALL)
     _repeat(root, 220)
@@ -286,7 +286,7 @@ def test_a_killed_command_resumes(tmp_path: Path) -> None:
     before = first.stat().st_mtime_ns
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     while process.poll() is None:
-        with suppress(OSError):  # it is gone in the end
+        with suppress(OSError):  # it is removed in the end
             assert first.stat().st_mtime_ns == before
         time.sleep(0.01)
     assert process.returncode == 0 and not (root / FOLDER).exists()
@@ -295,7 +295,7 @@ def test_a_killed_command_resumes(tmp_path: Path) -> None:
 
 
 def _repeat(root: Path, times: int) -> None:
-    """Make the one shard of a bank many shards that hold the same."""
+    """Turn the single shard of a bank into many shards with the same content."""
     index = Bank(root).index
     [entry] = index.shards
     entries: list[Entry] = []

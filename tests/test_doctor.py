@@ -134,7 +134,7 @@ def test_the_cards_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("driver", "build", "state", "found"),
     [(None, None, "absent", "no NVIDIA driver"), ("/usr/bin/nvidia-smi", None, "check", "built for the CPU"),
-     ("/usr/bin/nvidia-smi", "13.0", "check", "finds no card")],
+     ("/usr/bin/nvidia-smi", "13.0", "check", "finds no GPU")],
 )  # fmt: skip
 def test_why_there_is_no_card(
     monkeypatch: pytest.MonkeyPatch, driver: str | None, build: str | None, state: str, found: str

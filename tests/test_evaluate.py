@@ -194,7 +194,7 @@ def test_what_is_not_known_is_said(kitti360: Path, fake: Path) -> None:
     (fake / NOTE).write_text(json.dumps({"trained_on": "KITTI raw"}))
     result = judge(kitti360, fake)
     assert result.exception is None
-    assert "does not tell which recordings its model was trained on" in result.stderr
+    assert "does not record its model's training data" in result.stderr
     (fake / NOTE).write_text(json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]}))
     assert "whether the two share frames is not known" not in judge(kitti360, fake).stderr
 

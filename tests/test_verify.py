@@ -1,4 +1,4 @@
-"""Keeping banks whole: verify finds what is wrong, repair makes it again; merge, split and head keep every scan."""
+"""Maintenance of banks: verify finds damage, repair regenerates it; merge, split and head keep every scan."""
 
 import json
 import os
@@ -71,21 +71,21 @@ def flip(path: Path, bit: int) -> None:
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "flip": (lambda path: flip(path, 8 * path.stat().st_size // 2), r"has \d+ bytes and sha256"),
-    "cut": (lambda path: path.write_bytes(path.read_bytes()[:-9]), "by the index"),
-    "longer": (lambda path: path.write_bytes(path.read_bytes() + b"x"), "by the index"),
+    "cut": (lambda path: path.write_bytes(path.read_bytes()[:-9]), "the index lists"),
+    "longer": (lambda path: path.write_bytes(path.read_bytes() + b"x"), "the index lists"),
     "missing": (lambda path: path.unlink(), r"cannot be read \(No such file"),
     "another": (lambda path: shutil.copyfile(path.with_name("shard-00000.h5"), path), "holds scans 0 to 2 of seed 0"),
 }
 
 
-def test_a_whole_bank(root: Path, model: Path) -> None:
+def test_an_intact_bank_needs_no_repair(root: Path, model: Path) -> None:
     assert verify(root, progress=False) == [] and repair(root, progress=False) == {}
     status, output = call("verify", root, "--deep", "--model", model, "--sample", 3)
-    assert status == 0 and f"{root}: whole" in output and "3 scans made again, at least 100.00%" in output
+    assert status == 0 and f"{root}: intact" in output and "3 scans regenerated, at least 100.00%" in output
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_damage_is_found_and_made_again(root: Path, original: Path, model: Path, kind: str) -> None:
+def test_damage_is_found_and_repaired(root: Path, original: Path, model: Path, kind: str) -> None:
     damage, message = DAMAGE[kind]
     damage(root / "shard-00001.h5")
     status, output = call("verify", root)
@@ -93,7 +93,7 @@ def test_damage_is_found_and_made_again(root: Path, original: Path, model: Path,
     problems = verify(root, progress=False)
     assert {p.file for p in problems} == {"shard-00001.h5"}
     assert any(re.search(message, p.what) for p in problems)
-    assert repair(root, str(model), progress=False) == {"shard-00001.h5": "made again"}
+    assert repair(root, str(model), progress=False) == {"shard-00001.h5": "regenerated"}
     assert shards(root) == shards(original) and verify(root, progress=False) == []
     assert (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
 
@@ -109,7 +109,7 @@ def test_every_flipped_bit_is_found(root: Path) -> None:
 
 
 def test_a_damaged_scan_is_named(root: Path) -> None:
-    """A file whose hash the index knows, but with a scan that is not its CRC's: only reading it finds that."""
+    """A file with the hash in the index, but with a scan that does not match its CRC: only reading it shows that."""
     path = root / "shard-00001.h5"
     with h5py.File(path, "r+") as file:
         file["label"][2, 3, 4] = 18 - file["label"][2, 3, 4] % 19
@@ -120,7 +120,7 @@ def test_a_damaged_scan_is_named(root: Path) -> None:
     assert problem.file == "shard-00001.h5" and "scan 2 cannot be read (its CRC does not match)" in problem.what
 
 
-def test_files_that_nobody_knows(root: Path) -> None:
+def test_unlisted_shards_are_found(root: Path) -> None:
     shutil.copyfile(root / "shard-00000.h5", root / "shard-00009.h5")
     [problem] = verify(root, progress=False)
     assert (problem.file, problem.what) == ("shard-00009.h5", "is not in the index")
@@ -143,39 +143,39 @@ SIDE_DAMAGE: dict[str, Callable[[Path, np.random.Generator], object]] = {
 
 @pytest.mark.parametrize("name", SIDE)
 @pytest.mark.parametrize("kind", SIDE_DAMAGE)
-def test_damage_beside_the_shards_is_found_and_mended(root: Path, original: Path, name: str, kind: str) -> None:
+def test_damage_of_other_files_is_found_and_repaired(root: Path, original: Path, name: str, kind: str) -> None:
     rng = np.random.default_rng(SIDE.index(name))
     for _ in range(20 if kind in ("flip", "cut") else 1):
         SIDE_DAMAGE[kind](root / name, rng)
         [problem] = verify(root, progress=False)
         assert problem.file == name
-        assert repair(root, progress=False) == {name: "written again from the index"}
+        assert repair(root, progress=False) == {name: "rewritten from the index"}
         assert verify(root, progress=False) == [] and sides(root) == sides(original)
         assert (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
 
 
-def test_damage_beside_the_shards_by_command(root: Path, model: Path) -> None:
+def test_verify_and_repair_report_damage_of_other_files(root: Path, model: Path) -> None:
     (root / SETTINGS).write_text("{}")
     status, output = call("verify", root)
-    assert status == 1 and f"{SETTINGS}: has sha256" in output and "damaged, or was edited" in output
+    assert status == 1 and f"{SETTINGS}: has sha256" in output and "was damaged or edited" in output
     status, output = call("repair", root)
-    assert status == 0 and f"{SETTINGS}: written again from the index" in output
+    assert status == 0 and f"{SETTINGS}: rewritten from the index" in output
     assert bake(make_plan(root, BakeJob(model=str(model), count=8, shard_size=3)), progress=False) is not None
 
 
-def test_a_bank_under_another_name_is_whole(root: Path, tmp_path: Path) -> None:
+def test_a_renamed_bank_is_intact(root: Path, tmp_path: Path) -> None:
     assert verify(root.rename(tmp_path / "other"), progress=False) == []
 
 
-def test_all_is_lost_but_the_shards(root: Path, original: Path) -> None:
+def test_repair_rebuilds_a_bank_from_its_shards(root: Path, original: Path) -> None:
     for name in (*SIDE, INDEX):
         (root / name).unlink()
-    assert repair(root, progress=False) == {INDEX: "written again from the shards"}
+    assert repair(root, progress=False) == {INDEX: "rebuilt from the shards"}
     assert sides(root) == sides(original) and (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
 
 
-def test_an_index_of_an_older_version_names_no_other_files(root: Path, original: Path, model: Path) -> None:
-    """It is the same bank; the settings of its bake stand in another order, and are left as they are."""
+def test_an_index_of_an_older_version_lists_no_other_files(root: Path, original: Path, model: Path) -> None:
+    """It is the same bank; its settings file with another order of keys is kept."""
     values = json.loads((root / INDEX).read_bytes())
     assert set(values.pop("files")) == set(SIDE)
     values["checksum"] = Bank(original).identity
@@ -189,23 +189,23 @@ def test_an_index_of_an_older_version_names_no_other_files(root: Path, original:
     assert list(json.loads((root / SETTINGS).read_bytes())) == list(reversed(settings))
     assert verify(root, progress=False) == [] and (root / "README.md").is_file()
     flip(root / SETTINGS, 80)
-    assert repair(root, progress=False) == {SETTINGS: "written again from the index"}
+    assert repair(root, progress=False) == {SETTINGS: "rewritten from the index"}
     assert sides(root) == sides(original)
 
 
-def test_a_deep_look_takes_other_scans_each_time(root: Path, model: Path) -> None:
-    drawn = [call("verify", root, "--deep", "--model", model, "--sample", 2)[1] for _ in range(2)]
-    seeds = [re.findall(r"scans drawn by --seed (\d+)", output) for output in drawn]
+def test_deep_verification_samples_other_scans_each_time(root: Path, model: Path) -> None:
+    outputs = [call("verify", root, "--deep", "--model", model, "--sample", 2)[1] for _ in range(2)]
+    seeds = [re.findall(r"scans selected by --seed (\d+)", output) for output in outputs]
     assert len(seeds[0]) == len(seeds[1]) == 1 and seeds[0] != seeds[1]
-    assert "drawn by --seed 7" in call("verify", root, "--deep", "--model", model, "--sample", 2, "--seed", 7)[1]
+    assert "selected by --seed 7" in call("verify", root, "--deep", "--model", model, "--sample", 2, "--seed", 7)[1]
     samples = [frozenset(regenerate(root, str(model), 2, progress=False)) for _ in range(8)]
     assert len(set(samples)) > 1
     again = [set(regenerate(root, str(model), 2, progress=False, seed=7)) for _ in range(2)]
     assert again[0] == again[1] and len(again[0]) == 2
 
 
-def test_a_shard_that_is_open_in_plain_h5py(root: Path) -> None:
-    """In this process; whoever comes first, the other one reads it too."""
+def test_a_shard_may_be_open_in_plain_h5py(root: Path) -> None:
+    """In this process; both can read it, in either order."""
     path = root / "shard-00001.h5"
     bank = Bank(root)
     for options in ({}, {"locking": True}, {"locking": False}, {"libver": "latest"}, {"driver": "stdio"}):
@@ -219,14 +219,14 @@ def test_a_shard_that_is_open_in_plain_h5py(root: Path) -> None:
         assert len(bank[4].points)
 
 
-def test_scans_that_are_not_what_they_say(tmp_path: Path, model: Path) -> None:
+def test_deep_verification_finds_scans_that_do_not_match_their_seeds(tmp_path: Path, model: Path) -> None:
     honest = Bank(baked(tmp_path / "honest", model, seed=5))
-    told = {name: getattr(honest.facts, name) for name in ("settings", "checkpoint", "fields")}
-    write_bank(tmp_path / "false", [some_image(i) for i in range(8)], **told)
+    stored = {name: getattr(honest.facts, name) for name in ("settings", "checkpoint", "fields")}
+    write_bank(tmp_path / "false", [some_image(i) for i in range(8)], **stored)
     assert verify(tmp_path / "false", progress=False) == []
     assert max(regenerate(tmp_path / "false", str(model), progress=False).values()) < AGREE
     status, output = call("verify", tmp_path / "false", "--deep", "--model", model)
-    assert status == 1 and "of its cells agree with the scan made again" in output
+    assert status == 1 and "of its cells agree with the regenerated scan" in output
     other = write(tmp_path / "other.safetensors", ("range",))
     with pytest.raises(ConfigError, match=r"other.*the checkpoint that made the bank's scans, small .*--model"):
         regenerate(honest.root, str(other), progress=False)
@@ -238,7 +238,7 @@ def test_scans_that_are_not_what_they_say(tmp_path: Path, model: Path) -> None:
 
 
 @pytest.mark.parametrize("lost", [True, False])
-def test_a_lost_or_damaged_index_is_written_again(root: Path, original: Path, model: Path, lost: bool) -> None:
+def test_a_lost_or_damaged_index_is_rebuilt(root: Path, original: Path, model: Path, lost: bool) -> None:
     if lost:
         (root / INDEX).unlink()
     else:
@@ -248,12 +248,12 @@ def test_a_lost_or_damaged_index_is_written_again(root: Path, original: Path, mo
     with pytest.raises((DataError, FileError)):
         verify(root, progress=False)
     done = repair(root, str(model), progress=False)
-    assert done == {INDEX: "written again from the shards", "shard-00000.h5": "made again",
-                    "shard-00002.h5": "made again"}  # fmt: skip
+    assert done == {INDEX: "rebuilt from the shards", "shard-00000.h5": "regenerated",
+                    "shard-00002.h5": "regenerated"}  # fmt: skip
     assert shards(root) == shards(original) and (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
 
 
-def test_what_cannot_be_repaired(root: Path, tmp_path: Path) -> None:
+def test_banks_beyond_repair_are_reported(root: Path, tmp_path: Path) -> None:
     (root / INDEX).unlink()
     with pytest.raises(DataError, match="and no shard of .* can be read"):
         repair(tmp_path, progress=False)
@@ -267,9 +267,9 @@ def test_what_cannot_be_repaired(root: Path, tmp_path: Path) -> None:
         repair(tmp_path / "strange", progress=False)
 
 
-def test_other_bytes_are_written_down(root: Path, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on another machine: the scans are equal to rounding, their bytes are not."""
-    before, made = [scan.points for scan in Bank(root)], repair_module.write_shard
+def test_a_repair_with_different_bytes_is_recorded(root: Path, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Like a repair on another machine: the scans are equal up to rounding, their bytes differ."""
+    before, write_shard = [scan.points for scan in Bank(root)], repair_module.write_shard
 
     class Rounding:
         def __init__(self, generator: Any) -> None:
@@ -282,25 +282,25 @@ def test_other_bytes_are_written_down(root: Path, model: Path, monkeypatch: pyte
                 image.range[image.mask] = np.minimum(image.range[image.mask] * np.float32(1 + 1e-4), 80)
             return images
 
-    monkeypatch.setattr(repair_module, "write_shard", lambda generator, *rest: made(Rounding(generator), *rest))
+    monkeypatch.setattr(repair_module, "write_shard", lambda generator, *rest: write_shard(Rounding(generator), *rest))
     (root / "shard-00001.h5").unlink()
-    assert repair(root, str(model), progress=False) == {"shard-00001.h5": "made again, with other bytes"}
+    assert repair(root, str(model), progress=False) == {"shard-00001.h5": "regenerated, with different bytes"}
     assert verify(root, progress=False) == []
-    assert "shard-00001.h5 was made again with torch" in Bank(root).index.repairs[0]
-    assert "with other bytes" in (root / "README.md").read_text()
+    assert "shard-00001.h5 was regenerated with torch" in Bank(root).index.repairs[0]
+    assert "with different bytes" in (root / "README.md").read_text()
     for old, new in zip(before, (scan.points for scan in Bank(root)), strict=True):
         assert np.allclose(old, new, rtol=1e-3)
     bake_again = make_plan(root, BakeJob(model=str(model), count=8, shard_size=3))
     index = bake(bake_again, progress=False)
-    assert index is not None and index.repairs  # going on does not forget
+    assert index is not None and index.repairs  # resuming keeps the record
 
 
-def test_repair_by_command(root: Path, model: Path) -> None:
+def test_the_repair_command(root: Path, model: Path) -> None:
     status, output = call("repair", root, "--model", model)
-    assert status == 0 and f"{root}: whole, nothing to do" in output
+    assert status == 0 and f"{root}: intact, nothing to do" in output
     (root / "shard-00001.h5").unlink()
     status, output = call("repair", root, "--model", model)
-    assert status == 0 and "shard-00001.h5: made again" in output
+    assert status == 0 and "shard-00001.h5: regenerated" in output
 
 
 # Merge, split, head
@@ -321,21 +321,21 @@ def test_split_and_merge_are_inverse(root: Path, tmp_path: Path) -> None:
     assert verify(tmp_path / "merged", progress=False) == []
 
 
-def test_head(root: Path, tmp_path: Path, model: Path) -> None:
+def test_head_takes_the_first_scans(root: Path, tmp_path: Path, model: Path) -> None:
     status, output = call("bank", "head", root, tmp_path / "head", "--count", 4)
     assert status == 0 and f"{tmp_path / 'head'}: 4 scans in 2 shards" in output
     assert names_and_points(tmp_path / "head") == names_and_points(root)[:4]
     assert (tmp_path / "head" / "shard-00000.h5").read_bytes() == (root / "shard-00000.h5").read_bytes()
     before = shards(tmp_path / "head")
     (tmp_path / "head" / "shard-00001.h5").unlink()
-    assert repair(tmp_path / "head", str(model), progress=False) == {"shard-00001.h5": "made again"}
+    assert repair(tmp_path / "head", str(model), progress=False) == {"shard-00001.h5": "regenerated"}
     assert shards(tmp_path / "head") == before
     for count in (0, 9):
         with pytest.raises(ConfigError, match=f"the first {count} scans of .*; expected 1 to 8"):
             head(Bank(root), count, tmp_path / "none", progress=False)
 
 
-def test_banks_of_several_bakes(root: Path, tmp_path: Path, model: Path) -> None:
+def test_banks_of_several_bakes_can_be_merged_and_repaired(root: Path, tmp_path: Path, model: Path) -> None:
     other = baked(tmp_path / "other", model, first=8, count=4)
     status, _ = call("bank", "merge", tmp_path / "all", root, other)
     assert status == 0
@@ -343,9 +343,9 @@ def test_banks_of_several_bakes(root: Path, tmp_path: Path, model: Path) -> None
     bank = Bank(tmp_path / "all")
     assert len(bank.index.sources) == 2 and bank[11].id == "small/0/11"
     (tmp_path / "all" / "shard-00003.h5").unlink()
-    assert repair(tmp_path / "all", str(model), progress=False) == {"shard-00003.h5": "made again"}
+    assert repair(tmp_path / "all", str(model), progress=False) == {"shard-00003.h5": "regenerated"}
     assert names_and_points(tmp_path / "all") == names_and_points(root, other)
-    with pytest.raises(ConfigError, match="both hold scan 6 of seed 0; expected every scan once"):
+    with pytest.raises(ConfigError, match="both hold scan 6 of seed 0; expected every scan only once"):
         merge([Bank(root), Bank(baked(tmp_path / "over", model, first=6, count=4))], tmp_path / "x", progress=False)
     write_bank(tmp_path / "few", [some_image()])
     with pytest.raises(ConfigError, match=r"few holds \('reflectance', 'label'\) of sensor 'small'; expected"):
@@ -353,8 +353,8 @@ def test_banks_of_several_bakes(root: Path, tmp_path: Path, model: Path) -> None
     assert not (tmp_path / "x").exists()
 
 
-def test_edits_that_cannot_be(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="holds a bank; expected a folder of its own"):
+def test_invalid_edits_are_refused(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds a bank; expected an empty folder"):
         head(Bank(root), 2, root, progress=False)
     for shares in ({"a": 0.5, "b": 0.6}, {"a": 1.5, "b": -0.5}, {"a": 0.99, "b": 0.01}):
         with pytest.raises(ConfigError, match="sum to 1|at least one scan"):
@@ -363,11 +363,11 @@ def test_edits_that_cannot_be(root: Path, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=f"part '{part}'; expected FOLDER=SHARE"):
             call("bank", "split", root, part)
     (tmp_path / "file").touch()
-    with pytest.raises(FileError, match="file cannot be made"):
+    with pytest.raises(FileError, match="file cannot be created"):
         head(Bank(root), 2, tmp_path / "file", progress=False)
 
 
-def test_info(root: Path) -> None:
+def test_info_describes_a_bank(root: Path) -> None:
     status, output = call("info", root)
     assert status == 0
     for text in (

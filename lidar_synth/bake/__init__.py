@@ -1,13 +1,40 @@
-"""Baking: banks made by a generator, on one machine or many.
+"""Baking: writing banks of generated scans, on one machine or many.
 
-``job`` holds the settings and the plan, ``shard`` makes one shard whoever asks, ``run`` makes a whole bank by one of
-the engines (``local``, ``processes``, ``ray_actors``, ``slurm``, ``torchrun``); ``verify``, ``repair`` and ``edit``
-look after banks that are there.
+``options`` holds the settings and ``job`` the plan; ``shard`` writes one shard, whichever engine calls it; ``run``
+writes a complete bank with one of the engines (``local``, ``processes``, ``ray_actors``, ``slurm``, ``torchrun``).
+``verify``, ``repair`` and ``edit`` maintain existing banks.
+
+Each name is imported when it is first used, so that the command line can read ``BakeJob`` without importing torch.
 """
 
-from lidar_synth.bake.job import BakeJob, BakePlan, make_plan
-from lidar_synth.bake.resources import Resources
-from lidar_synth.bake.run import ENGINES, Share, bake
-from lidar_synth.bake.shard import bake_shard
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["ENGINES", "BakeJob", "BakePlan", "Resources", "Share", "bake", "bake_shard", "make_plan"]
+_HOME = {
+    "ENGINES": "run",
+    "BakeJob": "options",
+    "BakePlan": "job",
+    "Resources": "resources",
+    "Share": "run",
+    "bake": "run",
+    "bake_shard": "shard",
+    "make_plan": "job",
+}
+
+__all__ = [*_HOME]
+
+if TYPE_CHECKING:
+    from lidar_synth.bake.job import BakePlan as BakePlan
+    from lidar_synth.bake.job import make_plan as make_plan
+    from lidar_synth.bake.options import BakeJob as BakeJob
+    from lidar_synth.bake.resources import Resources as Resources
+    from lidar_synth.bake.run import ENGINES as ENGINES
+    from lidar_synth.bake.run import Share as Share
+    from lidar_synth.bake.run import bake as bake
+    from lidar_synth.bake.shard import bake_shard as bake_shard
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'lidar_synth.bake' has no attribute {name!r}")
+    return getattr(import_module(f"lidar_synth.bake.{_HOME[name]}"), name)

@@ -1,5 +1,4 @@
-"""What generated scans are conditioned on: the scans of a dataset, scan ``index`` by number ``index`` of them, and
-round again."""
+"""Conditions of generated scans: scan ``index`` is conditioned on scan ``index`` of a dataset, modulo its length."""
 
 from collections.abc import Iterable
 from functools import lru_cache
@@ -10,12 +9,12 @@ from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.scan import Scan
 
 FOCAL_TOLERANCE = 0.02
-"""By which share a camera's focal length may differ from that of the training."""
+"""Relative difference that is allowed between a camera's focal length and that of the training data."""
 
 
 @lru_cache(maxsize=1)
 def open_conditions(path: str | None, layout: str | None = None, split: str | None = None) -> ScanFiles | None:
-    """The dataset that conditions come from, once per process; None without a path.
+    """The dataset of the conditions, opened once per process; None without a path.
 
     Raises:
         ConfigError: on a layout or a split without a path, and as ``open_scans``.
@@ -24,18 +23,19 @@ def open_conditions(path: str | None, layout: str | None = None, split: str | No
     if path is not None:
         return open_scans(path, layout=layout, split=split)
     if layout is not None or split is not None:
-        raise ConfigError(f"conditions of layout {layout} and split {split}, but no dataset", "--condition PATH, too")
+        raise ConfigError(f"conditions of layout {layout} and split {split}, but no dataset", "--condition PATH")
     return None
 
 
 def conditions_for(
     generator: Generator, path: str | None, layout: str | None = None, split: str | None = None
 ) -> ScanFiles | None:
-    """The dataset that a model's conditions come from, if it is one that the model understands.
+    """The dataset of a model's conditions, after a check that it fits the model.
 
     Raises:
-        ConfigError: where a conditional model gets none, or the other way round, and as ``open_conditions``.
-        DataError: where the dataset's camera is another than that of the training, or not known, and as
+        ConfigError: if a conditional model gets no conditions or an unconditional one gets some, and as
+            ``open_conditions``.
+        DataError: if the dataset's camera is unknown or differs from that of the training, and as
             ``open_conditions``.
         FileError: as ``open_conditions``.
     """
@@ -52,29 +52,29 @@ def conditions_for(
 
 
 def _check_camera(source: ScanFiles, focal: float | None) -> None:
-    """Refuse a camera of another focal length: its images show more or less than those of the training."""
+    """Refuse a camera of another focal length: its images have another field of view than those of the training."""
     if focal is None:
         return
     camera = source.calibration(0)
-    found = None if camera is None else float(camera.projection[0, 0])
-    if found is None or abs(found / focal - 1) > FOCAL_TOLERANCE:
-        given = "no calibration" if found is None else f"a focal length of {found:.1f} pixels"
+    actual = None if camera is None else float(camera.projection[0, 0])
+    if actual is None or abs(actual / focal - 1) > FOCAL_TOLERANCE:
+        given = "no calibration" if actual is None else f"a focal length of {actual:.1f} pixels"
         raise DataError(
             f"{source.root}: a camera with {given}",
-            f"{focal:.1f} pixels, those of the camera that the model was trained on",
-            "Crop and resize the images to what that camera sees, and say so in the dataset's calibration files.",
+            f"{focal:.1f} pixels, the focal length that the model was trained with",
+            "Crop and resize the images to that field of view, and change the dataset's calibration files accordingly.",
         )
 
 
 def conditions(source: ScanFiles | None, indices: Iterable[int]) -> list[Scan] | None:
-    """The scans that condition those of these indices; None for an unconditional model.
+    """The scans that condition the scans with these indices; None for an unconditional model.
 
     Raises:
-        FileError, DataError: where one cannot be read.
+        FileError, DataError: if one cannot be read.
     """
     return None if source is None else [source.read(index % len(source)) for index in indices]
 
 
 def condition_names(source: ScanFiles | None, indices: Iterable[int]) -> list[str]:
-    """Their names; none for an unconditional model."""
+    """The names of these conditions; an empty list for an unconditional model."""
     return [] if source is None else [source.ids[index % len(source)] for index in indices]

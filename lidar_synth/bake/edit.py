@@ -1,8 +1,8 @@
-"""Banks from banks: ``merge``, ``split``, ``head`` and ``drop``. Whole shards are linked, or copied where that cannot
-be.
+"""New banks from existing ones: ``merge``, ``split``, ``head`` and ``drop``. Complete shards are hard-linked, or copied
+where the file system has no links.
 
-A curated bank is an index that leaves scans of its shards out; its shards carry that in their names, because they say
-less than the truth without their index. Whatever is made of a curated bank is curated too.
+The index of a curated bank leaves out some scans of its shards. The names of these shards end in ``.curated.h5``,
+because they still hold the dropped scans. Every bank that is made from a curated one is curated too.
 """
 
 import os
@@ -21,16 +21,16 @@ from lidar_synth.files.disk import part_of, sha256
 
 
 def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
-    """One bank with the scans of several, in their order.
+    """Merge banks: one bank with the scans of several, in order.
 
     Args:
-        banks: of one sensor and the same fields.
+        banks: banks with the same sensor and fields.
         out: the new bank's folder.
         progress: show a bar.
 
     Raises:
-        ConfigError: on banks that do not fit together or hold the same scans, or a folder that is not empty.
-        FileError: where it cannot be written.
+        ConfigError: on banks with different sensors or fields, banks that share scans, or a folder that is not empty.
+        FileError: if it cannot be written.
     """
     first = banks[0].facts
     for bank in banks[1:]:
@@ -39,21 +39,21 @@ def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
                 f"{bank.root} holds {bank.facts.fields} of sensor {bank.sensor.name!r}",
                 f"{first.fields} of sensor {first.sensor.name!r}, as {banks[0].root}",
             )
-    _check_apart(banks)
+    _check_disjoint(banks)
     return _write(out, [(bank, 0, len(bank)) for bank in banks], progress)
 
 
 def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dict[Path, Index]:
-    """Several banks with consecutive shares of one.
+    """Split a bank into several with consecutive scans.
 
     Args:
-        bank: what to split.
+        bank: the bank to split.
         parts: {folder: share of the scans}, in order; the shares sum to 1.
         progress: show a bar.
 
     Raises:
         ConfigError: on shares that do not sum to 1 or leave a part empty, or a folder that is not empty.
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     if any(share <= 0 for share in parts.values()) or abs(sum(parts.values()) - 1) > 1e-9:
         raise ConfigError(f"shares {list(parts.values())}", "positive numbers that sum to 1")
@@ -70,11 +70,11 @@ def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dic
 
 
 def head(bank: Bank, scans: int, out: Path, progress: bool = True) -> Index:
-    """A bank with the first scans of one.
+    """A new bank with the first scans of a bank.
 
     Raises:
-        ConfigError: on more scans than there are, or a folder that is not empty.
-        FileError: where it cannot be written.
+        ConfigError: on more scans than the bank holds, or a folder that is not empty.
+        FileError: if it cannot be written.
     """
     if not 1 <= scans <= len(bank):
         raise ConfigError(f"the first {scans} scans of {bank.root}", f"1 to {len(bank)}")
@@ -82,22 +82,22 @@ def head(bank: Bank, scans: int, out: Path, progress: bool = True) -> Index:
 
 
 def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool = True) -> Index:
-    """A curated bank: all scans but some. No shard is written anew; one of which nothing is kept is not there.
+    """A curated bank: all scans of a bank except some. Shards are linked, not rewritten; empty ones are omitted.
 
     Args:
-        bank: what to choose from.
-        numbers: of the scans to leave out, 0 <= number < len.
-        why: what they are left out by, in words; it stands in the index.
+        bank: the original bank.
+        numbers: numbers of the scans to leave out, 0 <= number < len.
+        why: the reason in words; it is stored in the index.
         out: the new bank's folder.
         progress: show a bar.
 
     Raises:
-        ConfigError: where no scan is left, on a number that is none, or a folder that is not empty.
-        FileError: where it cannot be written.
+        ConfigError: if no scan is left, on a number out of range, or a folder that is not empty.
+        FileError: if it cannot be written.
     """
     left_out = set(numbers)
-    if none := sorted(number for number in left_out if not 0 <= number < len(bank)):
-        raise ConfigError(f"scans {none[:8]} to leave out", f"0 to {len(bank) - 1}")
+    if invalid := sorted(number for number in left_out if not 0 <= number < len(bank)):
+        raise ConfigError(f"scans {invalid[:8]} to leave out", f"0 to {len(bank) - 1}")
     if len(left_out) == len(bank):
         raise ConfigError(f"all {len(bank)} scans of {bank.root} left out ({why})", "a rule that leaves some")
     _check_empty(out)
@@ -119,7 +119,7 @@ def _name(number: int, curated: bool) -> str:
 
 
 def _write(out: Path, parts: Sequence[tuple[Bank, int, int]], progress: bool) -> Index:
-    """A bank of ranges of scans: (bank, first, one past the last)."""
+    """Write a bank from ranges of scans: (bank, first, one past the last)."""
     _check_empty(out)
     curation = tuple(dict.fromkeys(why for bank, _, _ in parts for why in bank.index.curation))
     sources: list[Facts] = []
@@ -135,18 +135,18 @@ def _write(out: Path, parts: Sequence[tuple[Bank, int, int]], progress: bool) ->
                 if facts not in sources:
                     sources.append(facts)
                 new = replace(entry, file=_name(len(entries), bool(curation)), source=sources.index(facts))
-                entries.append(_take(bank, number, new, first, last, out))
+                entries.append(_copy_part(bank, number, new, first, last, out))
                 bar.update(last - first)
     return write_bank_files(out, Index(tuple(sources), tuple(entries), curation=curation))
 
 
-def _take(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path) -> Entry:
-    """Of the scans of a shard that are kept, ``first`` to ``last`` - 1 as the shard ``entry.file`` of another bank."""
+def _copy_part(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path) -> Entry:
+    """Write the kept scans ``first`` to ``last`` - 1 of a shard as the shard ``entry.file`` of another bank."""
     path = out / entry.file
     if (first, last) == (0, entry.kept):
         _link(Path(bank.root) / bank.index.shards[number].file, path)
         return entry
-    # A file holds consecutive scans: those between that are dropped go along, and stay dropped.
+    # A file holds consecutive scans: dropped ones in between are copied too, and stay dropped.
     start, stop = entry.position(first), entry.position(last - 1) + 1
     dropped = tuple(position - start for position in entry.dropped if start <= position < stop)
     entry = replace(entry, first=entry.first + start, scans=stop - start, dropped=dropped)
@@ -162,7 +162,7 @@ def _take(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Pat
 
 
 def _link(source: Path, path: Path) -> None:
-    """A second name for a file; a copy where the file system has no second names."""
+    """Hard-link a file; copy it where the file system has no hard links."""
     part = part_of(path)
     try:
         os.link(source, part)
@@ -171,21 +171,21 @@ def _link(source: Path, path: Path) -> None:
             shutil.copyfile(source, part)
         except OSError as error:
             part.unlink(missing_ok=True)
-            raise FileError(f"{path} cannot be written ({error.strerror})", "a folder on a disk with room") from error
+            raise FileError(f"{path} cannot be written ({error.strerror})", "a disk with free space") from error
     part.replace(path)
 
 
 def _check_empty(out: Path) -> None:
     if (out / INDEX).exists() or any(out.glob("*.h5")):
-        raise ConfigError(f"{out} holds a bank", "a folder of its own for the new one")
+        raise ConfigError(f"{out} holds a bank", "an empty folder for the new one")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileError(f"{out} cannot be made ({error.strerror})", "a folder that may be written to") from error
+        raise FileError(f"{out} cannot be created ({error.strerror})", "a writable folder") from error
 
 
-def _check_apart(banks: Sequence[Bank]) -> None:
-    """Refuse to have a scan twice: the same checkpoint and settings, the same seed, the same index."""
+def _check_disjoint(banks: Sequence[Bank]) -> None:
+    """Refuse banks that share a scan: the same checkpoint, settings, seed and index."""
     taken: dict[tuple[str, str, int], list[tuple[int, int, str | Path]]] = {}
     for bank in banks:
         for entry in bank.index.shards:
@@ -196,7 +196,7 @@ def _check_apart(banks: Sequence[Bank]) -> None:
                 if entry.first < stop and first < entry.first + entry.scans:
                     raise ConfigError(
                         f"{root} and {bank.root} both hold scan {max(first, entry.first)} of seed {entry.seed}",
-                        "every scan once",
-                        "Bake with another --seed, or a --first behind the end of the other bank.",
+                        "every scan only once",
+                        "Bake with another --seed, or a --first after the end of the other bank.",
                     )
             others.append((entry.first, entry.first + entry.scans, bank.root))

@@ -1,20 +1,20 @@
-"""How large a bank will be and how long it will take, by making a few scans of it."""
+"""Estimates a bank's size and the time it takes, from a few scans."""
 
 import time
 from typing import NamedTuple
 
 from lidar_synth.bake.job import BakePlan
-from lidar_synth.bake.shard import generate, load_checked, one_computer
+from lidar_synth.bake.shard import generate, load_checked, torch_threads
 from lidar_synth.bank.chunks import deflate
 from lidar_synth.bank.layout import head_size
 
 
 class Estimate(NamedTuple):
-    """Of a whole bake, by one worker like this one.
+    """The expected size and time of a complete bake.
 
     Args:
-        bytes: of all shards.
-        seconds: of generating; what is written is packed meanwhile.
+        bytes: size of all shards.
+        seconds: time that one worker on this machine needs to generate the scans; compression runs in parallel.
     """
 
     bytes: float
@@ -22,18 +22,18 @@ class Estimate(NamedTuple):
 
 
 def estimate(plan: BakePlan) -> Estimate:
-    """Make two micro-batches, the first to warm up, and count on.
+    """Generate two batches, the first one to warm up, and extrapolate from the second one.
 
     Raises:
-        ConfigError: where the device is not there.
+        ConfigError: if the device is not available.
     """
     job = plan.job
     generator, batch = load_checked(job, plan.facts), job.batch or 1
-    with one_computer(job.threads):
+    with torch_threads(job.threads):
         for _ in range(2):
             start = time.perf_counter()
             images = generate(generator, job, range(job.first, job.first + batch))
             seconds = time.perf_counter() - start
-    size = sum(len(deflate(a)) for image in images for a in plan.facts.encoding.encode(image).values())
+    chunks = sum(len(deflate(a)) for image in images for a in plan.facts.encoding.encode(image).values())
     heads = sum(head_size(plan.facts, entry.scans) for entry in plan.shards)
-    return Estimate(heads + size / batch * job.count, seconds / batch * job.count)
+    return Estimate(heads + chunks / batch * job.count, seconds / batch * job.count)

@@ -1,12 +1,11 @@
-"""A bank's folder while it is being filled: with what, which shards are there, and the index at the end.
+"""A bank's folder during a bake: its settings, its finished shards, and finally its index.
 
-A shard is written beside its place and renamed when it is on the disk. Just before, its size and hash are noted in
-``.lidar_synth/``; when all shards are there, ``finish`` gathers the notes in ``index.json``. A shard counts as
-finished when its file has the noted hash, so that a run which is killed at any moment loses the shards it was making
-and nothing else.
+A shard is written to a temporary file, synced, and renamed. Just before, its size and hash are recorded in
+``.lidar_synth/``; when all shards exist, ``finish`` gathers the records in ``index.json``. A shard counts as finished
+when its file has the recorded hash. So a run that is killed at any moment loses only the shards that it was writing.
 
-Several runs may fill one folder at the same time. Each is ``at_work`` there, and nothing is cleared away before the
-last of them has ended.
+Several runs may fill one folder at the same time. Each of them is ``at_work`` there, and temporary files are removed
+only after the last one has ended.
 """
 
 import hashlib
@@ -28,31 +27,31 @@ from lidar_synth.files.disk import read_file, sha256, write_file
 from lidar_synth.formats.writer import NOTES, claim
 
 SETTINGS = ".bake.json"
-"""File in the bank's folder that says what it is being filled with; the runs that fill it hold a lock on it."""
+"""File in the bank's folder with the settings of the bake; runs that fill the folder hold a lock on it."""
 
 LOGS = ".slurm"
-"""Folder of the logs of Slurm's jobs, in the bank's folder until that is finished."""
+"""Folder with the logs of Slurm's jobs, in the bank's folder until the bank is finished."""
 
 
 def prepare(plan: BakePlan) -> None:
-    """Claim the folder for the plan's settings, and clear away what killed runs left half-made.
+    """Claim the folder for the plan's settings, and remove temporary files of killed runs.
 
     Raises:
-        ConfigError: where it holds a bank of other settings; the message shows the difference.
-        FileError: where it cannot be written.
+        ConfigError: if it holds a bank with other settings; the message shows the difference.
+        FileError: if it cannot be written.
     """
     if (plan.out / INDEX).exists() and not (plan.out / SETTINGS).exists():
-        raise ConfigError(f"{plan.out} holds a bank that no bake made", "a folder of its own", "Choose another one.")
+        raise ConfigError(f"{plan.out} holds a bank that was not made by a bake", "an empty folder")
     claim(plan.out / SETTINGS, plan.settings)
     _clear_up(plan.out, finished=False)
 
 
 @contextmanager
 def at_work(plan: BakePlan) -> Iterator[None]:
-    """While it lasts, no process clears anything away in the plan's folder.
+    """Prevent all processes from removing temporary files in the plan's folder until the block ends.
 
     Raises:
-        FileError: where the folder is not, or no more, the one that ``prepare`` claimed.
+        FileError: if the folder is not, or is no longer, the one that ``prepare`` claimed.
     """
     check_folder(plan)
     with shared(plan.out / SETTINGS):
@@ -60,7 +59,7 @@ def at_work(plan: BakePlan) -> Iterator[None]:
 
 
 def recorded(plan: BakePlan, number: int) -> Entry | None:
-    """What was noted of a shard when it was made, in its own note or in the index."""
+    """The recorded size and hash of a shard, from its own record or from the index."""
     wanted = plan.shards[number]
     with suppress(FileError, ValueError, TypeError):
         entry = Entry(**json.loads(read_file(_note(plan, number))))
@@ -72,7 +71,7 @@ def recorded(plan: BakePlan, number: int) -> Entry | None:
 
 
 def finished(plan: BakePlan, number: int) -> Entry | None:
-    """The shard, if its file is there and has the hash that was noted."""
+    """The shard, if its file exists and has the recorded hash."""
     entry = recorded(plan, number)
     if entry is None:
         return None
@@ -84,12 +83,12 @@ def finished(plan: BakePlan, number: int) -> Entry | None:
 
 
 def publish(plan: BakePlan, number: int, part: Path) -> Entry:
-    """Note a shard that was written beside its place, and put it there.
+    """Record a shard that was written to a temporary file, and rename the file to its final name.
 
     Raises:
-        FileError: where the folder has vanished or cannot be written.
+        FileError: if the folder has vanished or cannot be written.
     """
-    check_folder(plan)  # before a note would make the folder again
+    check_folder(plan)  # first, because writing the record would create a vanished folder again
     path = plan.out / plan.shards[number].file
     try:
         entry = replace(plan.shards[number], bytes=part.stat().st_size, sha256=sha256(part))
@@ -98,16 +97,16 @@ def publish(plan: BakePlan, number: int, part: Path) -> Entry:
     except OSError as error:
         if isinstance(error, FileError):
             raise
-        raise FileError(f"{path} cannot be written ({error.strerror or error})", "a folder that stays") from error
+        raise FileError(f"{path} cannot be written ({error.strerror or error})", "a mounted folder") from error
     sync_folder(plan.out)
     return entry
 
 
 def finish(plan: BakePlan) -> Index | None:
-    """Write index and card, if every shard is noted and there; None where some are still missing.
+    """Write index and card if every shard is recorded and exists; None if some are still missing.
 
     Raises:
-        FileError: where they cannot be written.
+        FileError: if they cannot be written.
     """
     with at_work(plan):
         entries = []
@@ -118,29 +117,29 @@ def finish(plan: BakePlan) -> Index | None:
             entries.append(entry)
         index, there = Index((plan.facts,), tuple(entries)), _index(plan.out)
         if there is not None and there.shards == index.shards:
-            index = there  # it may know of repairs
+            index = there  # it may list repairs
         index = write_bank_files(plan.out, index, baked=True)
     _clear_up(plan.out, finished=True)
     return index
 
 
 def write_bank_files(root: Path, index: Index, baked: bool = False) -> Index:
-    """The card, for the folder of a bake its settings, and the index last: with it the bank is whole.
+    """Write the card, the settings of a bake, and last the index, which completes the bank.
 
     Args:
         root: the bank's folder.
-        index: of its shards.
-        baked: whether a bake filled the folder, and may go on with it.
+        index: index of its shards.
+        baked: whether a bake filled the folder and may resume there.
 
     Returns:
-        The index, with the hashes of the other files.
+        The index with the hashes of the other files.
 
     Raises:
-        FileError: where they cannot be written.
+        FileError: if they cannot be written.
     """
     files = card_files(root.resolve().name, index) | (_settings_file(root, index) if baked else {})
     for name, content in files.items():
-        if not _holds(root / name, content):  # a file that is locked stays the same file
+        if not _holds(root / name, content):  # do not replace a file that others hold a lock on
             write_file(root / name, content)
     index = replace(index, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
     write_file(root / INDEX, index.to_json(), durable=True)
@@ -149,7 +148,7 @@ def write_bank_files(root: Path, index: Index, baked: bool = False) -> Index:
 
 
 def _settings_file(root: Path, index: Index) -> dict[str, bytes]:
-    """The settings of the bake that fills a folder, as ``claim`` writes them. Older versions wrote another order."""
+    """The settings file of a bake, as ``claim`` writes it; an older file with another order of keys is kept."""
     wanted = json.dumps(settings_of(index.sources[0]), indent=1).encode()
     with suppress(FileError, ValueError, RecursionError):
         there = read_file(root / SETTINGS)
@@ -167,8 +166,8 @@ def _holds(path: Path, content: bytes) -> bool:
 
 
 def sync_folder(path: Path) -> None:
-    """Have a folder's names on the disk, where the system can."""
-    with suppress(OSError):  # Windows opens no folders
+    """Sync a folder's entries to the disk, where the system supports it."""
+    with suppress(OSError):  # Windows cannot open folders
         handle = os.open(path, os.O_RDONLY)
         try:
             os.fsync(handle)
@@ -177,28 +176,28 @@ def sync_folder(path: Path) -> None:
 
 
 def check_folder(plan: BakePlan) -> None:
-    """Refuse a folder that is not, or no more, the one that ``prepare`` claimed.
+    """Refuse a folder that is not, or is no longer, the one that ``prepare`` claimed.
 
     Raises:
-        FileError: where it has vanished.
+        FileError: if it has vanished.
     """
-    with suppress(OSError):  # a network's folder that is gone, or closed to us
+    with suppress(OSError):  # a network folder that has vanished, or without permission
         if (plan.out / SETTINGS).is_file():
             return
     raise FileError(
         f"{plan.out} has vanished or lost its {SETTINGS}",
-        "the folder in which the bake began",
-        "Bring it back, or run the same command to begin again.",
+        "the folder in which the bake started",
+        "Restore it, or run the same command to start over.",
     )
 
 
 def _clear_up(root: Path, finished: bool) -> None:
-    """Remove what processes that ended left half-made, and what a finished bank does not need.
+    """Remove temporary files of processes that have ended, and everything that a finished bank does not need.
 
-    While another process is at work there, it is left to that one.
+    While another process is at work in the folder, nothing is removed; that process does it later.
     """
-    with alone(root / SETTINGS) as nobody_else:
-        if not nobody_else:
+    with alone(root / SETTINGS) as exclusive:
+        if not exclusive:
             return
         for part in root.glob(".*.part"):
             with suppress(OSError):
@@ -208,7 +207,7 @@ def _clear_up(root: Path, finished: bool) -> None:
 
 
 def _index(root: Path) -> Index | None:
-    """The index that is there, if one can be read; parsed again only when its file is another one."""
+    """The existing index, if it can be read; parsed again only after its file has changed."""
     try:
         there = (root / INDEX).stat()
     except OSError:

@@ -1,24 +1,24 @@
-"""What a bake shall make, and its plan: which shard holds which scans.
+"""The plan of a bake: its settings, and which shard holds which scans.
 
-A scan is a function of (checkpoint, time grid and solver, seed, index). Its bytes depend also on what computes it:
-precision, micro-batch, kind of device, threads and versions. All of these are settings of the bank, so that two runs
-with the same settings write the same bytes, and a run with other ones is refused.
+A scan is a function of (checkpoint, time grid, solver, seed, index). Its bytes also depend on the computation:
+precision, batch size, type of device, threads and versions. All of these are settings of the bank. Two runs with the
+same settings write the same bytes; a run with other settings is refused.
 """
 
 import platform
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import deflate
 import h5py
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
 
 import lidar_synth
 from lidar_synth.bake.conditions import conditions_for
+from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
 from lidar_synth.errors import ConfigError
@@ -26,66 +26,18 @@ from lidar_synth.flow.solvers import SOLVERS
 from lidar_synth.formats.source import choose
 from lidar_synth.generate.generator import BATCH, load_generator
 
-Count = Annotated[int, Field(ge=1)]
-
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""What a network may compute in, by name."""
-
-
-class BakeJob(BaseModel):
-    """Settings of a bake; unknown keys are refused.
-
-    Args:
-        model: a shipped model's name or a checkpoint file.
-        count: scans.
-        seed: scan i is a function of the model, the seed and i.
-        first: the index of the first scan; for a bank that shall go on where another one ends.
-        condition: for a conditional model, a dataset whose scans have what it takes: labels, or camera images.
-        condition_layout, condition_split: of that dataset, as ``open_scans`` takes them.
-        guidance: scale of classifier-free guidance, 1 = none.
-        shard_size: scans per file.
-        steps: of a uniform time grid; by default the checkpoint's own grid.
-        solver: a name of ``SOLVERS``.
-        fields: what a scan carries beside its range: reflectance, label, confidence; by default all that the model
-            gives.
-        batch: scans at a time; by default what suits the device.
-        dtype: float32 or bfloat16, what the network computes in.
-        device: cpu or cuda.
-        threads: of torch in each worker, on the CPU. With one, all engines compute alike.
-        compression: gzip or blosc2.
-        layout: plain, or paged for reading over a network.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    model: str = "town"
-    count: Count = 1000
-    seed: int = Field(0, ge=0, lt=2**64)
-    first: int = Field(0, ge=0, lt=2**62)
-    condition: str | None = None
-    condition_layout: str | None = None
-    condition_split: str | None = None
-    guidance: float = Field(1.0, ge=0, le=100)
-    shard_size: Count = 1024
-    steps: Count | None = None
-    solver: str = "euler"
-    fields: tuple[str, ...] | None = None
-    batch: Count | None = None
-    dtype: str = "float32"
-    device: Literal["cpu", "cuda"] = "cpu"
-    threads: int = Field(1, ge=1, le=1024)
-    compression: Literal["gzip", "blosc2"] = "gzip"
-    layout: Literal["plain", "paged"] = "plain"
+"""Data types of the network's computation, by name."""
 
 
 @dataclass(frozen=True)
 class BakePlan:
-    """A job on a checkpoint that was looked at, and where its bank goes. Small, and can be sent to any process.
+    """A job, checked against its checkpoint, with the folder of the bank. Small enough to send to any process.
 
     Args:
         out: the bank's folder.
-        job: the settings, with ``batch`` and ``fields`` settled and ``model`` as a path where it is one.
-        facts: what the bank will say about its scans.
+        job: the settings, with ``batch`` and ``fields`` resolved and the path of a checkpoint file made absolute.
+        facts: the facts of the bank.
     """
 
     out: Path
@@ -94,7 +46,7 @@ class BakePlan:
 
     @cached_property
     def shards(self) -> tuple[Entry, ...]:
-        """The shards to make, in order, sizes and hashes not known yet."""
+        """The shards to write, in order; their sizes and hashes are not known yet."""
         job = self.job
         starts = range(0, job.count, job.shard_size)
         digits = max(5, len(str(len(starts) - 1)))
@@ -105,7 +57,7 @@ class BakePlan:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All that decides the bank's bytes, by name."""
+        """All settings that determine the bank's bytes, by name."""
         return settings_of(self.facts)
 
     @property
@@ -115,19 +67,19 @@ class BakePlan:
 
 
 def settings_of(facts: Facts) -> dict[str, Any]:
-    """All that decides the bytes of a bank with these facts, by name, sorted."""
+    """All settings that determine the bytes of a bank with these facts, sorted by name."""
     others = {"checkpoint": facts.checkpoint, "fields": list(facts.fields), "compression": facts.compression,
               "layout": facts.layout}  # fmt: skip
     return dict(sorted((facts.settings | others | facts.software).items()))
 
 
 def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
-    """Look at the checkpoint and settle what the job leaves open, before any work starts.
+    """Check a job against its checkpoint and resolve its defaults, before any work starts.
 
     Raises:
-        ConfigError: on a model, solver, precision or device that is not there, a field that the model does not give,
-            or a conditional model without conditions.
-        FileError, DataError: where the checkpoint or the dataset of the conditions cannot be read.
+        ConfigError: on an unknown model, solver or data type, a field that the model does not generate, or a
+            conditional model without conditions.
+        FileError, DataError: if the checkpoint or the dataset of the conditions cannot be read.
     """
     choose("solver", job.solver, SOLVERS)
     choose("dtype", job.dtype, DTYPES)
@@ -140,7 +92,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
                 "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "deflate": deflate.__version__,
                 "machine": platform.machine()}  # fmt: skip
     model = Path(job.model)
-    settled = job.model_copy(
+    resolved = job.model_copy(
         update={
             "model": str(model.resolve()) if model.suffix == ".safetensors" else job.model,
             "fields": fields,
@@ -153,21 +105,21 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
                  "split": job.condition_split}  # fmt: skip
     facts = Facts(
         sensor=header.sensor, fields=fields, model=generator.name, checkpoint=generator.hash,
-        settings=settled.model_dump(exclude={"model", "fields", "compression", "layout"}),
+        settings=resolved.model_dump(exclude={"model", "fields", "compression", "layout"}),
         label_policy=labelled if "label" in fields else "none", condition=reference if generator.condition else None,
         licence=str(header.provenance["licence"]), data_licence=str(header.provenance["data_licence"]),
         provenance=header.provenance, software=software, compression=job.compression, layout=job.layout,
     )  # fmt: skip
-    return BakePlan(Path(out), settled, facts)
+    return BakePlan(Path(out), resolved, facts)
 
 
-def _fields(job: BakeJob, given: frozenset[str]) -> tuple[str, ...]:
-    """What the scans will carry, in the order in which it is stored."""
-    wanted = given if job.fields is None else set(job.fields)
-    if lacking := sorted(wanted - given):
+def _fields(job: BakeJob, generated: frozenset[str]) -> tuple[str, ...]:
+    """The fields of the scans, in the order in which they are stored."""
+    wanted = generated if job.fields is None else set(job.fields)
+    if missing := sorted(wanted - generated):
         raise ConfigError(
-            f"fields {lacking} of model {job.model!r}",
-            f"some of {sorted(given)}: what the model gives" if given else "none: the model gives ranges only",
-            "A checkpoint whose channels have 'label' gives labels and their confidence." if "label" in lacking else "",
+            f"fields {missing} of model {job.model!r}",
+            f"some of {sorted(generated)}, which it generates" if generated else "none: it generates only ranges",
+            "A checkpoint with the channel 'label' generates labels with confidence." if "label" in missing else "",
         )
     return tuple(name for name in TYPES if name in wanted)

@@ -8,6 +8,6 @@ from lidar_synth.bake.shard import Progress, bake_shard
 
 
 def bake_local(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
-    """Make the shards here."""
+    """Write the shards in this process."""
     for number in numbers:
         bake_shard(plan, number, progress)

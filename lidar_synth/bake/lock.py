@@ -1,8 +1,8 @@
-"""A lock on a file that the system gives back when its process ends, however it ends.
+"""A lock on a file, which the system releases when its process ends or is killed.
 
-Processes that work in one folder hold it together (``shared``); what they leave behind is cleared away only by one that
-has it ``alone``. The system keeps it (flock; over NFS, a lock on the server). On a file system without locks nobody is
-known to be alone. On Windows everybody counts as alone: a file that is open cannot be removed there.
+Processes that work in one folder hold the lock together (``shared``); only a process that holds it exclusively
+(``alone``) removes leftover files. The lock is flock; over NFS, a lock on the server. On a file system without locks
+nothing is ever removed. On Windows every process counts as exclusive: an open file cannot be removed there.
 """
 
 import sys
@@ -20,7 +20,7 @@ else:
     import fcntl
 
     def _lock(file: BinaryIO, alone: bool) -> bool:
-        """Take the lock: with the others, after waiting, or alone, at once or not at all."""
+        """Take the lock: shared after waiting, or exclusive (``alone``) without waiting; False if unavailable."""
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB if alone else fcntl.LOCK_SH)
             return True
@@ -29,10 +29,10 @@ else:
 
 @contextmanager
 def shared(path: Path) -> Iterator[None]:
-    """Hold the lock on a file together with others; wait while one has it alone.
+    """Hold a shared lock on a file; wait while another process holds it exclusively.
 
     Raises:
-        OSError: where the file cannot be opened.
+        OSError: if the file cannot be opened.
     """
     with path.open("rb") as file:
         _lock(file, alone=False)
@@ -41,9 +41,9 @@ def shared(path: Path) -> Iterator[None]:
 
 @contextmanager
 def alone(path: Path) -> Iterator[bool]:
-    """Whether nobody else holds the lock on a file; if so, nobody gets it until the block ends."""
+    """Try to hold an exclusive lock on a file until the block ends; yields whether it was available."""
     try:
-        file = path.open("r+b")  # NFS gives a lock to one alone only where the file may be written
+        file = path.open("r+b")  # NFS grants exclusive locks only on writable files
     except OSError:
         yield False
         return

@@ -1,7 +1,7 @@
-"""Engine ``processes``: several processes on this machine, each taking the next shard that nobody has.
+"""Engine ``processes``: several processes on this machine; each takes the next unassigned shard.
 
-On GPUs every process has one of its own, in turn. A worker that is killed stops the run with a message; what it was
-making is made by the next one.
+Each process uses one GPU, assigned in turn. A killed worker stops the run with an error message; the next run writes
+its unfinished shard.
 """
 
 import signal
@@ -17,61 +17,61 @@ from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import FileError
 
-_LOOK = 0.2  # seconds between two looks at the workers
-_PATIENCE = 60  # seconds for a worker to give up its shard
+_POLL = 0.2  # seconds between two checks of the workers
+_PATIENCE = 60  # seconds for a worker to abort its shard
 
 
 def bake_in_processes(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
-    """Make the shards in ``resources.workers`` processes.
+    """Write the shards in ``resources.workers`` processes.
 
     Raises:
-        FileError: where a worker was killed.
+        FileError: if a worker was killed.
     """
     context = get_context("spawn")  # a fork would share torch's threads
     count = min(resources.workers, len(numbers))
     taken, errors = context.Value("q", 0), context.SimpleQueue()
-    # What this process looks at has no lock: a worker that is killed while it holds one would stop it for good.
+    # This process reads only values without a lock: a worker killed while holding a lock would block it forever.
     scans, stop = context.RawArray("q", count), context.RawValue("b", 0)
     workers = [
         context.Process(target=_work, args=(plan, numbers, taken, scans, stop, errors, rank), daemon=True)
         for rank in range(count)
     ]
-    told = 0
+    reported = 0
     try:
-        with _signals_wait():
+        with _signals_deferred():
             for worker in workers:
                 worker.start()
         while any(worker.is_alive() for worker in workers):
             for worker in workers:
-                worker.join(_LOOK / len(workers))
-            told += _tell(progress, sum(scans) - told)
+                worker.join(_POLL / len(workers))
+            reported += _report(progress, sum(scans) - reported)
             if not errors.empty():
                 raise errors.get()
             if killed := [worker for worker in workers if worker.exitcode not in (None, 0)]:
                 raise FileError(
                     f"a worker was killed (exit status {killed[0].exitcode})",
                     "enough memory for all workers",
-                    "Run the same again, perhaps with fewer workers: finished shards are kept.",
+                    "Run the same command again, possibly with fewer workers: finished shards are kept.",
                 )
         if not errors.empty():
             raise errors.get()
-        _tell(progress, sum(scans) - told)
+        _report(progress, sum(scans) - reported)
     finally:
         stop.value = 1
-        for worker in filter(attrgetter("pid"), workers):  # those that were started
+        for worker in filter(attrgetter("pid"), workers):  # skips workers that were not started
             worker.join(_PATIENCE)
-            worker.kill()  # one that a killed worker left waiting for a lock
+            worker.kill()  # it may wait for a lock that a killed worker held
             worker.join()
 
 
 @contextmanager
-def _signals_wait() -> Iterator[None]:
-    """Signals are heard when all processes that start within are started; these never hear control-C, which a terminal
-    sends to all: this one says when to stop."""
-    heard: list[int] = []
+def _signals_deferred() -> Iterator[None]:
+    """Defer signals until the block has started all processes. These ignore Ctrl-C, which a terminal sends to every
+    process of the group: the parent process tells them when to stop."""
+    received: list[int] = []
     in_charge = threading.current_thread() is threading.main_thread()
     numbers = (signal.SIGINT, signal.SIGTERM) if in_charge else ()
-    before = {number: signal.signal(number, lambda found, frame: heard.append(found)) for number in numbers}
+    before = {number: signal.signal(number, lambda number, frame: received.append(number)) for number in numbers}
     masks = hasattr(signal, "pthread_sigmask")  # not on Windows
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
     try:
@@ -81,19 +81,19 @@ def _signals_wait() -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for number, handler in before.items():
             signal.signal(number, handler)
-    for late in heard:
+    for late in received:
         signal.raise_signal(late)
 
 
-def _tell(progress: Progress, scans: int) -> int:
+def _report(progress: Progress, scans: int) -> int:
     if scans:
         progress(scans)
     return scans
 
 
 def _work(plan: BakePlan, numbers: Sequence[int], taken: Any, scans: Any, stop: Any, errors: Any, rank: int) -> None:
-    """One worker: until there is no shard left, or the run is stopped."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows, where none can be deaf from the start
+    """One worker: writes shards until none is left or the run is stopped."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows, where the parent cannot block it before the start
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if plan.job.device == "cuda":
         import torch

@@ -1,7 +1,7 @@
-"""Engine ``ray``: actors on a Ray cluster, one accelerator each, all writing to a folder that every node sees.
+"""Engine ``ray``: actors on a Ray cluster, one accelerator each, all writing to a folder that every node shares.
 
-An actor gets a shard when it is up, so that one which waits for a node holds nothing back. When an actor or its node
-is lost, its shard goes back to the others and a new actor waits for room: nodes may come and go while the bake runs.
+An actor gets a shard only when it is running, so that a pending actor blocks no shard. When an actor or its node is
+lost, its shard returns to the queue and a new actor is requested: nodes may join and leave during the bake.
 """
 
 import os
@@ -14,29 +14,29 @@ from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError, FileError, LibraryError
 
-_LOSSES = 5  # actors that may be lost, for each worker, while no shard is made
+_LOSSES = 5  # lost actors per worker, without a finished shard in between, after which the bake fails
 
 
 class Baker:
-    """What an actor holds: the plan; the model stays loaded between shards."""
+    """The actor: it holds the plan and keeps the model loaded between shards."""
 
     def __init__(self, plan: BakePlan) -> None:
         self._plan = plan
 
     def ready(self) -> None:
-        """Return when the actor is up."""
+        """Return as soon as the actor is running."""
 
     def bake(self, number: int) -> int:
-        """Make one shard; the number of its scans."""
+        """Write one shard and return its number of scans."""
         return bake_shard(self._plan, number).scans
 
 
 def bake_on_ray(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
-    """Make the shards by ``resources.workers`` actors.
+    """Write the shards with ``resources.workers`` actors.
 
     Raises:
-        LibraryError: where Ray is not installed, here or on a node, or the package is not.
-        ConfigError: where there is no cluster at the address.
+        LibraryError: if Ray or this package is not installed, here or on a node.
+        ConfigError: if no cluster is running at the address.
         FileError, DataError: as ``bake_shard``.
     """
     ray = _import_ray()
@@ -46,7 +46,7 @@ def bake_on_ray(plan: BakePlan, numbers: Sequence[int], resources: Resources, pr
         try:
             ray.init(address=resources.address, log_to_driver=False)
         except ConnectionError as error:
-            raise ConfigError(f"Ray address {resources.address!r} ({error})", "a cluster that is up") from error
+            raise ConfigError(f"Ray address {resources.address!r} ({error})", "a running cluster") from error
     share: dict[str, Any] = {"num_gpus": 1} if plan.job.device == "cuda" else {"num_cpus": plan.job.threads}
     actor = ray.remote(max_restarts=0, **share)(Baker)
     try:
@@ -57,9 +57,9 @@ def bake_on_ray(plan: BakePlan, numbers: Sequence[int], resources: Resources, pr
 
 
 def _work_off(ray: Any, start: Any, waiting: deque[int], workers: int, progress: Progress) -> None:
-    """Give shards to actors until all are made."""
-    running: dict[Any, tuple[Any, int | None]] = {}  # what is awaited: (its actor, the shard it makes)
-    losses = 0  # since the last shard that was made
+    """Assign shards to actors until all are written."""
+    running: dict[Any, tuple[Any, int | None]] = {}  # pending result: (its actor, the shard it writes)
+    losses = 0  # since the last finished shard
 
     def begin() -> None:
         actor = start()
@@ -80,9 +80,9 @@ def _work_off(ray: Any, start: Any, waiting: deque[int], workers: int, progress:
             losses += 1
             if losses > _LOSSES * workers:
                 raise FileError(
-                    f"{losses} Ray actors were lost and no shard was made ({error})",
+                    f"{losses} Ray actors were lost without a finished shard ({error})",
                     "nodes with enough memory",
-                    "Run the same again, perhaps with fewer workers: finished shards are kept.",
+                    "Run the same command again, possibly with fewer workers: finished shards are kept.",
                 ) from error
             if number is not None:
                 waiting.append(number)

@@ -1,4 +1,4 @@
-"""Making again exactly what is damaged or missing in a bank."""
+"""Repair of banks: regenerates exactly what is damaged or missing."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,24 +18,23 @@ from lidar_synth.files.disk import part_of, sha256
 
 
 def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[str, str]:
-    """Generate damaged and missing shards again; write anew what is damaged or missing of the index and of the files
-    that follow from it: the card, and the settings of the bake.
+    """Regenerate damaged and missing shards, and rewrite a damaged or missing index, card or settings file.
 
-    On the machine and with the versions that made the bank, the bytes are the same. Elsewhere the scans are equal to
-    rounding; the index then gets the new hashes, and the fact.
+    On the machine and with the versions that made the bank, the bytes are the same. Elsewhere the scans are equal up to
+    rounding; the index then gets the new hashes and an entry in ``repairs``.
 
     Args:
         root: the bank's folder.
-        model: the checkpoint, where it is not a shipped one.
+        model: the checkpoint, if it is not a shipped model.
         progress: show a bar.
 
     Returns:
-        {file: what was done}; empty where all was whole.
+        {file: what was done}; empty if the bank is intact.
 
     Raises:
-        ConfigError: where the checkpoint is not the one that made the scans.
-        DataError: where too little is left to tell what was there.
-        FileError: where something cannot be read or written.
+        ConfigError: if the checkpoint is not the one that made the scans.
+        DataError: if too little is left to determine what the bank held.
+        FileError: if a file cannot be read or written.
     """
     done: dict[str, str] = {}
     try:
@@ -43,8 +42,8 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
         baked = SETTINGS in index.files or (root / SETTINGS).is_file()
     except (DataError, FileError) as error:
         index, baked = _index_from_shards(root, error), True
-        done[INDEX] = "written again from the shards"
-    done |= {problem.file: "written again from the index" for problem in check_side_files(root, index)}
+        done[INDEX] = "rebuilt from the shards"
+    done |= {problem.file: "rewritten from the index" for problem in check_side_files(root, index)}
     shards, repairs = list(index.shards), list(index.repairs)
     total = sum(entry.scans for entry in shards)
     with tqdm(total=total, desc="repair", unit="scan", disable=not progress) as bar:
@@ -53,51 +52,51 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
             if entry.sha256 and next(check_shard(root, facts, entry), None) is None:
                 bar.update(entry.scans)
                 continue
-            shards[number] = made = _make_again(root, facts, entry, model, bar.update)
-            same = entry.sha256 in ("", made.sha256)
-            done[entry.file] = "made again" + ("" if same else ", with other bytes")
+            shards[number] = new = _regenerate(root, facts, entry, model, bar.update)
+            same = entry.sha256 in ("", new.sha256)
+            done[entry.file] = "regenerated" + ("" if same else ", with different bytes")
             if not same:
-                repairs.append(f"{entry.file} was made again with torch {torch.__version__}, with other bytes")
+                repairs.append(f"{entry.file} was regenerated with torch {torch.__version__}, with different bytes")
     if done:
         write_bank_files(root, replace(index, shards=tuple(shards), repairs=tuple(repairs)), baked)
     return done
 
 
-def _make_again(root: Path, facts: Facts, entry: Entry, model: str | None, progress: Callable[[int], object]) -> Entry:
-    """Generate a shard and put it in its place."""
+def _regenerate(root: Path, facts: Facts, entry: Entry, model: str | None, progress: Callable[[int], object]) -> Entry:
+    """Generate a shard and replace its file."""
     job = job_of(facts, model)
     part = part_of(root / entry.file)
     try:
         write_shard(load_checked(job, facts), part, job, facts, entry, progress)
-        made = replace(entry, bytes=part.stat().st_size, sha256=sha256(part))
+        new = replace(entry, bytes=part.stat().st_size, sha256=sha256(part))
         part.replace(root / entry.file)
     except OSError as error:
         if isinstance(error, LidarSynthError):
             raise
-        raise FileError(f"{root / entry.file} cannot be written ({error.strerror})", "a folder to write to") from error
+        raise FileError(f"{root / entry.file} cannot be written ({error.strerror})", "a writable folder") from error
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
     sync_folder(root)
-    return made
+    return new
 
 
 def _index_from_shards(root: Path, damage: Exception) -> Index:
-    """The index of a bake whose own is lost, by what its shards say; a shard without a hash is to be made again.
+    """Rebuild the lost index of a bake from its shards; an entry without a hash marks a shard to regenerate.
 
     Raises:
-        DataError: where no shard can be read, or those that can are not one bake's.
+        DataError: if no shard can be read, or the readable ones come from different bakes.
     """
     found: dict[str, tuple[Facts, Entry]] = {}
     for path in sorted(root.glob("*.h5")):
         with suppress(DataError, FileError), ShardReader(path, str(path)) as shard:
             found[path.name] = shard.facts, shard.entry
     if not found:
-        raise DataError(f"{damage}, and no shard of {root} can be read", "at least one") from damage
+        raise DataError(f"{damage}, and no shard of {root} can be read", "at least one intact shard") from damage
     facts = next(iter(found.values()))[0]
     shards = BakePlan(root, job_of(facts), facts).shards
     if any(other != facts for other, _ in found.values()) or not {e for _, e in found.values()} <= set(shards):
-        raise DataError(f"{damage}, and the shards of {root} are not one bake's", "a copy of the index") from damage
+        raise DataError(f"{damage}, and the shards of {root} are of different bakes", "a copy of the index") from damage
     entries = []
     for entry in shards:
         path = root / entry.file

@@ -1,16 +1,16 @@
-"""What an engine may use."""
+"""The resources of an engine."""
 
 from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
 class Resources:
-    """Of one run; they decide how long it takes and nothing else.
+    """The resources of one run. They change its duration, never its result.
 
     Args:
-        workers: processes, actors or jobs at a time; each has a GPU of its own where the device is cuda.
-        address: of a Ray cluster; by default one is started on this machine.
-        slurm: options of submitit for the jobs, such as {"slurm_partition": "gpu", "timeout_min": 240}.
+        workers: number of concurrent processes, actors or jobs; with device cuda each one uses its own GPU.
+        address: address of a Ray cluster; by default Ray starts on this machine.
+        slurm: options of submitit for the jobs, for instance {"slurm_partition": "gpu", "timeout_min": 240}.
     """
 
     workers: int = 1

@@ -1,6 +1,6 @@
-"""A whole bake: claim the folder, make the shards that are not there by an engine, write the index.
+"""A complete bake: claim the folder, write the missing shards with an engine, write the index.
 
-To add an engine: write a file with a function of ``Engine``'s kind and enter it in ``ENGINES``.
+To add an engine, write a function with the signature of ``Engine`` in a file of its own and add it to ``ENGINES``.
 """
 
 import signal
@@ -34,15 +34,19 @@ ENGINES: dict[str, Engine] = {
     "slurm": bake_on_slurm,
     "torchrun": bake_under_torchrun,
 }
-"""How shards are made, by name; all of them run ``bake_shard``."""
+"""Engines by name; each of them runs ``bake_shard``."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """Every n-th shard, for runs that know nothing of each other.
+    """Every n-th shard, for independent runs that share the work.
+
+    Args:
+        index: position of the first shard, 0 <= index < of.
+        of: number of shares.
 
     Raises:
-        ConfigError: on an index that is not one of the shares.
+        ConfigError: on an index outside this interval.
     """
 
     index: int = 0
@@ -60,23 +64,23 @@ def bake(
     share: Share | None = None,
     progress: bool = True,
 ) -> Index | None:
-    """Make a bank, or go on with it.
+    """Bake a bank, or resume an interrupted bake.
 
     Args:
-        plan: what to make.
+        plan: the plan of the bank.
         engine: one of ``ENGINES``.
-        resources: what it may use.
-        share: the part of the shards that this run makes; by default all.
+        resources: resources of the engine.
+        share: the shards that this run writes; by default all.
         progress: show a bar.
 
     Returns:
-        The bank's index; None where shards of another run are still missing.
+        The bank's index; None if shards of another run are still missing.
 
     Raises:
-        ConfigError: on an unknown engine, fewer than one worker, or a folder that was filled with other settings.
-        FileError: where the folder cannot be written or the disk is full; what is finished is kept.
-        LibraryError: where the engine's library is not installed.
-        KeyboardInterrupt: on SIGINT or SIGTERM; what is finished is kept.
+        ConfigError: on an unknown engine, fewer than one worker, or a folder of a bake with other settings.
+        FileError: if the folder cannot be written or the disk is full; finished shards are kept.
+        LibraryError: if the engine's library is not installed.
+        KeyboardInterrupt: on SIGINT or SIGTERM; finished shards are kept.
     """
     run = choose("engine", engine, ENGINES)
     resources, share = resources or Resources(), share or Share()
@@ -86,8 +90,8 @@ def bake(
     with _terminated_as_interrupted():
         with at_work(plan):
             mine = range(len(plan.shards))[share.index :: share.of]
-            looked_at = tqdm(mine, "looking at what is there", unit="shard", leave=False, disable=not progress, delay=2)
-            missing = [number for number in looked_at if finished(plan, number) is None]
+            checked = tqdm(mine, "checking existing shards", unit="shard", leave=False, disable=not progress, delay=2)
+            missing = [number for number in checked if finished(plan, number) is None]
             scans = sum(plan.shards[number].scans for number in missing)
             if missing:
                 with tqdm(total=scans, unit="scan", smoothing=0.05, disable=not progress) as bar:
@@ -97,7 +101,7 @@ def bake(
 
 @contextmanager
 def _terminated_as_interrupted() -> Iterator[None]:
-    """SIGTERM stops a run as control-C does: the shard in hand is given up, its file removed."""
+    """Handle SIGTERM like Ctrl-C: abort the current shard and remove its temporary file."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

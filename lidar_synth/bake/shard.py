@@ -1,4 +1,4 @@
-"""One shard of a plan, made once, whoever asks: what every engine runs."""
+"""Writes one shard of a plan; every engine runs this."""
 
 import os
 import shutil
@@ -11,7 +11,8 @@ import torch
 
 from lidar_synth.bake.conditions import condition_names, conditions, open_conditions
 from lidar_synth.bake.folder import at_work, finished, publish
-from lidar_synth.bake.job import DTYPES, BakeJob, BakePlan
+from lidar_synth.bake.job import DTYPES, BakePlan
+from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import part_of
@@ -19,26 +20,26 @@ from lidar_synth.formats import ScanFiles
 from lidar_synth.generate.generator import BATCH, Generator, load_generator
 from lidar_synth.geometry.scan import RangeImage
 
-_PACKED = 0.6  # size of a compressed scan over that of a plain one, at most, for what models make
+_PACKED = 0.6  # highest ratio of compressed to plain size, for scans that models generate
 
 Progress = Callable[[int], object]
-"""Called with the number of scans that were just made; what it raises stops the shard."""
+"""Called with the number of newly generated scans; an exception in it aborts the shard."""
 
 
 def bake_shard(plan: BakePlan, number: int, progress: Progress = lambda scans: None) -> Entry:
-    """Make one shard, unless it is there.
+    """Write one shard, unless it exists.
 
     Args:
-        plan: of a folder that ``prepare`` claimed.
-        number: which shard.
-        progress: told of the scans as they are made.
+        plan: a plan whose folder ``prepare`` has claimed.
+        number: number of the shard.
+        progress: called with the number of scans as they are generated.
 
     Returns:
         The shard, with size and hash.
 
     Raises:
-        FileError: where the folder has vanished or cannot be written, or the disk is or would become full.
-        ConfigError: where the checkpoint is not the plan's any more, or the device is not there.
+        FileError: if the folder has vanished or cannot be written, or the disk is or would become full.
+        ConfigError: if the checkpoint has changed since the plan was made, or the device is not available.
     """
     there = finished(plan, number)
     if there is not None:
@@ -61,20 +62,20 @@ def write_shard(generator: Generator, path: Path, job: BakeJob, facts: Facts, en
     """Generate the scans of a shard and write them; the same settings give the same bytes.
 
     Raises:
-        FileError: where the file cannot be written or the disk is full.
+        FileError: if the file cannot be written or the disk is full.
     """
     names = condition_names(_source(job), range(entry.first, entry.first + entry.scans))
-    # One thread packs 250 scans a second, more than a CPU makes; how many there are changes no byte.
-    packers = job.threads if job.device == "cpu" else min(16, os.cpu_count() or 1)
-    writer = ShardWriter(path, facts, entry, conditions=names, threads=packers)
-    with one_computer(job.threads), writer:
+    # One thread compresses 250 scans/s, more than a CPU generates; the number of threads changes no byte.
+    compressors = job.threads if job.device == "cpu" else min(16, os.cpu_count() or 1)
+    writer = ShardWriter(path, facts, entry, conditions=names, threads=compressors)
+    with torch_threads(job.threads), writer:
         for image in images(generator, job, entry):
             writer.append(image)
             progress(1)
 
 
 def images(generator: Generator, job: BakeJob, entry: Entry) -> Iterator[RangeImage]:
-    """The range images of a shard, in micro-batches that start with it."""
+    """The range images of a shard, generated in batches; the first batch starts with the shard."""
     size = job.batch or generator.batch
     stop = entry.first + entry.scans
     for first in range(entry.first, stop, size):
@@ -83,10 +84,10 @@ def images(generator: Generator, job: BakeJob, entry: Entry) -> Iterator[RangeIm
 
 
 def generate(generator: Generator, job: BakeJob, indices: Sequence[int]) -> list[RangeImage]:
-    """The range images of some indices, as the job has them made.
+    """The range images of some indices, with the settings of the job.
 
     Raises:
-        FileError, DataError: where a condition cannot be read.
+        FileError, DataError: if a condition cannot be read.
     """
     given = conditions(_source(job), indices)
     return generator.range_images(job.seed, indices, given, steps=job.steps, solver=job.solver, guidance=job.guidance)
@@ -97,8 +98,8 @@ def _source(job: BakeJob) -> ScanFiles | None:
 
 
 @contextmanager
-def one_computer(threads: int) -> Iterator[None]:
-    """The conditions under which all engines compute the same bits: as many torch threads as the settings say."""
+def torch_threads(threads: int) -> Iterator[None]:
+    """Set torch's number of threads, on which the computed bits depend, so that all engines compute the same."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -113,18 +114,18 @@ def _load(model: str, device: str, dtype: str, batch: int) -> Generator:
 
 
 def load_checked(job: BakeJob, facts: Facts) -> Generator:
-    """The model behind a bank, once per process.
+    """Load the model of a bank, once per process.
 
     Raises:
-        ConfigError: where it is another checkpoint, or the device is not there.
-        FileError, DataError: where it cannot be read.
+        ConfigError: if it is another checkpoint, or the device is not available.
+        FileError, DataError: if it cannot be read.
     """
     generator = _load(job.model, job.device, job.dtype, job.batch or BATCH[job.device])
     if generator.hash != facts.checkpoint:
         raise ConfigError(
             f"model {job.model!r}, checkpoint {generator.hash[:12]}",
             f"the checkpoint that made the bank's scans, {facts.model} {facts.checkpoint[:12]}",
-            "Name its file with --model.",
+            "Give its file with --model.",
         )
     return generator
 
@@ -136,5 +137,5 @@ def _check_space(plan: BakePlan, entry: Entry) -> None:
         raise FileError(
             f"{plan.out} has {free / 1e6:.0f} MB free",
             f"about {need / 1e6:.0f} MB for the next shard",
-            "Free some space and run the same again: finished shards are kept.",
+            "Free some space and run the same command again: finished shards are kept.",
         )

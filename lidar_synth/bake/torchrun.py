@@ -1,6 +1,6 @@
-"""Engine ``torchrun``: as one of the processes that ``torchrun`` starts; each takes every n-th shard.
+"""Engine ``torchrun``: one of the processes that ``torchrun`` starts; each takes every n-th shard.
 
-The processes do not talk to each other: the one that finishes last writes the index.
+The processes do not communicate: the one that finishes last writes the index.
 """
 
 import os
@@ -15,10 +15,10 @@ from lidar_synth.errors import ConfigError
 
 
 def bake_under_torchrun(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
-    """Make this process's shards.
+    """Write this process's shards.
 
     Raises:
-        ConfigError: where torchrun did not start this process.
+        ConfigError: if torchrun did not start this process.
     """
     try:
         rank, ranks, local = (int(os.environ[name]) for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
@@ -30,7 +30,7 @@ def bake_under_torchrun(plan: BakePlan, numbers: Sequence[int], resources: Resou
         ) from error
     if plan.job.device == "cuda":
         torch.cuda.set_device(local)
-    # By the shard's own number: what is missing may look different to a process that looks later.
+    # By the shard's number in the plan: the list of missing shards may differ between processes.
     for number in numbers:
         if number % ranks == rank:
             bake_shard(plan, number, progress)

@@ -1,8 +1,9 @@
 """Banks: folders of generated scans as range images in HDF5, "lidar-synth-bank/1".
 
-``encoding`` says how a range image is stored, ``shard`` what a file of them holds and how it is read, ``layout`` checks
-what such a file declares, ``storage`` reads ranges of files and URLs, ``writer`` writes a shard, ``index`` is what a
-bank says about itself, ``reader`` makes it a source of scans, ``card`` describes it to people and to data set tools.
+``encoding`` converts range images to compact arrays and ``chunks`` compresses them. ``shard`` reads one file of a bank,
+``layout`` validates what such a file declares, ``storage`` reads byte ranges of files and URLs, ``writer`` writes a
+shard. ``index`` holds a bank's metadata, ``reader`` offers a bank as a source of scans, and ``card`` describes it to
+people and to data set tools.
 """
 
 from lidar_synth.bank.encoding import Encoding

@@ -1,7 +1,8 @@
-"""What a bank tells people and data set tools: ``README.md``, a dataset card as the Hugging Face hub shows them, and
-``croissant.json``, its files in the Croissant vocabulary (https://docs.mlcommons.org/croissant/docs/croissant-spec.html).
+"""Descriptions of a bank for people and data set tools: ``README.md`` is a dataset card in the format of the Hugging
+Face hub; ``croissant.json`` lists the files in the Croissant vocabulary
+ (https://docs.mlcommons.org/croissant/docs/croissant-spec.html).
 
-Both follow from the index alone, so that the same bank has the same card.
+Both are computed from the index alone: the same bank always has the same card.
 """
 
 import json
@@ -14,7 +15,7 @@ CARD, CROISSANT = "README.md", "croissant.json"
 
 
 def card_files(name: str, index: Index) -> dict[str, bytes]:
-    """Both files of a bank of this name, by the files' names."""
+    """Card and Croissant description of a bank, as {file name: content}."""
     return {
         CARD: dataset_card(name, index).encode(),
         CROISSANT: (json.dumps(croissant(name, index), indent=1) + "\n").encode(),
@@ -22,7 +23,7 @@ def card_files(name: str, index: Index) -> dict[str, bytes]:
 
 
 def summary(index: Index) -> dict[str, Any]:
-    """What there is to know about a bank at a glance: plain values by name."""
+    """A bank's main properties, as {name: plain value}."""
     facts = index.sources[0]
     rows, columns = facts.sensor.shape
     return {
@@ -37,7 +38,7 @@ def summary(index: Index) -> dict[str, Any]:
         "fields": ", ".join(facts.fields) or "none",
         "label policy": facts.label_policy,
         "model": _each(f"{source.model}, checkpoint {source.checkpoint}" for source in index.sources),
-        "data": _each(source.provenance.get("data", "not told") for source in index.sources),
+        "data": _each(source.provenance.get("data", "unknown") for source in index.sources),
         "data licence": _each(source.data_licence for source in index.sources),
         "licence": _each(source.licence for source in index.sources),
         "settings": _each(json.dumps(source.settings, sort_keys=True) for source in index.sources),
@@ -51,12 +52,12 @@ def summary(index: Index) -> dict[str, Any]:
 
 
 def _each(values: Iterable[Any]) -> str:
-    """What the sources say, each thing once."""
+    """The distinct values of all sources, as one text."""
     return "; ".join(dict.fromkeys(map(str, values)))
 
 
 def dataset_card(name: str, index: Index) -> str:
-    """Markdown with the hub's metadata on top."""
+    """The dataset card: Markdown with the hub's metadata as a header."""
     lines = [
         "---",
         f"pretty_name: {json.dumps(name)}",

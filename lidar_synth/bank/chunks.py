@@ -1,7 +1,7 @@
-"""Scans as the chunks of an HDF5 dataset, made and read in the same way as HDF5's own filters do it.
+"""Compression of scans to the chunks of an HDF5 dataset, in the format of HDF5's own filters.
 
-They are made and read here and not by HDF5, because HDF5 does one thing at a time, and by libdeflate, which takes half
-of zlib's time both ways (docs/benchmarks.md).
+HDF5 does not compress the chunks itself because it holds one global lock. libdeflate compresses and decompresses in
+half of zlib's time (docs/benchmarks.md).
 """
 
 import math
@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from lidar_synth.errors import LibraryError
 
 _GZIP_LEVEL = 1
-_DEFLATE_RATIO = 1032  # no deflated byte holds more
+_DEFLATE_RATIO = 1032  # highest compression ratio that deflate can reach
 
 FILTERS = {"gzip": (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32),
            "blosc2": (32026, h5py.h5z.FILTER_FLETCHER32)}  # fmt: skip
-"""HDF5's numbers of what packs a chunk, in order, by ``compression``."""
+"""HDF5 numbers of the filters of a chunk, in order, by ``compression``."""
 
 
 def checksum(seed: int, index: int, arrays: Mapping[str, NDArray[Any]], condition: bytes = b"") -> int:
-    """CRC-32 of what a scan is: seed and index (8 bytes each, lowest first), the condition's name, then the arrays."""
+    """CRC-32 of a scan: seed and index (8 bytes each, little-endian), the condition's name, then the arrays."""
     crc = libdeflate.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
     for values in arrays.values():
         crc = libdeflate.crc32(values.data, crc)
@@ -33,7 +33,7 @@ def checksum(seed: int, index: int, arrays: Mapping[str, NDArray[Any]], conditio
 
 
 def deflate(values: NDArray[Any]) -> bytes:
-    """A chunk as HDF5's filters shuffle, deflate and fletcher32 make it."""
+    """Compress an array to a chunk, like HDF5's filters shuffle, deflate and fletcher32."""
     size = values.itemsize
     planes = np.empty((size, values.size), np.uint8)
     for k, plane in enumerate(planes):
@@ -46,7 +46,7 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
     """The inverse of ``deflate``.
 
     Raises:
-        ValueError: where the chunk is damaged, or holds something else.
+        ValueError: if the chunk is damaged, or holds something else.
     """
     packed = memoryview(chunk)[:-4]
     if fletcher32(packed) != int.from_bytes(chunk[-4:], "little"):
@@ -59,7 +59,7 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
     except libdeflate.DeflateError as error:
         raise ValueError(f"it is damaged or does not hold {size} bytes") from error
     if len(plain) != size:
-        raise ValueError(f"it holds {len(plain)} bytes and not {size}")
+        raise ValueError(f"it holds {len(plain)} bytes instead of {size}")
     first, *others = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
     values = first.astype(dtype, copy=False)
     for k, plane in enumerate(others, 1):
@@ -68,15 +68,15 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
 
 
 def unpack(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any], compression: str) -> NDArray[Any]:
-    """The array in a chunk of a file.
+    """Decompress a chunk of a file to its array.
 
     Raises:
-        ValueError, OSError, RuntimeError: where the chunk is damaged, or holds something else.
+        ValueError, OSError, RuntimeError: if the chunk is damaged, or holds something else.
         LibraryError: on Blosc2 without hdf5plugin.
     """
     if compression == "gzip":
         return inflate(chunk, shape, dtype)
-    # hdf5plugin has its filters for HDF5 alone, so HDF5 unpacks the chunk, as the only one of a file in memory.
+    # hdf5plugin's filters work only within HDF5: a file in memory with this one chunk decompresses it.
     options = {"chunks": (1, *shape), "fletcher32": True, **filters(compression)}
     with h5py.File("chunk", "w", driver="core", backing_store=False) as file:
         dataset = file.create_dataset("values", (1, *shape), dtype, **options)
@@ -86,7 +86,7 @@ def unpack(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any], compressi
 
 
 def fletcher32(data: bytes | bytearray | memoryview) -> int:
-    """The checksum of HDF5's filter of that name: over big-endian 16-bit words, an odd last byte as the higher one."""
+    """The checksum of HDF5's fletcher32 filter, over big-endian 16-bit words; an odd last byte is a high byte."""
     first, second = _fletcher_sums(np.frombuffer(data, np.uint8))
     if len(data) % 2:
         first += data[-1] << 8
@@ -98,7 +98,7 @@ def fletcher32(data: bytes | bytearray | memoryview) -> int:
 
 @numba.njit(nogil=True, cache=True)
 def _fletcher_sums(data):  # type: ignore[no-untyped-def]  # (N,) uint8, compiled
-    """The sum of the whole 16-bit words, and the sum of what it was after each of them."""
+    """The sum of the complete 16-bit words, and the sum of the partial sums after each word."""
     count = len(data) // 2
     first = second = np.int64(0)
     for i in range(count):
@@ -109,8 +109,9 @@ def _fletcher_sums(data):  # type: ignore[no-untyped-def]  # (N,) uint8, compile
 
 
 def filters(compression: str) -> Mapping[str, Any]:
-    """What ``h5py.create_dataset`` takes for gzip, which every HDF5 reads, or for Blosc2 (zstd 3, bits shuffled), where
-    hdf5plugin is installed; importing that is also what makes HDF5 know Blosc2.
+    """Arguments of ``h5py.create_dataset`` for gzip, which every HDF5 reads, or for Blosc2 (zstd 3, bits shuffled).
+
+    Blosc2 needs hdf5plugin; importing it also registers the filter with HDF5.
 
     Raises:
         LibraryError: on Blosc2 without hdf5plugin.

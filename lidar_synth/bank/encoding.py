@@ -1,4 +1,4 @@
-"""How a bank holds a range image: 3 to 5 bytes a cell, the same bytes on every machine.
+"""Encoding of range images: 3 to 5 bytes per cell, the same bytes on every machine.
 
 =========== ====== ================================================================================================
 array       type   value
@@ -6,12 +6,12 @@ array       type   value
 range       uint16 metres = value * scale, scale = the sensor's range_max / 65535 (1.2 mm for 80 m); 0 = no return
 reflectance uint8  value / 255
 label       uint8  train ids 0..18, 255 = ignore
-confidence  uint8  value / 15: four bits are what a confidence is worth
+confidence  uint8  value / 15: four bits are precise enough for a confidence
 =========== ====== ================================================================================================
 
-``encode`` is off by half a step at most and the inverse of ``decode`` on everything that ``decode`` gives. A return
-stays a return: one nearer than half a step is 1 and not 0, and none leaves the sensor's range limits, where a
-projection would drop it.
+``encode`` rounds by at most half a step, and ``encode(decode(x)) == x``. Every return stays a return: a range below
+half a step is stored as 1, not as 0, and decoded ranges stay within the sensor's limits, so that a projection keeps
+them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -27,7 +27,7 @@ from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
 
 RANGE_STEPS = 65535
-"""Steps of the range from 0 to the sensor's farthest."""
+"""Steps of the range from 0 to the sensor's range_max."""
 
 TYPES: dict[str, type[np.unsignedinteger[Any]]] = {
     "range": np.uint16, "reflectance": np.uint8, "label": np.uint8, "confidence": np.uint8,
@@ -38,18 +38,18 @@ LEVELS = {"reflectance": 255, "confidence": 15}
 """Steps from 0 to 1."""
 
 _INSIDE = 1e-6
-"""Share by which a decoded range keeps away from the sensor's limits: what float32 points lose on the way back."""
+"""Relative margin between decoded ranges and the sensor's limits: the rounding error of float32 points."""
 
 
 class Encoding:
-    """Range images of one sensor to compact arrays and back.
+    """Encodes range images of one sensor as compact arrays and decodes them.
 
     Args:
-        sensor: whose grid.
-        fields: names of ``TYPES`` that a scan carries beside its range.
+        sensor: defines the grid.
+        fields: names of ``TYPES`` that are stored beside the range.
 
     Attributes:
-        names: of the arrays, in order.
+        names: the names of the arrays, in order.
         scale: metres per step of the range.
 
     Raises:
@@ -72,11 +72,11 @@ class Encoding:
         """The arrays of a range image.
 
         Args:
-            image: on the sensor's grid, with a channel for each field; more do no harm.
-            out: (H, W) arrays to write into, as ``arrays`` tells them; new ones by default.
+            image: on the sensor's grid, with a channel for each field; further channels are ignored.
+            out: (H, W) arrays to write into, with the types of ``arrays``; new ones by default.
 
         Returns:
-            {name: (H, W)}, those of ``out`` where they are given.
+            {name: (H, W)}: ``out`` if given, otherwise new arrays.
 
         Raises:
             DataError: on another grid, a missing channel, or a value that has no code: a range outside the sensor's
@@ -94,7 +94,7 @@ class Encoding:
         return {name: out[name] for name in self.names}
 
     def decode(self, arrays: Mapping[str, NDArray[Any]]) -> RangeImage:
-        """The range image of ``encode``'s arrays; its own memory, float32 but for the labels."""
+        """The range image of encoded arrays, in new memory; float32 except for the labels."""
         channels: dict[str, NDArray[Any]] = {}
         for name in self.names[1:]:
             if name in LEVELS:
@@ -105,7 +105,7 @@ class Encoding:
         return RangeImage(self.metres(arrays["range"]), self.sensor, channels)
 
     def check(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Refuse codes that ``encode`` never gives.
+        """Refuse codes that ``encode`` never writes.
 
         Raises:
             DataError: naming the array.
@@ -117,14 +117,14 @@ class Encoding:
             _train_ids(arrays["label"])
 
     def metres(self, codes: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Ranges (any shape) of their codes, 0 = no return."""
+        """Ranges in metres (any shape) from their codes; 0 = no return."""
         near, far = self.sensor.range_min * (1 + _INSIDE), self.sensor.range_max * (1 - _INSIDE)
         metres = np.empty(codes.shape, np.float32)
         _decode_range(codes.ravel(), np.float32(self.scale), np.float32(near), np.float32(far), metres.reshape(-1))
         return metres
 
     def _code(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
-        """What ``encode`` stores of one channel."""
+        """The codes of one channel."""
         if name == "label":
             return _train_ids(values)
         codes = np.empty(values.shape, TYPES[name])
@@ -132,9 +132,9 @@ class Encoding:
             near, far = self.sensor.range_min - self.scale / 2, self.sensor.range_max + self.scale / 2
             limits = np.float32(max(near, 0)), np.float32(far)
             if not _encode_range(values.ravel(), np.float32(1 / self.scale), *limits, codes.reshape(-1)):
-                seen = values[values != 0]
+                returns = values[values != 0]
                 raise DataError(
-                    f"a range image with ranges from {seen.min():g} to {seen.max():g} m",
+                    f"a range image with ranges from {returns.min():g} to {returns.max():g} m",
                     f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of {self.sensor.name!r}, "
                     "or 0 = no return",
                 )
@@ -165,7 +165,7 @@ def _encode_range(metres, inverse, near, far, out):  # type: ignore[no-untyped-d
 
 @numba.njit(nogil=True, cache=True)
 def _decode_range(codes, scale, near, far, out):  # type: ignore[no-untyped-def]
-    """The inverse, kept between near and far."""
+    """The inverse of ``_encode_range``, clipped to near..far."""
     for i in range(len(codes)):
         out[i] = min(max(np.float32(codes[i]) * scale, near), far) if codes[i] > 0 else np.float32(0)
 
@@ -182,6 +182,6 @@ def _encode_shares(values, levels, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True)
 def _decode_shares(codes, levels, out):  # type: ignore[no-untyped-def]
-    """The inverse."""
+    """The inverse of ``_encode_shares``."""
     for i in range(len(codes)):
         out[i] = np.float32(codes[i]) / levels

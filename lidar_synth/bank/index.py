@@ -1,28 +1,28 @@
-"""What a bank says about itself: the facts behind its scans, and ``index.json`` with every shard's size and hash.
+"""A bank's metadata: the facts that its scans have in common, and ``index.json`` with every shard's size and hash.
 
 ``index.json`` of "lidar-synth-bank/1"::
 
-    format     "lidar-synth-bank/1"; a reader refuses every other
-    scans      how many
-    sources    the facts of each bake whose scans are here; more than one after a merge
+    format     "lidar-synth-bank/1"; readers refuse every other value
+    scans      number of scans
+    sources    the facts of each bake; more than one after a merge
     shards     in order: file, seed, first index, scans, source (a position in ``sources``), bytes, sha256; in a
-               curated bank also ``dropped``, positions in the file of the scans that are left out
-    repairs    what was made again with other bytes, in words
-    curation   in a curated bank: by what scans were left out, in words
-    files      sha256 of the other files that are written with the index; banks of older versions have none
-    checksum   sha256 of the rest, as JSON without spaces and with sorted keys
+               curated bank also ``dropped``: positions in the file of the scans that are left out
+    repairs    descriptions of the shards that a repair wrote with different bytes
+    curation   in a curated bank: why scans were left out
+    files      sha256 of the other files of the bank; missing in banks of older versions
+    checksum   sha256 of all other values, as JSON without spaces and with sorted keys
 
-The facts stand in the root attributes of each shard too, text and numbers as they are, everything else as JSON, and
-have to agree::
+The root attributes of each shard repeat the facts and have to agree with them; text and numbers are stored directly,
+everything else as JSON::
 
     sensor         as in sensors.yaml; scale = range_max / 65535, metres per step of ``range``
-    fields         what a scan carries beside its range: reflectance, label, confidence
-    model          the checkpoint's name; checkpoint: its hash; provenance: what it says about itself
-    settings       of the bake: what else the scans are a function of
+    fields         what is stored beside the range: reflectance, label, confidence
+    model          the checkpoint's name; checkpoint: its hash; provenance: its header's provenance
+    settings       of the bake: everything else that determines the scans
     label_policy   "generated", or "none"
-    condition      what the scans are conditioned on, by reference, or null
-    licence        of the weights; data_licence: of the data behind them
-    software       versions of what made the scans
+    condition      the dataset that the scans are conditioned on, or null
+    licence        of the weights; data_licence: of the training data
+    software       versions of the libraries that made the scans
     compression    "gzip" or "blosc2"; layout "plain" or "paged"
 """
 
@@ -49,17 +49,17 @@ LAYOUTS = ("plain", "paged")
 INDEX = "index.json"
 
 SCAN_NUMBERS = 20
-"""Bytes of a scan's seed, index and CRC: the fewest that a scan takes."""
+"""Bytes of a scan's seed, index and CRC: the minimum size of a scan."""
 
-REPAIR = "lidar-synth repair BANK makes what is damaged or missing again."
+REPAIR = "lidar-synth repair BANK regenerates what is damaged or missing."
 
 _TEXT = ("format", "model", "checkpoint", "label_policy", "licence", "data_licence", "compression", "layout")
-_DEPTH = 32  # most levels of JSON: each nested one costs Python a call
+_DEPTH = 32  # most levels of nested JSON: Python recurses once per level
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What all scans of one bake have in common; the fields are those of the module's docstring.
+    """The properties that all scans of one bake share; the module's docstring describes the fields.
 
     Raises:
         ConfigError: on fields that have no encoding.
@@ -81,16 +81,16 @@ class Facts:
 
     @cached_property
     def encoding(self) -> Encoding:
-        """How the scans are stored."""
+        """The encoding of the scans."""
         return Encoding(self.sensor, self.fields)
 
     @cached_property
     def text_size(self) -> int:
-        """Bytes of all of it as JSON."""
+        """Size of the facts as JSON, in bytes."""
         return len(json.dumps(self.to_dict()).encode())
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, with format and scale."""
+        """The facts as plain values, with format and scale."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values |= {"sensor": self.sensor.to_dict(), "fields": list(self.fields)}
         return {"format": FORMAT, "scale": self.sensor.range_max / RANGE_STEPS, **values}
@@ -100,8 +100,8 @@ class Facts:
         """The inverse of ``to_dict``.
 
         Raises:
-            DataError: on another format, keys that do not belong there, values of another kind, or a scale that is
-                not the sensor's.
+            DataError: on another format, unknown keys, values of a wrong type, or a scale that does not match the
+                sensor.
         """
         try:
             values = dict(values)
@@ -119,11 +119,11 @@ class Facts:
         return facts
 
     def to_attributes(self) -> dict[str, Any]:
-        """Values for HDF5 attributes, small ones first: HDF5 moves the first eight when a ninth comes, and leaves a
-        hole of their size. Text has a fixed length: what is longer would stand where no checksum is.
+        """Values for HDF5 attributes, ascending by size: HDF5 moves the first eight when a ninth is added, which
+        leaves a gap of their size. Text has a fixed length: HDF5 stores variable-length text without a checksum.
         """
-        found = {name: _attribute(value) for name, value in self.to_dict().items()}
-        return dict(sorted(found.items(), key=lambda item: np.asarray(item[1]).nbytes))
+        attributes = {name: _attribute(value) for name, value in self.to_dict().items()}
+        return dict(sorted(attributes.items(), key=lambda item: np.asarray(item[1]).nbytes))
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any], where: str) -> "Facts":
@@ -138,7 +138,7 @@ class Facts:
         return cls.from_dict(values, where)
 
     def _check_kinds(self) -> None:
-        """Raise ``TypeError`` or ``ValueError`` where a value is of another kind than it has to be."""
+        """Raise ``TypeError`` or ``ValueError`` on a value of a wrong type."""
         kinds = dict.fromkeys(_TEXT[1:], str) | {"settings": dict, "provenance": dict, "software": dict}
         for name, kind in kinds.items():
             value = getattr(self, name)
@@ -155,14 +155,14 @@ class Entry:
     """One shard: scans ``first`` to ``first + scans - 1`` of a seed.
 
     Args:
-        file: its name in the bank's folder.
-        seed: of the scans' noise.
+        file: name of the file in the bank's folder.
+        seed: seed of the scans' noise.
         first: index of its first scan.
-        scans: how many.
-        source: position of its facts among the bank's.
-        bytes: the file's size.
-        sha256: of the file.
-        dropped: positions of the scans that are in the file and not in the bank, ascending.
+        scans: number of scans in the file.
+        source: position of its facts in ``Index.sources``.
+        bytes: size of the file.
+        sha256: hash of the file.
+        dropped: ascending positions of the scans that are in the file but not in the bank.
     """
 
     file: str
@@ -179,30 +179,30 @@ class Entry:
 
     @property
     def kept(self) -> int:
-        """How many of its scans are in the bank."""
+        """Number of its scans that are in the bank."""
         return self.scans - len(self.dropped)
 
     def position(self, rank: int) -> int:
-        """Where in the file scan ``rank`` of those that are kept stands."""
-        # Before dropped scan i stand ``dropped[i] - i`` that are kept, and it is passed by all ranks from there on.
+        """The position in the file of the kept scan number ``rank``."""
+        # ``dropped[i] - i`` kept scans precede dropped scan i; it shifts every rank from there on by one.
         return rank + bisect_right(range(len(self.dropped)), rank, key=lambda i: self.dropped[i] - i)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """The entry as plain values."""
         values = asdict(self)
         return values if self.dropped else {name: value for name, value in values.items() if name != "dropped"}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Entry":
-        """The inverse of ``to_dict``, for a shard that is written.
+        """The inverse of ``to_dict``, for a shard that has been written.
 
         Raises:
-            TypeError, ValueError: on keys or values that no shard has.
+            TypeError, ValueError: on keys or values that a shard cannot have.
         """
         entry = cls(**values)
-        whole = (entry.seed, entry.first, entry.scans, entry.source, entry.bytes, *entry.dropped)
-        # A JSON number may be 1e30 or 2.0, and a truth value counts as a number too.
-        if not all(type(number) is int and 0 <= number < 1 << 64 for number in whole):
+        numbers = (entry.seed, entry.first, entry.scans, entry.source, entry.bytes, *entry.dropped)
+        # A JSON number may be 1e30 or 2.0, and Python takes true for a number.
+        if not all(type(number) is int and 0 <= number < 1 << 64 for number in numbers):
             raise ValueError(f"numbers of {entry}")
         if not (isinstance(entry.file, str) and isinstance(entry.sha256, str)):
             raise TypeError(f"text of {entry}")
@@ -212,23 +212,23 @@ class Entry:
 
     @property
     def span(self) -> str:
-        """Which scans, in words."""
+        """Description of its scans, for messages."""
         return f"scans {self.first} to {self.first + self.scans - 1} of seed {self.seed}"
 
 
 @dataclass(frozen=True)
 class Index:
-    """What is in a bank, in order.
+    """The content of a bank, in order.
 
     Args:
         sources: the facts of each bake.
         shards: at least one.
-        repairs: what was made again with other bytes.
-        curation: by what scans were left out; () for a bank that is not curated.
-        files: {name: sha256} of the other files beside the shards; they are no part of the bank's identity.
+        repairs: descriptions of shards that a repair wrote with different bytes.
+        curation: why scans were left out; () for a bank that is not curated.
+        files: {name: sha256} of the other files of the bank; they do not change the bank's identity.
 
     Raises:
-        DataError: where they do not fit together.
+        DataError: if the values are inconsistent.
     """
 
     sources: tuple[Facts, ...]
@@ -245,35 +245,35 @@ class Index:
                 raise DataError(f"a bank with {entry}", "at least one scan, of one of its sources")
             steps = pairwise((-1, *entry.dropped, entry.scans))
             if not (entry.kept >= 1 and all(a < b for a, b in steps) and (self.curation or not entry.dropped)):
-                raise DataError(f"a bank with {entry}", "ascending positions that leave a scan, and what dropped them")
+                raise DataError(f"a bank with {entry}", "ascending positions that leave a scan, and the rule")
         if not self.shards or len({e.file for e in self.shards}) < len(self.shards):
-            raise DataError(f"a bank with the shards {[e.file for e in self.shards]}", "at least one, each once")
+            raise DataError(f"a bank with the shards {[e.file for e in self.shards]}", "at least one, each only once")
         if any((f.sensor, f.fields) != (self.sources[0].sensor, self.sources[0].fields) for f in self.sources):
             raise DataError("a bank with several sensors or fields", "the same for all scans")
 
     @property
     def scans(self) -> int:
-        """How many there are."""
+        """Number of scans in the bank."""
         return self.ends[-1]
 
     @cached_property
     def ends(self) -> list[int]:
-        """Scans up to and with each shard."""
+        """Number of scans up to and including each shard."""
         return list(accumulate(entry.kept for entry in self.shards))
 
     @cached_property
     def by_file(self) -> dict[str, Entry]:
-        """The shards by their files' names."""
+        """The shards, by file name."""
         return {entry.file: entry for entry in self.shards}
 
     @property
     def size(self) -> int:
-        """Bytes of all shards."""
+        """Size of all shards in bytes."""
         return sum(entry.bytes for entry in self.shards)
 
     @cached_property
     def checksum(self) -> str:
-        """What tells this bank from every other one: the sha256 of all but ``files``, one of which names it."""
+        """The bank's identity: the sha256 of all values but ``files``, one of which contains this checksum."""
         return _sum(self._values())
 
     def to_json(self) -> bytes:
@@ -286,14 +286,14 @@ class Index:
         """The inverse of ``to_json``.
 
         Raises:
-            DataError: on another format, or content that is damaged.
+            DataError: on another format or damaged content.
         """
         try:
             values = _from_json(text)
             _check_format(values.get("format"), where)
             given = values.pop("checksum", None)
             if given != _sum(values):
-                raise DataError(f"{where} does not have its own checksum: it was damaged or edited", "it as written")
+                raise DataError(f"{where} does not match its checksum: it was damaged or edited", "an index")
             index = cls(
                 tuple(Facts.from_dict(facts, where) for facts in values["sources"]),
                 tuple(Entry.from_dict(entry) for entry in values["shards"]),
@@ -324,13 +324,13 @@ class Index:
 
 
 def _from_json(text: str | bytes) -> Any:
-    """Values of a JSON text.
+    """Parse a JSON text.
 
     Raises:
-        ValueError, RecursionError: where it is none, is nested too deep, or has text that UTF-8 cannot hold.
+        ValueError, RecursionError: if it is invalid, nested too deep, or has text that UTF-8 cannot represent.
     """
     values = json.loads(text)
-    json.dumps(values, ensure_ascii=False).encode()  # half of a surrogate pair is text for JSON, and for nothing else
+    json.dumps(values, ensure_ascii=False).encode()  # JSON permits half of a surrogate pair, UTF-8 does not
     level = [values]
     for _ in range(_DEPTH):
         level = [
@@ -342,7 +342,7 @@ def _from_json(text: str | bytes) -> Any:
 
 
 def _sensor(values: Any) -> Sensor:
-    """The sensor of a bank's facts, which tell it as ``to_dict`` does."""
+    """The sensor of a bank's facts, from the values of ``Sensor.to_dict``."""
     sensor = Sensor.from_dict(values)
     numbers = [v for v in (*sensor.shape, sensor.columns, sensor.rows) if v is not None]
     if not all(type(number) is int for number in numbers) or sensor.to_dict() != values:
@@ -361,7 +361,7 @@ def _check_format(given: Any, where: str) -> None:
         raise DataError(
             f"{where} is of format {given!r}", repr(FORMAT), "Use the version of lidar_synth that wrote it."
         )
-    raise DataError(f"{where} is no part of a bank (format {given!r})", repr(FORMAT))
+    raise DataError(f"{where} is not part of a bank (format {given!r})", repr(FORMAT))
 
 
 def _attribute(value: Any) -> Any:
@@ -375,7 +375,7 @@ def _plain(name: str, value: Any) -> Any:
     """The inverse of ``_attribute``."""
     if isinstance(value, float):
         return float(value)
-    if not isinstance(value, str | bytes):  # bytes(NUMBER) would take as many bytes as the number says
+    if not isinstance(value, str | bytes):  # bytes(NUMBER) would allocate that many bytes
         raise ValueError(f"{name} is a {type(value).__name__}")
     text = value if isinstance(value, str) else value.decode()
     return text if name in _TEXT else _from_json(text)

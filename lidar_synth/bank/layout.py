@@ -1,8 +1,8 @@
-"""Where in a shard its values lie. Whatever the file declares is checked before any memory is taken for it.
+"""The positions of a shard's values in its file. All declarations are validated before memory is allocated for them.
 
-A shard may come from anywhere. HDF5 would follow links and external or virtual storage into other files, run foreign
-filters, and give memory to whatever shape is declared. Here a shard has the named datasets and no others, each stored
-in the file itself, with the shapes and types of its facts.
+A shard may come from an untrusted source. HDF5 would follow links and external or virtual storage into other files, run
+arbitrary filters, and allocate memory for any declared shape. Here a shard has exactly the named datasets, each stored
+in the file itself, with the shapes and types that its facts imply.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,25 +23,25 @@ Arrays = Mapping[str, tuple[tuple[int, int], np.dtype[Any]]]
 """Shape and type of each array of one scan, as ``Encoding.arrays`` gives them."""
 
 NUMBERS: dict[str, np.dtype[Any]] = {"seed": np.dtype("<u8"), "index": np.dtype("<u8"), "crc": np.dtype("<u4")}
-"""Datasets with one number a scan."""
+"""Datasets with one number per scan."""
 
 CONDITION = "condition"
 
 _ATTRIBUTES, _ATTRIBUTE_SIZE = 64, 1 << 20
-_BASE = 12 << 10  # bytes of a shard's metadata, without facts of more than 4 kB and without the places of its chunks
-_PLACE = 16  # bytes of a chunk's place in the metadata
-_PASSES = 32  # most reads until the metadata are there
-_BLOSC2_ARRAY = 32 << 20  # most bytes of one array that Blosc2 packed: unlike deflate it packs zeros without bound
+_BASE = 12 << 10  # bytes of a shard's metadata, without facts of more than 4 kB and without the chunks' addresses
+_PLACE = 16  # bytes of a chunk's address in the metadata
+_PASSES = 32  # most reads to collect the metadata
+_BLOSC2_ARRAY = 32 << 20  # most bytes of one Blosc2 array: unlike deflate, Blosc2 has no highest compression ratio
 
 
 @dataclass(frozen=True)
 class Chunks:
-    """Where the chunks of one array lie, by position of the scan.
+    """The addresses of one array's chunks, by position of the scan.
 
     Args:
         offset: (N,) uint64, from the beginning of the file.
         size: (N,) uint64 bytes; 0 where there is no chunk.
-        skipped: (N,) uint32, the filters that were left out, as bits.
+        skipped: (N,) uint32, a bit mask of the filters that were not applied.
     """
 
     offset: NDArray[np.uint64]
@@ -51,12 +51,12 @@ class Chunks:
 
 @dataclass(frozen=True)
 class Layout:
-    """What stands where in a shard.
+    """The numbers of a shard and the addresses of its chunks.
 
     Args:
-        numbers: the values of ``NUMBERS``, (N,) each.
+        numbers: {name: (N,)} for the names in ``NUMBERS``.
         conditions: (N,) text, or None.
-        chunks: of each array.
+        chunks: {name: addresses} for each array.
     """
 
     numbers: dict[str, NDArray[Any]]
@@ -65,8 +65,8 @@ class Layout:
 
 
 def metadata_size(facts: Facts, scans: int) -> int:
-    """Bytes that a shard's metadata takes, rounded up. The writer keeps so much together at the beginning of the file;
-    behind it stand facts of more than 4 kB, and then the numbers.
+    """Upper bound of a shard's metadata in bytes. The writer reserves this block at the beginning of the file; facts of
+    more than 4 kB follow it, and then the numbers.
     """
     return _BASE + scans * _PLACE * len(facts.encoding.names)
 
@@ -77,15 +77,15 @@ def head_size(facts: Facts, scans: int) -> int:
 
 
 def with_hdf5(storage: Storage, facts: Facts | None, scans: int, work: Callable[[h5py.File], T]) -> T:
-    """What ``work`` makes of the metadata and the numbers of a stored file, in one read where they stand together.
+    """Call ``work`` on the metadata and numbers of a stored file; one read is enough where they are contiguous.
 
     Args:
         storage: the file.
-        facts, scans: what it is expected to hold.
-        work: is called with the open file, several times where the metadata are scattered.
+        facts, scans: the expected content.
+        work: called with the open file; several times if the metadata is scattered.
 
     Raises:
-        OSError, RuntimeError: from HDF5, where it is no such file.
+        OSError, RuntimeError: from HDF5, if it is not a valid file.
         FileError, DataError: as ``Storage.read``.
     """
     view = View(storage, max(storage.window, 0 if facts is None else head_size(facts, scans)))
@@ -99,32 +99,32 @@ def with_hdf5(storage: Storage, facts: Facts | None, scans: int, work: Callable[
                 raise
         if view.missing is None:
             return result
-    raise OSError("its metadata are scattered all over the file")
+    raise OSError("its metadata is scattered over the file")
 
 
 def read_attributes(file: h5py.File) -> dict[str, Any]:
     """The root attributes: numbers, and text of fixed length.
 
     Raises:
-        ValueError: on attributes of another kind, or too many or too large ones.
-        OSError, RuntimeError, KeyError: from HDF5, where they are damaged.
+        ValueError: on attributes of other types, or too many or too large ones.
+        OSError, RuntimeError, KeyError: from HDF5, if they are damaged.
     """
     if len(file.attrs) > _ATTRIBUTES:
-        raise ValueError(f"there are {len(file.attrs)}")
+        raise ValueError(f"there are {len(file.attrs)} of them")
     return {name: _attribute(file, name) for name in file.attrs}
 
 
 def read_layout(file: h5py.File, storage: Storage, scans: int, arrays: Arrays, compression: str) -> Layout:
-    """Where the values of ``scans`` scans lie.
+    """Validate the datasets of a shard and locate their values.
 
     Raises:
-        ValueError: where datasets are missing, more than the known ones, or not as they have to be.
-        OSError, RuntimeError, KeyError: from HDF5, where they are damaged.
+        ValueError: if a dataset is missing, unknown, or of another shape, type or storage.
+        OSError, RuntimeError, KeyError: from HDF5, if they are damaged.
     """
     expected = {*NUMBERS, *arrays}
     if len(file) > len(expected) + 1 or not expected <= (given := set(file)) <= {*expected, CONDITION}:
         raise ValueError(f"it does not hold {', '.join(sorted(expected))} and nothing else")
-    # Numbers come first: they stand in the file one by one, so that the count of scans is bounded by its size.
+    # The numbers come first: they are stored uncompressed, so the size of the file bounds the number of scans.
     numbers = {name: _one_a_scan(_stored(file, name), scans, storage, _is(dtype)) for name, dtype in NUMBERS.items()}
     conditions = _one_a_scan(_stored(file, CONDITION), scans, storage, _is_text) if CONDITION in given else None
     chunks = {name: _chunks(_stored(file, name), scans, *kind, compression) for name, kind in arrays.items()}
@@ -141,30 +141,30 @@ def _attribute(file: h5py.File, name: str) -> Any:
 
 
 def _stored(file: h5py.File, name: str) -> h5py.Dataset:
-    """A dataset whose values stand in this file."""
+    """A dataset whose values are stored in this file."""
     if file.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
-        raise ValueError(f"{name} is a link to elsewhere")
+        raise ValueError(f"{name} is a link to another object")
     found = file[name]
     if not isinstance(found, h5py.Dataset):
-        raise ValueError(f"{name} is no dataset")
+        raise ValueError(f"{name} is not a dataset")
     properties = found.id.get_create_plist()
-    # First of all: HDF5 opens the files behind a virtual dataset as soon as it is asked for its shape.
+    # This check comes first: reading the shape of a virtual dataset already opens the files behind it.
     if properties.get_layout() == h5py.h5d.VIRTUAL or properties.get_external_count():
-        raise ValueError(f"{name} is stored elsewhere")
+        raise ValueError(f"{name} is stored in another file")
     return found
 
 
 def _one_a_scan(
     dataset: h5py.Dataset, scans: int, storage: Storage, fits: Callable[[h5py.h5t.TypeID], bool]
 ) -> NDArray[Any]:
-    """(N,) values of a dataset that stands in one piece."""
+    """(N,) values of a contiguous dataset."""
     found, kind = dataset.id, dataset.id.get_type()
     if not fits(kind) or dataset.shape != (scans,):
         raise ValueError(f"{dataset.name} is {dataset.shape} of {_type_name(kind)}, for {scans} scans")
     size, offset = scans * kind.get_size(), found.get_offset()
-    piece = found.get_create_plist().get_layout() == h5py.h5d.CONTIGUOUS and found.get_storage_size() == size
-    if not piece or offset is None or offset + size > storage.size:
-        raise ValueError(f"{dataset.name} does not stand in one piece in the file")
+    contiguous = found.get_create_plist().get_layout() == h5py.h5d.CONTIGUOUS and found.get_storage_size() == size
+    if not contiguous or offset is None or offset + size > storage.size:
+        raise ValueError(f"{dataset.name} is not contiguous in the file")
     values: NDArray[Any] = dataset[:]
     return values
 
@@ -172,7 +172,7 @@ def _one_a_scan(
 def _chunks(
     dataset: h5py.Dataset, scans: int, shape: tuple[int, int], dtype: np.dtype[Any], compression: str
 ) -> Chunks:
-    """Where the chunks of an array lie."""
+    """The addresses of an array's chunks."""
     properties, kind = dataset.id.get_create_plist(), dataset.id.get_type()
     if not _is(dtype.newbyteorder("<"))(kind) or dataset.shape != (scans, *shape):
         raise ValueError(
@@ -207,4 +207,4 @@ def _is_text(kind: h5py.h5t.TypeID) -> bool:
 def _type_name(kind: h5py.h5t.TypeID) -> str:
     classes = {"INTEGER": "integers", "FLOAT": "floats", "STRING": "text"}
     names = {getattr(h5py.h5t, name): plain for name, plain in classes.items()}
-    return f"{kind.get_size()}-byte {names.get(kind.get_class(), 'values of another kind')}"
+    return f"{kind.get_size()}-byte {names.get(kind.get_class(), 'values of another type')}"

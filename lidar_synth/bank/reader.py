@@ -17,7 +17,7 @@ from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 _OPEN = 64  # shards kept open at a time
-_REMOTE = 256  # of a bank at a URL: no open files, but about 70 kB each that would have to be fetched again
+_REMOTE = 256  # the same for a bank at a URL: no open files, but about 70 kB of cached metadata each
 
 
 class Bank:
@@ -115,7 +115,7 @@ class Bank:
     def shard(self, number: int) -> ShardReader:
         """An open shard; raises as ``__getitem__``."""
         if self._process != os.getpid():
-            # A fork: the parent's handles share its file positions and locks. They are left to the parent.
+            # After a fork: the parent's handles share its file positions and locks, so they are left to the parent.
             self._shards, self._process = OrderedDict(), os.getpid()
         if number not in self._shards:
             entry = self.index.shards[number]
@@ -141,19 +141,19 @@ class Bank:
                 size = (root / entry.file).stat().st_size
             except OSError as error:
                 raise FileError(
-                    f"{root}: shard {entry.file} is missing ({error.strerror})", "a whole bank", REPAIR
+                    f"{root}: shard {entry.file} is missing ({error.strerror})", "a complete bank", REPAIR
                 ) from error
             if size != entry.bytes:
                 raise DataError(f"{root / entry.file} is {size} bytes long", f"{entry.bytes}, by the index", REPAIR)
 
 
 def is_bank(path: str | Path) -> bool:
-    """Whether a folder holds a bank, or what is left of one."""
+    """Whether a folder holds a bank, complete or damaged."""
     return (Path(path) / INDEX).is_file() or any(Path(path).glob("shard-*.h5"))
 
 
 class _Names(Sequence[str]):
-    """Names made when they are asked for: a bank of a million scans has no million texts."""
+    """The scans' names, computed on access: a bank of a million scans stores no list of texts."""
 
     def __init__(self, index: Index) -> None:
         self._index = index
@@ -172,7 +172,7 @@ class _Names(Sequence[str]):
 
 
 def _place(index: Index, number: int) -> tuple[int, int]:
-    """Shard and position there."""
+    """The shard of a scan, and its position in that shard."""
     shard = bisect_right(index.ends, number)
     entry = index.shards[shard]
     return shard, entry.position(number - (index.ends[shard] - entry.kept))
@@ -192,6 +192,6 @@ def _read_index(root: str | Path) -> bytes:
     except OSError as error:
         raise FileError(
             f"{root} holds no bank: {INDEX} cannot be read ({error.strerror})",
-            "the folder of a bank that is finished",
-            "A bake that was interrupted goes on by the same command; lidar-synth repair writes a lost index again.",
+            "the folder of a finished bank",
+            "Run an interrupted bake again to resume it; lidar-synth repair rebuilds a lost index.",
         ) from error

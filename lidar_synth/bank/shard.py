@@ -1,20 +1,20 @@
-"""One file of a bank: scans with consecutive indices, each a chunk of its own.
+"""One file of a bank: scans with consecutive indices, each in chunks of its own.
 
-HDF5 with root attributes, the bank's facts (see ``index``) and ``seed``, ``first``, ``scans`` of this file, and the
-datasets::
+An HDF5 file. The root attributes are the bank's facts (see ``index``) and ``seed``, ``first``, ``scans`` of this file.
+The datasets are::
 
-    range, reflectance, label, confidence   (scans, H, W), see ``encoding``; those that ``fields`` names
-    seed, index                             (scans,) uint64: what the scan was made from
-    condition                               (scans,) text, if there is one: the name of what it was conditioned on
+    range, reflectance, label, confidence   (scans, H, W), see ``encoding``; those in ``fields``
+    seed, index                             (scans,) uint64: seed and index of the scan's noise
+    condition                               (scans,) text, in conditional banks: name of the conditioning scan
     crc                                     (scans,) uint32: CRC-32 of a scan's seed, index, condition and arrays
 
-A chunk holds one scan of one array: bytes shuffled, deflated (level 1), and the Fletcher-32 checksum of that behind,
-as HDF5's own filters do it, so that any HDF5 reads it. The file format is HDF5 1.10's, whose metadata has checksums:
-with older ones a flipped bit in an attribute, such as the scale, would be read in silence. Nothing in a file depends
-on the time of writing.
+A chunk holds one array of one scan: shuffled, deflated (level 1), and followed by its Fletcher-32 checksum, as HDF5's
+own filters write it, so that any HDF5 library reads it. The file format is that of HDF5 1.10, whose metadata has
+checksums: in older formats a flipped bit in an attribute, such as the scale, would stay undetected. No byte of a file
+depends on the time of writing.
 
-HDF5 is asked once, when a shard is opened, for the attributes and for where the chunks lie (``layout``). Scans are then
-read from their places in the file, with one read where their chunks lie side by side.
+When a shard is opened, HDF5 reads the attributes and the addresses of the chunks once (``layout``). Scans are then read
+directly from the file, with a single read where their chunks are adjacent.
 """
 
 from collections.abc import Iterator
@@ -33,24 +33,26 @@ from lidar_synth.bank.storage import LocalFile, Storage
 from lidar_synth.errors import DataError, LidarSynthError
 from lidar_synth.files.disk import naming
 
-_GAP = 16 << 10  # bytes between two chunks that are read along rather than asked for separately
+_GAP = 16 << 10  # chunks closer together than this many bytes are read at once
 
 
 class ShardReader:
     """Reads one shard; every scan is checked against its CRC.
 
     Args:
-        file: a path, or a file as the bank opened it, which is closed with the reader.
-        name: what to call it in errors.
-        facts: what its attributes have to say, as the bank's index has it; None to take what they say.
-        entry: which scans it has to hold; None to take what it says.
+        file: a path, or an open storage, which is closed with the reader.
+        name: name of the file in error messages.
+        facts: the facts that the bank's index expects; None accepts those of the file.
+        entry: the scans that the bank's index expects; None accepts those of the file.
 
     Attributes:
-        facts, entry, encoding: of the file.
+        facts: facts of the file.
+        entry: scans of the file.
+        encoding: encoding of the scans.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: on a file that is no shard of this version, is damaged, or is not what the index says.
+        FileError: if it cannot be read.
+        DataError: on a file that is not a shard of this version, is damaged, or does not match the index.
         LibraryError: on Blosc2 without hdf5plugin.
     """
 
@@ -74,22 +76,22 @@ class ShardReader:
         """The arrays of one scan, 0 <= position < scans.
 
         Raises:
-            DataError: where it is damaged.
-            FileError: where the file cannot be read.
+            DataError: if it is damaged.
+            FileError: if the file cannot be read.
         """
         return self._read(position)[0]
 
     def condition(self, position: int) -> str | None:
-        """The name of what a scan is conditioned on.
+        """The name of the scan that a scan is conditioned on; None in an unconditional bank.
 
         Raises:
-            DataError: where it is no text.
+            DataError: if it is not text.
         """
         with self._reading(f"the condition of scan {position}"):
             return None if self._layout.conditions is None else self._condition(position).decode()
 
     def chunks(self, position: int) -> tuple[dict[str, bytes], int]:
-        """The chunks of one scan as they are in the file, and its CRC; raises as ``read``, which checks them."""
+        """The compressed chunks of one scan and its CRC, after the checks of ``read``; raises as ``read``."""
         return self._read(position)[1], int(self._layout.numbers["crc"][position])
 
     def close(self) -> None:
@@ -103,7 +105,7 @@ class ShardReader:
         self.close()
 
     def _open(self, facts: Facts | None, entry: Entry | None) -> tuple[Facts, Entry, Layout]:
-        """Facts and entry, by the file's attributes, and where its scans lie."""
+        """Facts and entry from the file's attributes, and the addresses of its scans."""
 
         def work(file: h5py.File) -> tuple[Facts, Entry, Layout]:
             with self._reading("its attributes"):
@@ -111,11 +113,11 @@ class ShardReader:
                 numbers = [int(attributes.pop(key, np.uint64(0))) for key in ("seed", "first", "scans")]
             found = Facts.from_attributes(attributes, self.name)
             self._check_facts(found, facts)
-            held = self._checked_entry(numbers, entry)
+            actual = self._checked_entry(numbers, entry)
             filters(found.compression)
             with self._reading("its datasets"):
-                layout = read_layout(file, self._file, held.scans, found.encoding.arrays(), found.compression)
-            return found, held, layout
+                layout = read_layout(file, self._file, actual.scans, found.encoding.arrays(), found.compression)
+            return found, actual, layout
 
         try:
             return with_hdf5(self._file, facts, entry.scans if entry else 0, work)
@@ -123,25 +125,25 @@ class ShardReader:
             raise
         except (OSError, RuntimeError) as error:
             raise DataError(
-                f"{self.name} is cut, damaged or no HDF5 file ({error})", f"a shard of {FORMAT}", REPAIR
+                f"{self.name} is truncated, damaged or not an HDF5 file ({error})", f"a shard of {FORMAT}", REPAIR
             ) from error
 
     def _check_facts(self, found: Facts, facts: Facts | None) -> None:
         if facts is not None and facts != found:
             mine, others = found.to_dict(), facts.to_dict()
             wrong = ", ".join(key for key in others if mine[key] != others[key])
-            raise DataError(f"{self.name}: {wrong} are not those of the bank's index", "a shard of it", REPAIR)
+            raise DataError(f"{self.name}: {wrong} differ from the bank's index", "a shard of this bank", REPAIR)
 
     def _checked_entry(self, numbers: list[int], entry: Entry | None) -> Entry:
         seed, first, scans = numbers
         found = Entry(Path(self.name).name, seed, first, scans)
         entry = found if entry is None else entry
         if (seed, first, scans) != (entry.seed, entry.first, entry.scans):
-            raise DataError(f"{self.name} holds {found.span}", f"{entry.span}, by the bank's index", REPAIR)
+            raise DataError(f"{self.name} holds {found.span}", f"{entry.span}, according to the bank's index", REPAIR)
         return entry
 
     def _read(self, position: int) -> tuple[dict[str, NDArray[Any]], dict[str, bytes]]:
-        """The arrays of a scan, and the chunks that hold them."""
+        """The arrays of a scan and their compressed chunks."""
         with self._reading(f"scan {position}"):
             packed = self._packed(position)
             kinds = self.encoding.arrays()
@@ -156,14 +158,14 @@ class ShardReader:
         return arrays, packed
 
     def _packed(self, position: int) -> dict[str, bytes]:
-        """The chunks of a scan; those that lie side by side are read at once."""
+        """The chunks of a scan; adjacent ones are read at once."""
         places = {}
         for name, chunks in self._layout.chunks.items():
             offset, size, skipped = (int(v[position]) for v in (chunks.offset, chunks.size, chunks.skipped))
             if skipped:
-                raise ValueError(f"filters {skipped:b} were left out")
+                raise ValueError(f"filters {skipped:b} were not applied")
             if not size or offset + size > self._file.size:
-                raise ValueError(f"there is no {name}" if not size else f"its {name} lies outside the file")
+                raise ValueError(f"its {name} is missing" if not size else f"its {name} lies outside the file")
             places[name] = (offset, offset + size)
         packed: dict[str, bytes] = {}
         for names in _side_by_side(places):
@@ -177,17 +179,17 @@ class ShardReader:
 
     @contextmanager
     def _reading(self, what: str) -> Iterator[None]:
-        """The errors of HDF5 and of foreign values in words that help."""
+        """Convert errors of HDF5 and of invalid values to a DataError that names the file."""
         try:
             yield
         except LidarSynthError:
-            raise  # from the file itself, which may only be out of reach
+            raise  # from the storage: the file may be intact but out of reach
         except (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError) as error:
-            raise DataError(f"{self.name}: {what} cannot be read ({error})", "a whole shard", REPAIR) from error
+            raise DataError(f"{self.name}: {what} cannot be read ({error})", "an intact shard", REPAIR) from error
 
 
 def _side_by_side(places: dict[str, tuple[int, int]]) -> list[list[str]]:
-    """Names in groups whose places, (start, end) each, have no gap of more than ``_GAP``."""
+    """Names in groups of adjacent places (start, end), without gaps of more than ``_GAP`` bytes."""
     groups: list[list[str]] = []
     reached = -_GAP - 1
     for name in sorted(places, key=lambda name: places[name]):

@@ -1,4 +1,4 @@
-"""Where the bytes of a bank come from: files on a disk, or URLs that fsspec knows. Only the asked ranges are read."""
+"""Access to the bytes of a bank: files on a disk, or URLs that fsspec supports. Only requested ranges are read."""
 
 import io
 import os
@@ -10,11 +10,11 @@ from lidar_synth.errors import DataError, FileError, LibraryError
 
 
 class Storage(Protocol):
-    """One file, of which ranges can be read.
+    """A file with random access to byte ranges.
 
     Attributes:
-        size: bytes.
-        window: bytes that are read in about the time of one.
+        size: size of the file in bytes.
+        window: number of bytes that take about as long to read as a single one.
     """
 
     size: int
@@ -24,8 +24,8 @@ class Storage(Protocol):
         """``size`` bytes from ``offset``, at least 0.
 
         Raises:
-            FileError: where they cannot be read.
-            DataError: where the file ends before.
+            FileError: if they cannot be read.
+            DataError: if the file ends earlier.
         """
         ...
 
@@ -36,7 +36,7 @@ class LocalFile:
     """A file on this machine; see ``Storage``.
 
     Raises:
-        FileError: where it cannot be opened.
+        FileError: if it cannot be opened.
     """
 
     window = 1 << 20
@@ -51,13 +51,13 @@ class LocalFile:
 
     def read(self, offset: int, size: int) -> bytes:
         if offset + size > self.size:
-            raise DataError(f"{self._path} ends before byte {offset + size}", "a whole file")
+            raise DataError(f"{self._path} ends before byte {offset + size}", "a complete file")
         try:
             content = os.pread(self._descriptor, size, offset)
         except OSError as error:
             raise self._unreadable(error) from error
         if len(content) != size:
-            raise DataError(f"{self._path} was cut while it was read", "a whole file")
+            raise DataError(f"{self._path} was truncated while it was read", "a complete file")
         return content
 
     def close(self) -> None:
@@ -73,15 +73,15 @@ class LocalFile:
 
 
 class RemoteFile:
-    """A file at a URL that fsspec knows; see ``Storage``. Each ``read`` is one request, and opening is none.
+    """A file at a URL that fsspec supports; see ``Storage``. Each ``read`` is one request; opening needs none.
 
     Args:
-        url: of the file.
-        size: its bytes, which the bank's index tells.
+        url: URL of the file.
+        size: size in bytes, from the bank's index.
 
     Raises:
-        LibraryError: where fsspec, or what it needs for such a URL, is not installed.
-        FileError: on a kind of URL that fsspec does not know.
+        LibraryError: if fsspec, or its package for such a URL, is not installed.
+        FileError: on a kind of URL that fsspec does not support.
     """
 
     window = 12 << 10
@@ -99,11 +99,11 @@ class RemoteFile:
                 "pip install 'lidar_synth[remote]' for http and https, s3fs for s3, gcsfs for gs.",
             ) from error
         except (OSError, ValueError) as error:
-            raise FileError(f"{url} cannot be read ({error})", "a URL that fsspec knows") from error
+            raise FileError(f"{url} cannot be read ({error})", "a URL that fsspec supports") from error
 
     def read(self, offset: int, size: int) -> bytes:
         if offset + size > self.size:
-            raise DataError(f"{self.url} ends before byte {offset + size}, by the bank's index", "a whole file")
+            raise DataError(f"{self.url} ends before byte {offset + size}", "the size in the bank's index")
         content = self._fetch(start=offset, end=offset + size)
         if len(content) != size:
             raise FileError(
@@ -114,10 +114,10 @@ class RemoteFile:
         return content
 
     def read_all(self) -> bytes:
-        """The whole file, whatever its size.
+        """The complete file, of any size.
 
         Raises:
-            FileError: where it cannot be read.
+            FileError: if it cannot be read.
         """
         return self._fetch()
 
@@ -127,24 +127,24 @@ class RemoteFile:
     def _fetch(self, **span: int) -> bytes:
         try:
             return bytes(self._system.cat_file(self._path, **span))
-        except Exception as error:  # every file system of fsspec has errors of its own
+        except Exception as error:  # each file system of fsspec raises its own classes
             reason = str(error) or type(error).__name__
             raise FileError(f"{self.url} cannot be read ({reason})", "a file of a bank") from error
 
 
 class View(io.RawIOBase):
-    """What was read of a file, as HDF5 takes files.
+    """A file object for HDF5 over the parts of a file that have been read so far.
 
-    Nothing is read while HDF5 is at work, because it holds a lock then: fetching from a URL is done by other threads,
-    and one of them that happens to free an object of HDF5 waits for that lock. So ``readinto`` notes what is missing
-    and fails, and whoever called HDF5 calls ``fetch_missing`` and starts again.
+    HDF5 holds a lock while it reads. Fetching from a URL uses other threads, and one of them that happens to free an
+    object of HDF5 would wait for that lock: a deadlock. So ``readinto`` never fetches: it records the missing range and
+    fails; the caller of HDF5 then calls ``fetch_missing`` and tries again.
 
     Args:
-        file: to look at.
-        head: how many of its first bytes are read at once.
+        file: the file to read from.
+        head: number of bytes to read at once from its beginning.
 
     Attributes:
-        missing: (offset, size) of what was asked for and is not there; None where there was no such thing.
+        missing: (offset, size) of the requested range that has not been read; None if there is none.
 
     Raises:
         FileError, DataError: as ``Storage.read``.
@@ -170,10 +170,10 @@ class View(io.RawIOBase):
         return self._position
 
     def readinto(self, buffer: Any) -> int:
-        """Fill the buffer, as far as the file goes.
+        """Fill the buffer, up to the end of the file.
 
         Raises:
-            OSError: where that was not read yet.
+            OSError: if these bytes have not been read yet.
         """
         start, size = self._position, min(len(buffer), max(self._file.size - self._position, 0))
         for first, content in self._spans:
@@ -183,12 +183,12 @@ class View(io.RawIOBase):
         else:
             if size:
                 self.missing = (start, size)
-                raise OSError(f"bytes {start} to {start + size} were not read yet")
+                raise OSError(f"bytes {start} to {start + size} have not been read yet")
         self._position += size
         return size
 
     def fetch_missing(self) -> None:
-        """Read what is missing, with what stands around it; raises as the class."""
+        """Read the missing range and its surroundings; raises as the class."""
         if self.missing is not None:
             start, size = self.missing
             margin = max(self._file.window - size, 0) // 2
@@ -200,19 +200,19 @@ class View(io.RawIOBase):
 
 
 def is_url(path: str | Path) -> bool:
-    """Whether a path leads to another machine, by fsspec."""
+    """Whether a path is a URL."""
     return isinstance(path, str) and "://" in path
 
 
 def open_storage(root: str | Path, name: str, size: int) -> Storage:
-    """A file in the folder of a bank, or at its URL.
+    """Open a file of a bank, in its folder or at its URL.
 
     Args:
         root: the folder or the URL.
-        name: of the file.
-        size: its bytes, by the bank's index.
+        name: name of the file.
+        size: size in bytes, from the bank's index.
 
     Raises:
-        FileError, LibraryError: where it cannot be opened.
+        FileError, LibraryError: if it cannot be opened.
     """
     return LocalFile(root / name) if isinstance(root, Path) else RemoteFile(f"{root.rstrip('/')}/{name}", size)

@@ -1,4 +1,4 @@
-"""Writing a shard; ``shard`` says what is in one, and reads it."""
+"""Writes a shard; ``shard`` describes its format and reads it."""
 
 import os
 from collections import deque
@@ -21,21 +21,21 @@ from lidar_synth.geometry.scan import RangeImage
 
 _VERSION = "v110"
 _PAGE = 4 << 20  # bytes: a paged file keeps its metadata together, for fewer requests over a network
-_PENDING = 8  # scans per thread that may wait for their turn
+_PENDING = 8  # scans per thread that may wait to be written
 
 
 class ShardWriter:
-    """Writes one shard. The file is whole when ``close`` returns, and only then.
+    """Writes one shard. The file is complete only after ``close`` has returned.
 
     Args:
-        path: of the file; it is overwritten.
-        facts: of the bank.
-        entry: which scans will come.
-        conditions: names of what each scan is conditioned on.
-        threads: that compress.
+        path: path of the file; an existing file is overwritten.
+        facts: facts of the bank.
+        entry: the scans that will be written.
+        conditions: name of the scan that conditions each scan, in order.
+        threads: number of threads that compress.
 
     Raises:
-        FileError: where the file cannot be written or the disk is full; also by the methods.
+        FileError: if the file cannot be written or the disk is full; also by the methods.
         LibraryError: on Blosc2 without hdf5plugin.
     """
 
@@ -69,10 +69,10 @@ class ShardWriter:
                 raise
 
     def append(self, image: RangeImage) -> None:
-        """Add the next scan; it is encoded and packed in a thread and written later, in its turn.
+        """Add the next scan; a thread encodes and compresses it, and it is written later, in order.
 
         Raises:
-            DataError: on an image that has no encoding, perhaps by a later call.
+            DataError: on an image that cannot be encoded; possibly raised by a later call.
         """
         position = self._next
         self._next += 1
@@ -80,17 +80,17 @@ class ShardWriter:
         self._write_ready(self._limit)
 
     def append_chunks(self, chunks: Mapping[str, bytes], crc: int) -> None:
-        """Add the next scan by the chunks that another shard of the same facts holds of it."""
+        """Add the next scan as compressed chunks from another shard with the same facts."""
         self._write_ready(0)
         self._put(self._next, crc, chunks, ready=True)
         self._next += 1
 
     def close(self) -> None:
-        """Write what is waiting and have the file on the disk.
+        """Write the waiting scans and sync the file to the disk.
 
         Raises:
-            DataError: where scans are missing.
-            FileError: where it cannot be written.
+            DataError: if scans are missing.
+            FileError: if it cannot be written.
         """
         self._write_ready(0)
         self._pool.shutdown()
@@ -103,7 +103,7 @@ class ShardWriter:
             self._sink.close()
 
     def discard(self) -> None:
-        """Give up and remove the file."""
+        """Abort and remove the file."""
         self._pool.shutdown(cancel_futures=True)
         with suppress(OSError, RuntimeError):
             self._file.close()
@@ -125,7 +125,7 @@ class ShardWriter:
             raise
 
     def _declare(self, facts: Facts) -> None:
-        """Attributes and datasets."""
+        """Write the attributes and create the datasets."""
         count = self.entry.scans
         own = {"seed": np.uint64(self.entry.seed), "first": np.uint64(self.entry.first), "scans": count}
         for name, value in (facts.to_attributes() | own).items():
@@ -153,7 +153,7 @@ class ShardWriter:
         }
 
     def _pack(self, position: int, image: RangeImage) -> tuple[int, dict[str, bytes]]:
-        """CRC and chunks of a scan; in a thread."""
+        """CRC and chunks of a scan; runs in a thread."""
         arrays = self.encoding.encode(image)
         plain = {name: arrays[name].astype(dtype, copy=False) for name, dtype in self._types().items()}
         condition = self._conditions[position] if self._conditions else b""
@@ -170,7 +170,7 @@ class ShardWriter:
             self._put(self._next - len(self._waiting) - 1, crc, chunks, ready=self._direct)
 
     def _put(self, position: int, crc: int, chunks: Mapping[str, bytes], ready: bool) -> None:
-        """Write a scan: its chunks if they are ready for the file, or else plain arrays, which HDF5 compresses."""
+        """Write a scan: compressed chunks if ``ready``, otherwise plain arrays, which HDF5 compresses."""
         self._crc[position] = crc
         with _on_disk(self.path):
             for name, chunk in chunks.items():
@@ -183,7 +183,7 @@ class ShardWriter:
 
 
 def _create(sink: Sink, facts: Facts, scans: int) -> h5py.File:
-    # In one block, so that a reader at a distance has all of the metadata with one request.
+    # One block, so that a remote reader gets all metadata with one request.
     options: dict[str, Any] = {"meta_block_size": metadata_size(facts, scans)}
     if facts.layout == "paged":
         options = {"fs_strategy": "page", "fs_page_size": _PAGE}
@@ -192,7 +192,7 @@ def _create(sink: Sink, facts: Facts, scans: int) -> h5py.File:
 
 @contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
-    """HDF5's errors of writing in words that help."""
+    """Convert HDF5's errors while writing to a FileError that names the file."""
     try:
         yield
     except (OSError, RuntimeError) as error:
@@ -201,6 +201,6 @@ def _on_disk(path: Path) -> Iterator[None]:
         reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
         raise FileError(
             f"{path} cannot be written ({reason})",
-            "a folder that may be written to, on a disk with room",
-            "Free some space or mend the folder, then run the same again: finished shards are kept.",
+            "a writable folder on a disk with free space",
+            "Free some space or fix the folder, then run the same command again: finished shards are kept.",
         ) from error

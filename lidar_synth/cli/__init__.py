@@ -1,6 +1,6 @@
-"""The command line ``lidar-synth``: one file per command, one place where errors become exit statuses.
+"""The command line ``lidar-synth``: one file per command; this module converts errors to exit statuses.
 
-Exit status 0 = done, 1 = the run failed with one clear message, 2 = the call was wrong.
+Exit status 0 = success, 1 = the run failed, 2 = wrong options or arguments; a failure prints one message.
 """
 
 import sys
@@ -41,11 +41,11 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "import": import_,
     "doctor": doctor,
 }
-"""Commands by name, in the order of the help."""
+"""Commands by name, in the order of the help text."""
 
 app = typer.Typer(
     name="lidar-synth",
-    help="Synthetic LiDAR scans for perception training: generate, mix, bake, convert, look.",
+    help="Synthetic LiDAR scans for perception training: generate, bake, curate, convert, evaluate, view.",
     no_args_is_help=True,
     invoke_without_command=True,
     add_completion=False,
@@ -56,7 +56,7 @@ app = typer.Typer(
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False,
 ) -> None:
     if version:
         print(f"lidar-synth {__version__}")

@@ -1,4 +1,4 @@
-"""``lidar-synth verify``, ``repair``, ``info`` and ``bank``: looking after banks."""
+"""``lidar-synth verify``, ``repair``, ``info`` and ``bank``: maintenance of banks."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,18 +6,20 @@ from typing import Annotated
 import typer
 
 BankFolder = Annotated[Path, typer.Argument(metavar="BANK", help="folder of a bank")]
-Model = Annotated[str | None, typer.Option(help="the checkpoint's file, where it is not a shipped model")]
+Model = Annotated[str | None, typer.Option(help="checkpoint file, if it is not a shipped model")]
 Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder of the new bank")]
 
 
 def verify(
     bank: BankFolder,
-    deep: Annotated[bool, typer.Option("--deep", help="generate some scans again from their seeds, too")] = False,
-    sample: Annotated[int, typer.Option(min=1, help="how many scans --deep generates")] = 16,
-    seed: Annotated[int | None, typer.Option(min=0, help="which ones [others each time]")] = None,
+    deep: Annotated[
+        bool, typer.Option("--deep", help="also regenerate some scans from their seeds and compare")
+    ] = False,
+    sample: Annotated[int, typer.Option(min=1, help="number of scans that --deep regenerates")] = 16,
+    seed: Annotated[int | None, typer.Option(min=0, help="seed that selects these scans [random]")] = None,
     model: Model = None,
 ) -> None:
-    """Checks a bank: its index, every shard's hash and attributes, every scan, and the card. Exit status 1 = not whole.
+    """Checks a bank: index, every shard's hash and attributes, every scan, and the card. Exit status 1 = damaged.
 
     \b
     Examples:
@@ -34,27 +36,27 @@ def verify(
     for problem in problems:
         typer.echo(f"{problem.file}: {problem.what}", err=True)
     if problems:
-        typer.echo(f"{bank}: {len(problems)} problems. lidar-synth repair {bank} makes what is damaged again.")
+        typer.echo(f"{bank}: {len(problems)} problems. lidar-synth repair {bank} regenerates what is damaged.")
         raise typer.Exit(1)
-    typer.echo(f"{bank}: whole")
+    typer.echo(f"{bank}: intact")
     if not deep:
         return
     seed = secrets.randbits(32) if seed is None else seed
-    typer.echo(f"{bank}: scans drawn by --seed {seed}")
+    typer.echo(f"{bank}: scans selected by --seed {seed}")
     shares = regenerate(bank, model, sample, seed=seed)
-    other = {name: share for name, share in shares.items() if share < AGREE}
-    for name, share in other.items():
-        typer.echo(f"{name}: {share:.1%} of its cells agree with the scan made again", err=True)
-    typer.echo(f"{bank}: {len(shares)} scans made again, at least {min(shares.values()):.2%} of the cells agree")
-    if other:
+    different = {name: share for name, share in shares.items() if share < AGREE}
+    for name, share in different.items():
+        typer.echo(f"{name}: {share:.1%} of its cells agree with the regenerated scan", err=True)
+    typer.echo(f"{bank}: {len(shares)} scans regenerated, at least {min(shares.values()):.2%} of the cells agree")
+    if different:
         raise typer.Exit(1)
 
 
 def repair(bank: BankFolder, model: Model = None) -> None:
-    """Generates again exactly the shards of a bank that are damaged or missing, and writes its index and card again.
+    """Regenerates exactly the damaged or missing shards of a bank, and rewrites a damaged index or card.
 
-    On the machine and with the versions that made the bank, the bytes are the same; elsewhere the scans are equal to
-    rounding, and the index says so.
+    On the machine and with the versions that made the bank, the bytes are the same; elsewhere the scans are equal up to
+    rounding, and the index records the repair.
 
     \b
     Examples:
@@ -67,14 +69,14 @@ def repair(bank: BankFolder, model: Model = None) -> None:
     for file, what in done.items():
         typer.echo(f"{file}: {what}")
     if not done:
-        typer.echo(f"{bank}: whole, nothing to do")
+        typer.echo(f"{bank}: intact, nothing to do")
 
 
 def info(
     bank: Annotated[str, typer.Argument(metavar="BANK", help="folder or URL of a bank")],
-    as_json: Annotated[bool, typer.Option("--json", help="for scripts")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Tells what is in a bank: scans, sensor, model, settings, licences.
+    """Describes a bank: scans, sensor, model, settings, licences.
 
     \b
     Examples:
@@ -86,19 +88,19 @@ def info(
     from lidar_synth.bank import Bank
     from lidar_synth.bank.card import summary
 
-    found = summary(Bank(bank).index)
+    values = summary(Bank(bank).index)
     if as_json:
-        typer.echo(json.dumps(found, indent=1))
+        typer.echo(json.dumps(values, indent=1))
         return
-    for name, value in found.items():
+    for name, value in values.items():
         typer.echo(f"{name:<14}{value}")
 
 
 def merge(
     out: Out,
-    banks: Annotated[list[Path], typer.Argument(metavar="BANK...", help="banks of one sensor and the same fields")],
+    banks: Annotated[list[Path], typer.Argument(metavar="BANK...", help="banks with the same sensor and fields")],
 ) -> None:
-    """Makes one bank of several. Shards are linked, not copied, where the disk allows it.
+    """Merges several banks into one. Shards are hard-linked instead of copied where the file system allows it.
 
     \b
     Example:
@@ -113,9 +115,14 @@ def merge(
 
 def split(
     bank: BankFolder,
-    parts: Annotated[list[str], typer.Argument(metavar="FOLDER=SHARE...", help="folders and their shares")],
+    parts: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FOLDER=SHARE...", help="folders, each with its share of the scans; the shares sum to 1"
+        ),
+    ],
 ) -> None:
-    """Splits a bank in consecutive parts.
+    """Splits a bank into consecutive parts.
 
     \b
     Example:
@@ -141,9 +148,9 @@ def split(
 def head(
     bank: BankFolder,
     out: Out,
-    count: Annotated[int, typer.Option(help="how many scans")] = 100,
+    count: Annotated[int, typer.Option(help="number of scans")] = 100,
 ) -> None:
-    """Makes a bank of the first scans of another one.
+    """Makes a bank from the first scans of another one.
 
     \b
     Example:
@@ -156,7 +163,7 @@ def head(
     typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
 
 
-bank = typer.Typer(name="bank", help="Makes banks from banks: merge, split, head.", no_args_is_help=True)
+bank = typer.Typer(name="bank", help="Makes new banks from existing ones: merge, split, head.", no_args_is_help=True)
 bank.command("merge")(merge)
 bank.command("split")(split)
 bank.command("head")(head)

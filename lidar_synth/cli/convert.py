@@ -1,4 +1,4 @@
-"""``lidar-synth convert``: scans from any format to any other."""
+"""``lidar-synth convert``: converts scans from any supported format to any other."""
 
 import sys
 from pathlib import Path
@@ -8,35 +8,35 @@ import typer
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="A file, a folder of scans or a dataset's root.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
+    source: Annotated[Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
     to: Annotated[
         str,
         typer.Option(
-            help="kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | png | webdataset"
+            help="format: kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | png | webdataset"
         ),
     ],
-    sensor: Annotated[str | None, typer.Option(help="Sensor of the input: a preset or a YAML file.")] = None,
-    layout: Annotated[str | None, typer.Option(help="Layout of the input, if it is not to be recognised.")] = None,
-    split: Annotated[str | None, typer.Option(help="Split of the input, r2flow/train for instance.")] = None,
-    as_sensor: Annotated[str | None, typer.Option(help="Re-project to this sensor: a preset or a YAML file.")] = None,
+    sensor: Annotated[str | None, typer.Option(help="sensor of the input: a preset or a YAML file")] = None,
+    layout: Annotated[str | None, typer.Option(help="layout of the input [detected]")] = None,
+    split: Annotated[str | None, typer.Option(help="split of the input, for instance r2flow/train")] = None,
+    as_sensor: Annotated[str | None, typer.Option(help="re-project to this sensor: a preset or a YAML file")] = None,
     unfold: Annotated[
-        bool, typer.Option("--unfold", help="One row per laser, ring by ring, as KITTI stores them.")
+        bool, typer.Option("--unfold", help="assign one row to each laser, from KITTI's order of points")
     ] = False,
-    fields: Annotated[int | None, typer.Option(help="Floats per point of plain .bin files, if not 4.")] = None,
+    fields: Annotated[int | None, typer.Option(help="floats per point in plain .bin files [4]")] = None,
     reflectance_max: Annotated[
-        float | None, typer.Option(help="Upper end of the reflectance in plain files, 255 for instance, if not 1.")
+        float | None, typer.Option(help="highest reflectance value in plain files, for instance 255 [1]")
     ] = None,
     on_bad: Annotated[
         str,
         typer.Option(
-            help="error | skip | drop-points: stop at what cannot be read, leave the scan out, or leave out its points "
-            "that are NaN or infinite."
+            help="bad scans: error = stop at the first one | skip = leave them out | drop-points = leave out their NaN "
+            "and infinite points"
         ),
     ] = "error",
-    jobs: Annotated[int, typer.Option(help="Worker processes.")] = 1,
+    jobs: Annotated[int, typer.Option(help="number of worker processes")] = 1,
 ) -> None:
-    """Convert scans from one format to another. Run it again to go on where it stopped.
+    """Converts scans from one format to another. Run it again to resume an interrupted conversion.
 
     Examples:
 
@@ -66,6 +66,6 @@ def convert(
     for name, reason in report.skipped.items():
         print(f"  skipped {name}: {reason}", file=sys.stderr)
     for name, count in report.dropped.items():
-        print(f"  dropped {count} points of {name}, which are NaN or infinite", file=sys.stderr)
+        print(f"  dropped {count} points of {name}, that are NaN or infinite", file=sys.stderr)
     for what in report.left_out:
         print(f"  left out {what}", file=sys.stderr)

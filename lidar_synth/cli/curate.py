@@ -1,4 +1,4 @@
-"""``lidar-synth curate``: scores of a bank's scans, and a bank without the odd ones."""
+"""``lidar-synth curate``: scores the scans of a bank and drops unusual ones."""
 
 import json
 from pathlib import Path
@@ -18,32 +18,38 @@ if TYPE_CHECKING:
 
 def curate(
     bank: BankFolder,
-    drop: Annotated[list[str] | None, typer.Option(help="rule; several drop what any of them means")] = None,
-    out: Annotated[Path | None, typer.Option(help="folder of the curated bank; without it nothing is dropped")] = None,
-    reference: Annotated[str | None, typer.Option(help="scans to compare with [the bank's own mean]")] = None,
-    split: Annotated[str | None, typer.Option(help="of the reference, r2flow/test for instance")] = None,
-    sort: Annotated[str, typer.Option(help="the score that the list goes by, highest first; -SCORE: lowest")] = "range",
-    limit: Annotated[int, typer.Option(min=0, help="scans to list")] = 10,
-    plot: Annotated[Path | None, typer.Option(help="PNG with the distribution of every score")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="scores as JSON")] = False,
-    jobs: Annotated[int, typer.Option(min=1, help="worker processes")] = 1,
+    drop: Annotated[
+        list[str] | None, typer.Option(help="rule that selects scans to drop; repeatable, any match drops")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="folder of the curated bank; without it nothing is written")] = None,
+    reference: Annotated[
+        str | None, typer.Option(help="scans whose mean histograms to compare with [the bank's own]")
+    ] = None,
+    split: Annotated[str | None, typer.Option(help="split of the reference, for instance r2flow/test")] = None,
+    sort: Annotated[
+        str, typer.Option(help="sort the list by this score, highest first; -SCORE: lowest first")
+    ] = "range",
+    limit: Annotated[int, typer.Option(min=0, help="number of scans to list")] = 10,
+    plot: Annotated[Path | None, typer.Option(help="PNG file to write with the distribution of every score")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="number of worker processes")] = 1,
 ) -> None:
-    """Scores every scan of a bank, lists the oddest, and makes a bank without those that a rule means.
+    """Scores every scan of a bank, lists the most unusual ones, and writes a bank without those that match a rule.
 
-    Scores are kept in BANK/scores.npz; run it again to resume it where it was stopped. The curated bank is an index: it
-    shares the shards, and no shard is written anew. A rule is conditions joined by "and", each a score, one of < <= >
-    >=, and a number; run it without --out to see what it would drop.
+    Scores are saved in BANK/scores.npz; run it again to resume an interrupted run. The curated bank has its own index
+    and links to the same shards. A rule joins conditions by "and"; each is a score, one of < <= > >=, and a number.
+    Run it without --out to see what a rule would drop.
 
     \b
     Scores:
-      range       how far the histogram of ranges lies from the mean one, 0 to 0.83
-      labels      how far that of the classes does
+      range       distance of the range histogram to the mean histogram, 0 to 0.83
+      labels      distance of the class histogram to the mean histogram, 0 to 0.83
       empty       share of cells without a return
       unlabelled  share of returns without a label
       floating    share of ground returns above the sensor
-      speckle     share of neighbours on one surface with two labels
-      confidence  mean of the returns
-      duplicate   likeness to the most similar earlier scan that is found, 0 to 1
+      speckle     share of neighbouring returns on one surface with different labels
+      confidence  mean confidence of the returns
+      duplicate   similarity to the most similar earlier scan, 0 to 1
     \b
     Examples:
       lidar-synth curate bank --plot scores.png
@@ -73,7 +79,7 @@ def curate(
         _plot(plot, scores, dropped, bank)
     if out is None:
         return
-    compared = f", beside {scores.reference}" if scores.reference else ""
+    compared = f", compared with {scores.reference}" if scores.reference else ""
     why = f"{dropped.sum()} of {len(opened)} scans left out by {' or '.join(map(repr, rules))}{compared}"
     index = write(opened, np.flatnonzero(dropped).tolist(), why, out, progress=not as_json)
     if not as_json:
@@ -86,26 +92,26 @@ def _check(plot: Path | None, out: Path | None, rules: list[str]) -> None:
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot {plot}", "a file that ends in .png")
     if out is not None and not rules:
-        raise ConfigError(f"--out {out} without a rule", "--drop, too")
+        raise ConfigError(f"--out {out} without a rule", "--drop as well")
 
 
 def _scores(
     opened: "Bank", bank: Path, reference: str | None, split: str | None, jobs: int, progress: bool
 ) -> "Scores":
-    """From the file where it belongs to this bank and this reference; else made, and kept."""
+    """Read the saved scores of this bank and reference, or compute and save them."""
     from lidar_synth.bake.curate import FILE, kept_in, read_scores, score, write_scores
     from lidar_synth.errors import ConfigError
     from lidar_synth.formats import open_scans
 
     if split is not None and reference is None:
-        raise ConfigError(f"--split {split} of nothing", "--reference, too")
+        raise ConfigError(f"--split {split} without a reference", "--reference as well")
     source = None if reference is None else open_scans(reference, split=split)
     name = "" if source is None else f"{len(source)} scans of {' '.join(filter(None, (reference, split)))}"
     path = bank / FILE
     if path.is_file():
-        there = read_scores(path)
-        if (there.bank, there.reference) == (opened.identity, name):
-            return there
+        saved = read_scores(path)
+        if (saved.bank, saved.reference) == (opened.identity, name):
+            return saved
     with kept_in(bank) as folder:
         scores = score(opened, source, name=name, jobs=jobs, progress=progress, folder=folder)
         write_scores(path, scores)
@@ -113,7 +119,7 @@ def _scores(
 
 
 def _sorted(scores: "Scores", by: str) -> "NDArray[np.int64]":
-    """Numbers of the scans, the one to show first first."""
+    """Numbers of the scans, in the order of the list."""
     import numpy as np
 
     from lidar_synth.formats.source import choose
@@ -129,7 +135,7 @@ def _row(bank: "Bank", scores: "Scores", number: int) -> dict[str, Any]:
 
 
 def _table(bank: "Bank", scores: "Scores", shown: "NDArray[np.int64]", dropped: "NDArray[np.bool_]") -> None:
-    """How the scores are distributed, and some scans."""
+    """Print percentiles of the scores, and the listed scans."""
     import numpy as np
 
     heads = ("lowest", "1 %", "median", "99 %", "highest")

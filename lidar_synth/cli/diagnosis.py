@@ -1,4 +1,4 @@
-"""What this machine has, what it lacks, and the line that mends it."""
+"""Checks of this machine: libraries, devices and data, and the command that fixes each problem."""
 
 import ctypes
 import importlib
@@ -17,8 +17,8 @@ from typing import Literal
 from lidar_synth import __version__
 
 State = Literal["ok", "absent", "check", "broken"]
-"""``absent``: an optional part that is not there; ``check``: one that is there and wrong; ``broken``: the package
-does not work without it."""
+"""``absent``: an optional part is missing; ``check``: an optional part does not work; ``broken``: the package does not
+work without this part."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class Finding:
 
     Args:
         group: ``libraries``, ``devices`` or ``data``.
-        name: of what was looked at.
-        state: how it is.
-        found: version or description, or what is wrong.
-        buys: what an optional part that is not there would add.
-        fix: the line to type.
+        name: name of the checked part.
+        state: result of the check.
+        found: version, description or problem.
+        buys: what a missing optional part would add.
+        fix: the command to type.
     """
 
     group: str
@@ -43,13 +43,13 @@ class Finding:
 
 
 OPTIONAL = {
-    "embreex": "the town and whatever else casts rays",
+    "embreex": "ray casting, for instance in the town",
     "open3d": "the 3-D window of lidar-synth view",
 }
-"""What the parts that a machine can do without are for; every other dependency is required."""
+"""Purposes of the optional dependencies; every other dependency is required."""
 
 MODULES = {"pyyaml": "yaml", "pillow": "PIL"}
-"""The import name of a distribution, where it is another."""
+"""Import names of the distributions whose import name differs."""
 
 SHARED_OBJECTS = {
     "libusb-1.0.so.0": "libusb-1.0-0",
@@ -69,28 +69,28 @@ DATA_ROOTS = {
     "LIDAR_SYNTH_REAL_SCANS": ("manifest.csv", ()),
     "LIDAR_SYNTH_GOLDEN": ("*.npz", ()),
 }
-"""Environment variables that name data: what has to be there, and the folders that more can be done with."""
+"""Environment variables that name data: a pattern of required files, and optional folders."""
 
 
 def examine() -> list[Finding]:
-    """Everything there is to say about this machine, in the order of the report."""
+    """All findings about this machine, in the order of the report."""
     return [*_libraries(), *_devices(), *_data()]
 
 
 def works(findings: list[Finding]) -> bool:
-    """Whether nothing that the package needs is broken."""
+    """Whether all parts that the package needs work."""
     return all(finding.state != "broken" for finding in findings)
 
 
 def missing_packages() -> list[str]:
-    """The Debian packages whose libraries open3d needs and this Linux does not have."""
+    """The Debian packages with libraries that open3d needs and this Linux lacks."""
     if not sys.platform.startswith("linux"):
         return []
     return [package for library, package in SHARED_OBJECTS.items() if not _loads(library)]
 
 
 def report(findings: list[Finding]) -> str:
-    """The findings as a table for people."""
+    """The findings as a text table."""
     width = max(len(finding.name) for finding in findings)
     lines = [
         f"lidar_synth {__version__} on Python {platform.python_version()}, {platform.system()} {platform.machine()}"
@@ -141,7 +141,7 @@ def _libraries() -> Iterator[Finding]:
 
 
 def _library(name: str, minimum: str, extra: str | None) -> Finding:
-    """How one dependency is; those of an extra are optional."""
+    """Check one dependency; those of an extra are optional."""
     buys = OPTIONAL.get(name) or (f"the extra {extra!r}" if extra else "")
     worst: State = "check" if buys else "broken"
     wheel = f"pip install 'lidar_synth[{extra}]'" if extra else f"pip install '{name}>={minimum}'"
@@ -149,7 +149,7 @@ def _library(name: str, minimum: str, extra: str | None) -> Finding:
         module = importlib.import_module(MODULES.get(name, name.replace("-", "_")))
     except ModuleNotFoundError:
         return Finding("libraries", name, "absent" if buys else "broken", "not installed", buys, wheel)
-    except Exception as error:  # a broken installation may raise anything: the report is where it is told
+    except Exception as error:  # a broken installation may raise anything; it is reported
         if name == "open3d" and (packages := missing_packages()):
             line = "apt-get install -y --no-install-recommends " + " ".join(packages)
             return Finding("libraries", name, "absent", "lacks system libraries", buys, _as_root(line))
@@ -161,7 +161,7 @@ def _library(name: str, minimum: str, extra: str | None) -> Finding:
 
 
 def _geometry() -> Finding:
-    """Whether a range image survives the way to points and back, which needs numpy and numba to agree."""
+    """Check that a range image survives the round trip to points, which needs compatible numpy and numba."""
     try:
         import numpy as np
 
@@ -173,7 +173,7 @@ def _geometry() -> Finding:
         image = RangeImage(np.full(sensor.shape, 10, np.float32), sensor)
         back = project(unproject(image))
         same = np.allclose(back.range, image.range, rtol=3e-7)
-    except Exception as error:  # whatever it is, it belongs in the report
+    except Exception as error:  # any error belongs in the report
         return Finding("libraries", "projection", "broken", f"{type(error).__name__}: {error}")
     if not same:
         return Finding("libraries", "projection", "broken", "a range image comes back changed",
@@ -195,7 +195,7 @@ def _cuda() -> Iterator[Finding]:
         import torch
 
         cards = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
-    except Exception as error:  # a driver that does not fit raises many things
+    except Exception as error:  # an incompatible driver raises various errors
         yield Finding("devices", "CUDA", "check", f"{type(error).__name__}: {error}")
         return
     for number, card in enumerate(cards):
@@ -207,10 +207,10 @@ def _cuda() -> Iterator[Finding]:
     if shutil.which("nvidia-smi") is None:
         yield Finding("devices", "CUDA", "absent", "no NVIDIA driver: everything runs on the CPU")
     elif torch.version.cuda is None:
-        yield Finding("devices", "CUDA", "check", "a driver, but torch is built for the CPU",
+        yield Finding("devices", "CUDA", "check", "driver found, but torch is built for the CPU",
                       fix="the line for this machine's CUDA on https://pytorch.org/get-started/locally")  # fmt: skip
     else:
-        yield Finding("devices", "CUDA", "check", f"a driver, but torch (CUDA {torch.version.cuda}) finds no card",
+        yield Finding("devices", "CUDA", "check", f"driver found, but torch (CUDA {torch.version.cuda}) finds no GPU",
                       fix="nvidia-smi")  # fmt: skip
 
 
@@ -257,10 +257,10 @@ def _cpu_name() -> str:
 
 
 def _instructions() -> str:
-    """The vector instructions that torch will use."""
+    """The vector instructions that torch uses."""
     try:
         import torch
 
         return f", {torch.backends.cpu.get_cpu_capability()}"
-    except Exception:  # without torch there is nothing to use them
+    except Exception:  # the report lists a missing torch separately
         return ""

@@ -1,4 +1,4 @@
-"""``lidar-synth doctor``: what this machine has and lacks."""
+"""``lidar-synth doctor``: checks this machine's libraries, devices and data."""
 
 import json
 from typing import Annotated
@@ -7,11 +7,11 @@ import typer
 
 
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="the same as JSON")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Says which libraries, devices and data are there, what is missing, and the line that installs it.
+    """Lists available and missing libraries, devices and data, and the command that installs what is missing.
 
-    Exit status 0 when the package works, 1 when something that it needs is broken.
+    Exit status 0 = the package works, 1 = a required part is missing or broken.
 
     \b
     Examples:

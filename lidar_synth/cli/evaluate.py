@@ -1,4 +1,4 @@
-"""``lidar-synth evaluate``: one set of scans beside another."""
+"""``lidar-synth evaluate``: compares a set of generated scans with a reference set."""
 
 import json
 from dataclasses import asdict
@@ -12,20 +12,20 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    real: Annotated[Path, typer.Argument(metavar="REAL", help="the reference: a dataset's root or a folder")],
-    fake: Annotated[Path, typer.Argument(metavar="FAKE", help="the scans to judge, likewise")],
-    protocol: Annotated[str, typer.Option(help="r2flow | lidm | town: whose definitions")],
-    split: Annotated[str | None, typer.Option(help="split of REAL, r2flow/test for instance")] = None,
-    sensor: Annotated[str | None, typer.Option(help="sensor of both: a preset or a YAML file")] = None,
-    segmenter: Annotated[bool, typer.Option(help="also by the features of the segmenter that knows the town")] = False,
-    training_data: Annotated[bool, typer.Option(help="compare even with what the model was trained on")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="the figures as JSON")] = False,
+    real: Annotated[Path, typer.Argument(metavar="REAL", help="reference scans: root of a dataset, or a folder")],
+    fake: Annotated[Path, typer.Argument(metavar="FAKE", help="scans to evaluate: root of a dataset, or a folder")],
+    protocol: Annotated[str, typer.Option(help="definitions of the metrics: r2flow | lidm | town")],
+    split: Annotated[str | None, typer.Option(help="split of REAL, for instance r2flow/test")] = None,
+    sensor: Annotated[str | None, typer.Option(help="sensor of both sets: a preset or a YAML file")] = None,
+    segmenter: Annotated[bool, typer.Option(help="add metrics on features of the town's segmenter")] = False,
+    training_data: Annotated[bool, typer.Option(help="permit a reference that the model was trained on")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Says how far two sets of scans lie apart: Jensen-Shannon distance and MMD from above, features on request.
+    """Compares two sets of scans: Jensen-Shannon distance and MMD of bird's-eye views; feature metrics on request.
 
-    The same names mean different things in different papers: figures of two protocols are not comparable. A reference
-    that shares frames with what the model was trained on flatters it and is refused, whatever the names of the splits;
-    the training data of the model's teacher and autoencoder count.
+    Papers define metrics of the same name differently: scores of two protocols are not comparable. A reference that
+    shares frames with the model's training data is refused, because it flatters the model; the training data of its
+    teacher and autoencoder count too, and the names of the splits do not matter.
 
     \b
     Examples:
@@ -52,7 +52,7 @@ def evaluate(
 
 
 def _refuse_training_data(reference: "Recordings", real: Path, fake: Path) -> None:
-    """Where generated scans say what their model was trained on, that is no reference."""
+    """Refuse a reference that contains training data of the model, where the generated scans record it."""
     from lidar_synth.errors import ConfigError
     from lidar_synth.evaluate.leakage import overlap, seen_by_model_of, undecided
 
@@ -63,13 +63,11 @@ def _refuse_training_data(reference: "Recordings", real: Path, fake: Path) -> No
         raise ConfigError(
             f"{real} as a reference for {fake}, whose model was trained on {shared} of it",
             "scans that the model was not trained on",
-            "Another split, or a town of another --seed; --training-data to compare nevertheless.",
+            "Use another split, or a town with another --seed; --training-data compares anyway.",
         )
     if not seen:
-        typer.echo(
-            f"{fake} does not tell which recordings its model was trained on: not compared with {real}", err=True
-        )
+        typer.echo(f"{fake} does not record its model's training data: overlap with {real} was not checked", err=True)
     elif undecided(seen, reference):
         typer.echo(
-            "KITTI's object set was drawn from the raw drives; whether the two share frames is not known", err=True
+            "KITTI's object set is a sample of the raw drives; whether the two sets share frames is not known", err=True
         )

@@ -1,4 +1,4 @@
-"""``lidar-synth import``: a peer's released weights as a checkpoint of this package."""
+"""``lidar-synth import``: converts the released weights of another project to a checkpoint of this package."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,14 +9,14 @@ from lidar_synth.errors import ConfigError
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The peer's released weights: .pth or .ckpt.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT.safetensors", help="Where the checkpoint will stand.")],
-    peer: Annotated[str, typer.Option(help="Whose weights: r2flow | lidm.")] = "r2flow",
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="released weights: .pth or .ckpt")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.safetensors", help="checkpoint to write")],
+    peer: Annotated[str, typer.Option(help="project of the weights: r2flow | lidm")] = "r2flow",
 ) -> None:
-    """Convert a peer's released weights to a checkpoint.
+    """Converts the released weights of another project to a checkpoint.
 
-    The file is read without running any code in it. Names, sign and time are converted; a file that does not
-    fit exactly is refused with its missing and unexpected keys.
+    Reading the file runs no code from it. Parameter names, sign and time convention are converted; a file with missing
+    or unexpected keys is refused, and the message lists them.
 
     Examples:
 

@@ -1,4 +1,4 @@
-"""``lidar-synth recipes``: the published configurations."""
+"""``lidar-synth recipes``: lists the published training configurations."""
 
 import json
 from dataclasses import asdict
@@ -11,7 +11,7 @@ def recipes(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="print the file of this recipe")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Lists the recipes that come with the package: data, size and expected time of each.
+    """Lists the recipes of the package with the data, model size and expected time of each.
 
     \b
     Examples:

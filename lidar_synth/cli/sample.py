@@ -1,4 +1,4 @@
-"""``lidar-synth sample``: scans from a model."""
+"""``lidar-synth sample``: generates scans with a model."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,25 +10,33 @@ from lidar_synth.datasets.recordings import NOTE
 
 def sample(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
-    model: Annotated[str, typer.Option(help="a shipped model's name or a .safetensors checkpoint")] = "town",
-    count: Annotated[int, typer.Option(min=1, help="scans")] = 16,
+    model: Annotated[str, typer.Option(help="name of a shipped model, or a .safetensors checkpoint")] = "town",
+    count: Annotated[int, typer.Option(min=1, help="number of scans")] = 16,
     seed: Annotated[int, typer.Option(min=0, help="scan i is a function of the model, the seed and i")] = 0,
-    steps: Annotated[int | None, typer.Option(min=1, help="of a uniform time grid; default: the model's own")] = None,
-    solver: Annotated[str, typer.Option(help="euler | heun")] = "euler",
-    condition: Annotated[
-        str | None, typer.Option(help="dataset that a conditional model takes its labels or images from")
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="steps of a uniform time grid [the model's own time grid]")
     ] = None,
-    condition_layout: Annotated[str | None, typer.Option(help="of that dataset, if not to be recognised")] = None,
-    condition_split: Annotated[str | None, typer.Option(help="of that dataset, r2flow/train for instance")] = None,
-    guidance: Annotated[float, typer.Option(min=0, max=100, help="of a conditional model; 1 = none")] = 1.0,
-    to: Annotated[str, typer.Option(help="npz (keeps all) | kitti | semantic_kitti | range | pcd | ...")] = "npz",
-    device: Annotated[str, typer.Option(help="cpu | cuda")] = "cpu",
-    dtype: Annotated[str, typer.Option(help="float32 | bfloat16: what the network computes in")] = "float32",
-    batch: Annotated[int | None, typer.Option(min=1, help="scans at a time; bounds the memory")] = None,
+    solver: Annotated[str, typer.Option(help="ODE solver: euler | heun")] = "euler",
+    condition: Annotated[
+        str | None, typer.Option(help="dataset with the labels or camera images that a conditional model needs")
+    ] = None,
+    condition_layout: Annotated[str | None, typer.Option(help="layout of that dataset [detected]")] = None,
+    condition_split: Annotated[
+        str | None, typer.Option(help="split of that dataset, for instance r2flow/train")
+    ] = None,
+    guidance: Annotated[
+        float, typer.Option(min=0, max=100, help="scale of classifier-free guidance; 1 = no guidance")
+    ] = 1.0,
+    to: Annotated[
+        str, typer.Option(help="output format: npz (keeps every field) | kitti | semantic_kitti | range | pcd | ...")
+    ] = "npz",
+    device: Annotated[str, typer.Option(help="device of the network: cpu | cuda")] = "cpu",
+    dtype: Annotated[str, typer.Option(help="data type of the network's computation: float32 | bfloat16")] = "float32",
+    batch: Annotated[int | None, typer.Option(min=1, help="scans per batch; limits the memory")] = None,
 ) -> None:
-    """Generates scans and writes them in any format. Run it again to go on where it stopped.
+    """Generates scans and writes them in any format. Run it again to resume an interrupted run.
 
-    Scan i of a conditional model is made of scan i of the dataset of conditions, and round again.
+    A conditional model generates scan i from scan i of the dataset of conditions, modulo the length of that dataset.
 
     \b
     Examples:

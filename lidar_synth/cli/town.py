@@ -1,4 +1,4 @@
-"""``lidar-synth town``: procedural streets in the datasets' own layouts."""
+"""``lidar-synth town``: scans of procedural streets in the folder layouts of public datasets."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,21 +7,21 @@ import typer
 
 
 def town(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
-    scans: Annotated[int, typer.Option(help="How many scans.")] = 200,
-    seed: Annotated[int, typer.Option(help="Which town.")] = 0,
-    layout: Annotated[str, typer.Option(help="kitti360 | semantic_kitti | kitti")] = "kitti360",
-    sensor: Annotated[str, typer.Option(help="Whose rays are cast: a preset or a YAML file.")] = "town",
-    camera: Annotated[bool, typer.Option(help="Render the camera's picture of each scan (about 1 s each).")] = True,
-    interval: Annotated[float, typer.Option(help="Seconds between neighbouring scans.")] = 0.4,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
+    scans: Annotated[int, typer.Option(help="number of scans")] = 200,
+    seed: Annotated[int, typer.Option(help="seed of the town: another seed is another town")] = 0,
+    layout: Annotated[str, typer.Option(help="folder layout: kitti360 | semantic_kitti | kitti")] = "kitti360",
+    sensor: Annotated[str, typer.Option(help="sensor that casts the rays: a preset or a YAML file")] = "town",
+    camera: Annotated[bool, typer.Option(help="render a camera image of each scan (about 1 s each)")] = True,
+    interval: Annotated[float, typer.Option(help="seconds between consecutive scans")] = 0.4,
     sequence: Annotated[
-        int | None, typer.Option(help="Drive or sequence that takes the scans; 4 for kitti360, 0 for semantic_kitti.")
+        int | None, typer.Option(help="number of the drive or sequence to write [4 for kitti360, 0 for semantic_kitti]")
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Worker processes.")] = 1,
+    jobs: Annotated[int, typer.Option(help="number of worker processes")] = 1,
 ) -> None:
-    """Write synthetic street scans with labels, boxes, poses and pictures, in a dataset's own folders.
+    """Writes street scans of a procedural town with labels, boxes, poses and images, in the layout of a public dataset.
 
-    The scans come from a procedural town, not from a dataset. Run it again to go on where it stopped.
+    No scan comes from a real dataset. Run it again to resume an interrupted run.
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""``lidar-synth train`` and ``lidar-synth distill``: train a teacher, distil a student."""
+"""``lidar-synth train`` and ``lidar-synth distill``: trains a teacher, distils a student."""
 
 import os
 from pathlib import Path
@@ -7,18 +7,20 @@ from typing import Annotated
 import typer
 
 RecipeName = Annotated[
-    str, typer.Argument(metavar="RECIPE", help="a name that `lidar-synth recipes` lists, or a YAML file")
+    str, typer.Argument(metavar="RECIPE", help="name of a recipe (see `lidar-synth recipes`), or a YAML file")
 ]
-Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="values to change")]
+Overrides = Annotated[
+    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="values of the recipe to override")
+]
 Resume = Annotated[bool, typer.Option("--resume", help="resume the run in the output folder")]
-Minutes = Annotated[float | None, typer.Option(help="save and stop after so many minutes; --resume continues")]
+Minutes = Annotated[float | None, typer.Option(help="save and stop after this many minutes; --resume continues")]
 
 
 def train(recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
     """Trains a teacher: a rectified flow from noise to scans.
 
-    The output folder gets the checkpoint, which has the folder's name; state.safetensors, from which --resume continues
-    with the same losses; logs for TensorBoard; and pictures of samples. torchrun runs it on several GPUs.
+    The output folder gets the checkpoint, named like the folder; state.safetensors, from which an interrupted run
+    resumes with the same losses; logs for TensorBoard; and images of samples. torchrun runs it on several GPUs.
 
     \b
     Examples:
@@ -30,14 +32,14 @@ def train(recipe: RecipeName, overrides: Overrides = None, resume: Resume = Fals
     """
     from lidar_synth.train import TrainConfig, load_config, run
 
-    _say(run(load_config(TrainConfig, recipe, overrides or ()), resume, minutes))
+    _print_once(run(load_config(TrainConfig, recipe, overrides or ()), resume, minutes))
 
 
 def distill(recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
     """Distils a student that needs few steps from a teacher.
 
-    Without a time grid in the configuration, the timesteps are selected first. With `weaker=` the student learns the
-    autoguided teacher (Karras et al. 2024).
+    Without a time grid in the configuration, the timesteps are selected first. With a weaker teacher the student learns
+    the autoguided velocity (Karras et al. 2024).
 
     \b
     Examples:
@@ -48,10 +50,10 @@ def distill(recipe: RecipeName, overrides: Overrides = None, resume: Resume = Fa
     """
     from lidar_synth.train import DistillConfig, load_config, run
 
-    _say(run(load_config(DistillConfig, recipe, overrides or ()), resume, minutes))
+    _print_once(run(load_config(DistillConfig, recipe, overrides or ()), resume, minutes))
 
 
-def _say(path: Path) -> None:
-    """Prints the path of the checkpoint, once for all processes of torchrun."""
+def _print_once(path: Path) -> None:
+    """Print the checkpoint's path, in one of the processes of torchrun only."""
     if os.environ.get("RANK", "0") == "0":
         typer.echo(path)

@@ -1,4 +1,4 @@
-"""``lidar-synth view``: look at scans."""
+"""``lidar-synth view``: shows scans."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,15 +12,15 @@ if TYPE_CHECKING:
 
 
 def view(
-    path: Annotated[Path, typer.Argument(help="a file, a folder, a dataset's root or a bank")],
-    index: Annotated[int, typer.Option(help="which scan, from 0; -1 is the last")] = 0,
-    count: Annotated[int, typer.Option(min=1, max=256, help="how many, from there on")] = 1,
-    out: Annotated[Path | None, typer.Option(help="a .png (sheet) or .html (interactive page) to write")] = None,
-    sensor: Annotated[str | None, typer.Option(help="a preset's name or a YAML file")] = None,
+    path: Annotated[Path, typer.Argument(help="file, folder, root of a dataset, or bank")],
+    index: Annotated[int, typer.Option(help="number of the first scan, from 0; -1 is the last one")] = 0,
+    count: Annotated[int, typer.Option(min=1, max=256, help="number of scans")] = 1,
+    out: Annotated[Path | None, typer.Option(help="file to write: .png (sheet) or .html (interactive page)")] = None,
+    sensor: Annotated[str | None, typer.Option(help="sensor: a preset or a YAML file")] = None,
 ) -> None:
-    """Shows scans: range image, bird's-eye view and 3-D.
+    """Shows scans as range image, bird's-eye view and 3-D points.
 
-    Without --out a window opens where there is a screen; elsewhere a page is written into the current folder.
+    Without --out a window opens if there is a screen; otherwise a page is written to the current folder.
 
     \b
     Examples:
@@ -42,10 +42,10 @@ def view(
 
 
 def _read(path: Path, index: int, count: int, sensor: str | None) -> "list[Scan]":
-    """Scans index, index + 1 .. of what is at the path.
+    """Read scans ``index``, ``index`` + 1, ... of a source.
 
     Raises:
-        ConfigError: where the index leads outside.
+        ConfigError: if the index is out of range.
     """
     from tqdm import tqdm
 

@@ -22,7 +22,7 @@ from timing import machine
 from untrained import write_untrained
 
 from lidar_synth.bake import BakeJob, BakePlan, Resources, bake, make_plan
-from lidar_synth.bake.shard import images, load_checked, one_computer
+from lidar_synth.bake.shard import images, load_checked, torch_threads
 
 ROUNDS = 3
 
@@ -53,7 +53,7 @@ def generated_and_baked(out: Path, model: str, count: int) -> list[tuple[float, 
         plan = plan_of(out / str(number), model, count, count)
         generator = load_checked(plan.job, plan.facts)
         start = time.perf_counter()
-        with one_computer(plan.job.threads):
+        with torch_threads(plan.job.threads):
             for _ in images(generator, plan.job, plan.shards[0]):
                 pass
         middle = time.perf_counter()

@@ -1,10 +1,11 @@
-"""Curation of banks: what is odd about each scan, and a bank without the ones that are too odd.
+"""Curation of banks: scores for unusual scans, and rules that drop scans by their scores.
 
-``features`` measures one scan, ``store`` keeps the features of all on disk, ``duplicates`` finds scans that are alike
-(``neighbours`` among very many), ``scores`` puts it together for a whole bank and keeps it in a file, ``rules`` says
-which scans a rule means. ``bake.edit.drop`` makes the curated bank.
+``features`` measures one scan and ``store`` keeps the features of all scans on disk. ``duplicates`` finds similar scans
+(``neighbours`` does so in very large banks). ``scores`` scores a complete bank and saves the scores in a file.
+``rules`` selects the scans that a rule matches, and ``bake.edit.drop`` writes the curated bank.
 
-To add a score: a function in ``features.MEASURES``, or for what needs the whole bank a line in ``scores``.
+To add a score of single scans, add a function to ``features.MEASURES``; to add one of a complete bank, add a line to
+``scores``.
 """
 
 from lidar_synth.bake.curate.rules import matching

@@ -1,22 +1,22 @@
-"""Scans that are alike, by their signatures: all pairs of a bank that is not large, and of others what is found."""
+"""Near duplicates by signature: an exact search over all pairs, or an approximate one in large banks."""
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lidar_synth.bake.curate.neighbours import Signatures, find_alike
+from lidar_synth.bake.curate.neighbours import Signatures, find_similar
 
 ALL_PAIRS = 20_000
-"""Scans of which every pair is compared."""
+"""Largest number of scans for the exact search over all pairs."""
 
 BLOCK = 2048
 """Signatures compared with one another at a time: 16 MB of products."""
 
 
-def most_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """For each scan the one before it that is most like it; of more than ``ALL_PAIRS`` the one that is found to be.
+def most_similar(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The most similar earlier scan of each scan; approximate for more than ``ALL_PAIRS`` scans.
 
-    Only those before it: of a group of scans that are alike, the first one is like none, and stays where the others
+    Only earlier scans count, so that the first of a group of similar scans has no duplicate and stays when the others
     are dropped.
 
     Args:
@@ -24,13 +24,13 @@ def most_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[n
         progress: show a bar.
 
     Returns:
-        (N,) likeness in [0, 1], 0 for the first scan; (N,) number of that scan, -1 for the first.
+        (N,) similarity in [0, 1], 0 for the first scan; (N,) number of the most similar scan, -1 for the first.
     """
-    return (compare_all if len(signatures) <= ALL_PAIRS else find_alike)(signatures, progress)
+    return (compare_all if len(signatures) <= ALL_PAIRS else find_similar)(signatures, progress)
 
 
 def compare_all(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """As ``most_alike``, by every pair; the work grows with the square of the number of scans."""
+    """Like ``most_similar``, over all pairs; the time grows with the square of the number of scans."""
     count = len(signatures)
     best, twin = np.zeros(count), np.full(count, -1)
     starts = range(0, count, BLOCK)
@@ -40,7 +40,7 @@ def compare_all(signatures: Signatures, progress: bool = True) -> tuple[NDArray[
         products = later @ earlier.T
         products[np.arange(a, a + len(later))[:, None] <= np.arange(b, b + len(earlier))] = -1
         found = products.argmax(1)
-        likeness = products[np.arange(len(later)), found].clip(max=1)
-        better = likeness > np.where(twin[a : a + BLOCK] < 0, -0.5, best[a : a + BLOCK])
-        best[a : a + BLOCK][better], twin[a : a + BLOCK][better] = likeness[better], found[better] + b
+        similarity = products[np.arange(len(later)), found].clip(max=1)
+        better = similarity > np.where(twin[a : a + BLOCK] < 0, -0.5, best[a : a + BLOCK])
+        best[a : a + BLOCK][better], twin[a : a + BLOCK][better] = similarity[better], found[better] + b
     return best, twin

@@ -1,4 +1,4 @@
-"""What is measured of one scan, without knowing the others."""
+"""Measurements of a single scan."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -12,28 +12,28 @@ from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 
 RANGE_BINS = 64
-"""Of the histogram of ranges, from 0 to the sensor's farthest."""
+"""Bins of the histogram of ranges, from 0 to the sensor's range_max."""
 
 SIDE, CELLS = 80.0, 32
-"""Side in metres of the square around the sensor that a signature shows from above, and its cells along it."""
+"""The bird's-eye map of a signature: side of its square around the sensor in metres, and cells along a side."""
 
 SIGNATURE = CELLS * CELLS
 """Entries of a signature."""
 
 GROUND = tuple(TRAIN_ID[name] for name in ("road", "parking", "sidewalk", "other-ground", "terrain"))
-"""Train ids of what one can stand on."""
+"""Train ids of the ground classes."""
 
-_SAME_SURFACE = 0.02  # relative difference in range of two neighbouring cells that see the same thing
+_SAME_SURFACE = 0.02  # relative range difference of two neighbouring cells on the same surface
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One number about a scan.
+    """One number that describes a scan.
 
     Args:
-        meaning: what it is, in words, with its interval.
-        field: what a scan has to carry; None = nothing.
-        of: the number, from the image and the scan that it unprojects to.
+        meaning: description with its interval.
+        field: the field that the scan needs; None = none.
+        of: computes the number from the range image and its unprojected scan.
     """
 
     meaning: str
@@ -56,7 +56,7 @@ def _floating(image: RangeImage, scan: Scan) -> float:
 
 
 def _speckle(image: RangeImage, scan: Scan) -> float:
-    """Around the seam, too."""
+    """Compares cells across the seam of the image, too."""
     assert image.label is not None
     label, metres = image.label, image.range
     right, beyond = np.roll(label, -1, 1), np.roll(metres, -1, 1)
@@ -75,19 +75,20 @@ MEASURES: dict[str, Measure] = {
     "speckle": Measure("share of neighbours in a row, 2 % apart in range, with two labels", "label", _speckle),
     "confidence": Measure("mean confidence of the returns", "confidence", _confidence),
 }
-"""By the name of the score; a share of nothing is 0."""
+"""Measures by the name of their score; a share of an empty set is 0."""
 
 
 class Features(NamedTuple):
-    """Of one scan.
+    """The features of one scan.
 
     Args:
-        numbers: by name in ``MEASURES``.
-        ranges: (RANGE_BINS,) returns by range.
-        classes: (19,) returns by train id.
-        signature: (SIGNATURE,) float16, the square roots of the returns in each cell of a map, farthest ahead and
-            left first, as a vector of length 1; 0 for a scan without a return there. The product of two such vectors is
-            the Bhattacharyya coefficient of the maps: 1 for scans that are alike, 0 for what has nothing in common.
+        numbers: {name: value} for the names in ``MEASURES``.
+        ranges: (RANGE_BINS,) number of returns per range bin.
+        classes: (19,) number of returns per train id.
+        signature: (SIGNATURE,) float16 unit vector: the square roots of the number of returns in each cell of a
+            bird's-eye map, starting with the cell farthest ahead and to the left; 0 for a scan without returns in the
+            map. The inner product of two signatures is the Bhattacharyya coefficient of the maps: 1 for identical maps,
+            0 for disjoint ones.
     """
 
     numbers: dict[str, float]
@@ -97,12 +98,12 @@ class Features(NamedTuple):
 
 
 def measured(fields: Collection[str]) -> tuple[str, ...]:
-    """The names in ``MEASURES`` of what can be measured of scans with these fields."""
+    """The names in ``MEASURES`` that scans with these fields support."""
     return tuple(name for name, measure in MEASURES.items() if measure.field is None or measure.field in fields)
 
 
 def features(image: RangeImage) -> Features:
-    """What is measured of a range image, as far as its channels go."""
+    """The features of a range image; measures of missing channels are left out."""
     scan = unproject(image)
     numbers = {name: MEASURES[name].of(image, scan) for name in measured(image.channels)}
     ranges, _ = np.histogram(image.range[image.mask], RANGE_BINS, (0, image.sensor.range_max))

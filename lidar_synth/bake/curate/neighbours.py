@@ -1,13 +1,13 @@
-"""Scans that are alike among very many, approximately: each is compared with a few cells of a Voronoi partition.
+"""Approximate nearest-neighbour search for near duplicates in large banks, with an inverted file.
 
-A signature is projected onto random signs and rounded to bytes, its sketch, which keeps distances to some per cent
-(Johnson and Lindenstrauss; Achlioptas, "Database-friendly random projections", 2003). Some sketches, drawn at random,
-are the centres of cells; a scan is compared with the earlier scans of the ``PROBES`` cells whose centres are nearest to
-it (an inverted file: Jegou et al., "Product quantization for nearest neighbor search", 2011), and the ``CANDIDATES``
-nearest sketches found by their whole signatures. Exact copies are found by hash, always.
+A signature is projected onto random signs and rounded to bytes. This sketch preserves distances to a few per cent
+(Johnson and Lindenstrauss; Achlioptas, "Database-friendly random projections", 2003). Randomly sampled sketches are the
+centres of Voronoi cells. A scan is compared with the earlier scans in the ``PROBES`` cells with the nearest centres
+(Jegou et al., "Product quantization for nearest neighbor search", 2011); of these, the ``CANDIDATES`` nearest sketches
+are compared by their full signatures. Exact copies are always found, by their hash.
 
-Everything before the whole signatures is integers that float32 holds exactly: the result does not depend on the
-machine, its threads, or how many rows are taken at a time. The work grows with N^1.5.
+All steps before the full signatures compute with integers that float32 represents exactly: the result does not depend
+on the machine, the number of threads or the block size. The time grows with N^1.5.
 """
 
 import hashlib
@@ -22,32 +22,32 @@ from tqdm import tqdm
 from lidar_synth.noise import keyed_rng
 
 DIMENSIONS = 64
-"""Of a sketch."""
+"""Dimensions of a sketch."""
 
 CELLS_PER_ROOT = 2
-"""Cells, for each of the square root of the number of scans."""
+"""Number of cells, divided by the square root of the number of scans."""
 
 PROBES = 16
-"""Cells that a scan is compared with."""
+"""Number of cells that a scan is compared with."""
 
 CROWD = 4096
-"""Scans of one cell that others are compared with, at most: the first ones. A cell holds an eighth of it at a million
-scans, unless very many are almost the same; then the first of them are found."""
+"""Largest number of scans of a cell to compare with; the first ones are taken. At a million scans a cell holds about an
+eighth of that, unless very many scans are nearly identical; then the first of them are found."""
 
 CANDIDATES = 6
-"""Nearest sketches whose whole signatures are compared."""
+"""Number of nearest sketches whose full signatures are compared."""
 
 ROWS = 1024
-"""Signatures taken at a time."""
+"""Signatures processed at a time."""
 
 PAIRS = 1 << 19
 """Pairs of sketches compared at a time: 4 MB of keys."""
 
-_STEPS = 4095  # of an entry of a signature, which lies in [0, 1]: sums of 1024 of them are exact in float32
-_SAMPLE = 65_536  # signatures that centre and scale of the sketches are taken from
-_SPREAD = 4  # standard deviations that a byte holds
-_NUMBERS = 2.0**30  # more than there are scans; times a distance, float64 holds it exactly
-_NONE = 2.0**53 - 1  # more than any key
+_STEPS = 4095  # quantisation steps of a signature's entries in [0, 1]: sums of 1024 entries are exact in float32
+_SAMPLE = 65_536  # signatures from which the centre and scale of the sketches are estimated
+_SPREAD = 4  # standard deviations that the range of a byte covers
+_NUMBERS = 2.0**30  # larger than any scan number; its product with a distance is exact in float64
+_NONE = 2.0**53 - 1  # larger than any key
 
 
 class Signatures(Protocol):
@@ -56,19 +56,19 @@ class Signatures(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, rows: Any, /) -> NDArray[np.float16]:
-        """Some rows, by a slice or an array of their numbers."""
+        """Rows by a slice or by an array of row numbers."""
         ...
 
 
-def find_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """For each signature an earlier one that is most like it, or nearly so; as ``most_alike``.
+def find_similar(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """For each signature, approximately the most similar earlier one; like ``most_similar``.
 
     Returns:
-        (N,) likeness in [0, 1], never more than that of the most similar one; (N,) number of the earlier one, -1 where
-        none was found.
+        (N,) similarity in [0, 1], never more than that of the exact nearest neighbour; (N,) number of the earlier scan,
+        -1 where none was found.
     """
     count = len(signatures)
-    likeness, twin = np.zeros(count), np.full(count, -1)
+    similarity, twin = np.zeros(count), np.full(count, -1)
     with tqdm(total=PROBES + 3, desc="duplicates", unit="step", disable=not progress, delay=2) as steps:
         first = _first_copies(signatures)
         steps.update()
@@ -78,12 +78,12 @@ def find_alike(signatures: Signatures, progress: bool = True) -> tuple[NDArray[n
         nearest = _nearest(sketches, steps)
         for part in _parts(count):
             candidates = nearest[np.searchsorted(own, first[part])]
-            found = np.where(candidates < 0, -1, own[candidates])  # numbers among the first ones, and among all
+            found = np.where(candidates < 0, -1, own[candidates])  # to numbers among all signatures
             copies = first[part] < np.arange(part.start, part.stop)
             found[copies] = first[part][copies, None]
-            likeness[part], twin[part] = _best(signatures, part, found)
+            similarity[part], twin[part] = _best(signatures, part, found)
         steps.update()
-    return likeness, twin
+    return similarity, twin
 
 
 def _parts(count: int, size: int | None = None) -> Iterator[slice]:
@@ -92,7 +92,7 @@ def _parts(count: int, size: int | None = None) -> Iterator[slice]:
 
 
 def _first_copies(signatures: Signatures) -> NDArray[np.int64]:
-    """(N,) the number of the first signature with the same bytes."""
+    """(N,) number of the first signature with the same bytes."""
     hashes = np.empty(len(signatures), np.uint64)
     for part in _parts(len(signatures)):
         rows = np.ascontiguousarray(signatures[part])
@@ -111,7 +111,7 @@ def _sketches(signatures: Signatures, own: NDArray[np.int64]) -> NDArray[np.int8
         return values
 
     some = own[np.linspace(0, len(own) - 1, min(len(own), _SAMPLE)).astype(np.int64)]
-    total, squares = np.zeros(DIMENSIONS), 0.0  # of integers below 2^53
+    total, squares = np.zeros(DIMENSIONS), 0.0  # sums of integers below 2^53
     for part in _parts(len(some)):
         values = project(some[part]).astype(np.float64)
         total += values.sum(0)
@@ -126,7 +126,7 @@ def _sketches(signatures: Signatures, own: NDArray[np.int64]) -> NDArray[np.int8
 
 
 def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32]:
-    """(N, CANDIDATES) numbers of the earlier sketches that are nearest, -1 where there are fewer."""
+    """(N, CANDIDATES) numbers of the nearest earlier sketches, -1 where there are fewer."""
     count = len(sketches)
     cells = min(count, int(CELLS_PER_ROOT * count**0.5) + 1)
     centres = sketches[np.sort(keyed_rng(count, cells).choice(count, cells, replace=False))]
@@ -149,7 +149,7 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32
 
 
 def _by_cell(of: NDArray[np.unsignedinteger], cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Numbers of the sketches, those of one cell together and ascending; where each cell begins, and the end."""
+    """Numbers of the sketches, sorted by cell and then ascending; start of each cell in this list, and its end."""
     order = np.argsort(of, kind="stable")
     return order, np.searchsorted(of[order], np.arange(cells + 1))
 
@@ -157,14 +157,14 @@ def _by_cell(of: NDArray[np.unsignedinteger], cells: int) -> tuple[NDArray[np.in
 def _compare(
     sketches: NDArray[np.int8], queries: NDArray[np.int64], members: NDArray[np.int64], best: NDArray[np.float64]
 ) -> None:
-    """Enter, among the best of each query, the earlier members of a cell."""
+    """Update the best candidates of each query with the earlier members of a cell."""
     keys = _keys(sketches[queries], sketches[members], members)
     keys[members >= queries[:, None]] = _NONE
     best[queries] = np.partition(np.concatenate([best[queries], keys], 1), CANDIDATES - 1)[:, :CANDIDATES]
 
 
 def _keys(some: NDArray[np.int8], others: NDArray[np.int8], numbers: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(M, N) squared distance of two sketches, and the number of the second one: ordered by the one, then the other."""
+    """(M, N) sort keys: the squared distance of two sketches first, then the number of the second sketch."""
     a, b = some.astype(np.float32), others.astype(np.float32)
     distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)  # whole numbers below 2^22
     keys: NDArray[np.float64] = distances.astype(np.float64) * _NUMBERS + numbers
@@ -174,15 +174,15 @@ def _keys(some: NDArray[np.int8], others: NDArray[np.int8], numbers: NDArray[np.
 def _best(
     signatures: Signatures, part: slice, found: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Likeness and number of the most similar of the candidates (M, K) of some signatures; the first of equals."""
+    """Similarity and number of the most similar of the candidates (M, K) of each signature; the first one of equals."""
     found = np.sort(found, 1)
     numbers, places = np.unique(found, return_inverse=True)
     others = signatures[numbers.clip(0)].astype(np.float32)
     own = signatures[part].astype(np.float32)
-    likeness = np.full(found.shape, -1.0)
+    similarity = np.full(found.shape, -1.0)
     for column, place in enumerate(places.reshape(found.shape).T):
-        likeness[:, column] = np.einsum("nd,nd->n", own, others[place])
-    likeness[found < 0] = -1
-    best = likeness.argmax(1)
+        similarity[:, column] = np.einsum("nd,nd->n", own, others[place])
+    similarity[found < 0] = -1
+    best = similarity.argmax(1)
     rows = np.arange(len(found))
-    return likeness[rows, best].clip(0, 1), found[rows, best]
+    return similarity[rows, best].clip(0, 1), found[rows, best]

@@ -1,7 +1,7 @@
 """Rules about scores: ``confidence < 0.5``, ``duplicate > 0.99 and empty <= 0.3``.
 
-A rule is conditions joined by "and"; a condition is a score's name, one of < <= > >=, and a number. Several rules mean
-what any of them means.
+A rule joins conditions by "and"; a condition is a score's name, one of < <= > >=, and a number. Several rules together
+select every scan that at least one of them matches.
 """
 
 import operator
@@ -25,16 +25,19 @@ _CONDITION = re.compile(r"\s*(\w+)\s*([<>]=?)\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE]
 
 
 def matching(rule: str, scores: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-    """(N,) which scans a rule means.
+    """Select the scans that a rule matches.
 
     Args:
-        rule: see the module.
+        rule: a rule as described in the module.
         scores: {name: (N,)}, at least one.
 
+    Returns:
+        (N,) whether each scan matches.
+
     Raises:
-        ConfigError: on what is no rule, or a score that there is not.
+        ConfigError: on an invalid rule or an unknown score.
     """
-    means = np.ones(len(next(iter(scores.values()))), bool)
+    selected = np.ones(len(next(iter(scores.values()))), bool)
     for condition in re.split(r"\band\b", rule):
         match = _CONDITION.fullmatch(condition)
         if match is None:
@@ -42,5 +45,5 @@ def matching(rule: str, scores: Mapping[str, NDArray[np.float64]]) -> NDArray[np
         name, sign, number = match.groups()
         if name not in scores:
             raise ConfigError(f"score {name!r} in rule {rule!r}", f"one of {', '.join(scores)}")
-        means &= OPERATORS[sign](scores[name], float(number))
-    return means
+        selected &= OPERATORS[sign](scores[name], float(number))
+    return selected

@@ -1,7 +1,7 @@
-"""Scores of all scans of a bank, and the file that keeps them.
+"""Scores of all scans of a bank, and their file.
 
-The file is numpy's ``.npz``, nothing pickled: ``bank``, the identity of the bank that it belongs to, ``reference``,
-what the histograms were compared with ("" = the bank's own mean), ``twin``, and one array (N,) per score.
+The file is a numpy ``.npz`` without pickled objects: ``bank``, the identity of its bank; ``reference``, the scans that
+the histograms were compared with ("" = the bank's own mean); ``twin``; and one array (N,) per score.
 """
 
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lidar_synth.bake.curate.duplicates import most_alike
+from lidar_synth.bake.curate.duplicates import most_similar
 from lidar_synth.bake.curate.features import MEASURES, RANGE_BINS, features
 from lidar_synth.bake.curate.store import Store, measure
 from lidar_synth.bank import Bank
@@ -33,30 +33,30 @@ FILE = "scores.npz"
 """Name of the file, in the bank's folder."""
 
 FARTHEST = float(np.sqrt(np.log(2)))
-"""The Jensen-Shannon distance of what has nothing in common; also that of a scan without anything to compare."""
+"""The Jensen-Shannon distance of disjoint histograms; also used for a scan without returns or labels."""
 
 MEANINGS: dict[str, str] = {
-    "range": "Jensen-Shannon distance of the range histogram to the mean one, 0 to 0.83",
-    "labels": "Jensen-Shannon distance of the class histogram to the mean one, 0 to 0.83",
-    "duplicate": "likeness to the most similar earlier scan that is found, seen from above, 0 to 1",
+    "range": "Jensen-Shannon distance of the range histogram to the mean histogram, 0 to 0.83",
+    "labels": "Jensen-Shannon distance of the class histogram to the mean histogram, 0 to 0.83",
+    "duplicate": "similarity to the most similar earlier scan in bird's-eye view, 0 to 1",
 } | {name: measure.meaning for name, measure in MEASURES.items()}
-"""What each score says."""
+"""Description of each score."""
 
-_CHUNK = 16  # scans of a reference that a worker takes at a time
+_CHUNK = 16  # scans of a reference per task of a worker
 
 Histograms = tuple[NDArray[Any], NDArray[Any]]
-"""(RANGE_BINS,) by range and (19,) by class."""
+"""(RANGE_BINS,) histogram of ranges and (19,) histogram of classes."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Of all scans of a bank.
+    """The scores of all scans of a bank.
 
     Args:
-        bank: its identity.
-        reference: what the histograms were compared with; "" for the bank's own mean.
-        values: {name: (N,) float64}, of ``MEANINGS`` those that the bank's fields allow.
-        twin: (N,) number of the earlier scan that ``duplicate`` compares with, -1 for the first.
+        bank: identity of the bank.
+        reference: name of the scans that the histograms were compared with; "" for the bank's own mean.
+        values: {name: (N,) float64} for the names in ``MEANINGS`` that the bank's fields support.
+        twin: (N,) number of the most similar earlier scan, -1 for the first scan.
     """
 
     bank: str
@@ -74,21 +74,21 @@ def score(
     progress: bool = True,
     folder: Path | None = None,
 ) -> Scores:
-    """Score every scan of a bank. It takes 2.4 kB a scan on disk, and at most 400 bytes a scan in memory.
+    """Score every scan of a bank. It needs 2.4 kB per scan on disk and at most 400 bytes per scan in memory.
 
     Args:
-        bank: whose scans.
+        bank: the bank to score.
         reference: scans whose mean histograms to compare with, projected onto the bank's sensor; by default the
-            bank's own. Without labels there is no score ``labels``.
-        name: what to call the reference.
+            bank's own. Without labels the score ``labels`` is left out.
+        name: name of the reference.
         jobs: worker processes.
         progress: show bars.
-        folder: where the features are kept until they are of no more use; a run that was killed resumes with the same
-            folder. By default a temporary one.
+        folder: stores the features during the run; a killed run resumes with the same folder. By default a temporary
+            one.
 
     Raises:
         ConfigError: on fewer than one job, or an empty reference.
-        DataError, FileError: where a scan cannot be read, or the folder cannot be written.
+        DataError, FileError: if a scan cannot be read, or the folder cannot be written.
     """
     if jobs < 1 or (reference is not None and len(reference) == 0):
         raise ConfigError(f"{jobs} jobs, a reference of {name!r}", "at least one job, and one scan")
@@ -103,37 +103,37 @@ def score(
             values["labels"] = _distances(store, "classes", classes)
         numbers = np.concatenate([rows["numbers"] for rows in store.blocks()])
         values |= dict(zip(store.names, numbers.T.copy(), strict=True))
-        values["duplicate"], twin = most_alike(store, progress)
+        values["duplicate"], twin = most_similar(store, progress)
     return Scores(bank.identity, name, {n: values[n] for n in MEANINGS if n in values}, twin)
 
 
 def write_scores(path: Path, scores: Scores) -> None:
-    """The file; ``read_scores`` is the inverse.
+    """Write scores to their file; ``read_scores`` is the inverse.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     arrays = {"bank": np.array(scores.bank), "reference": np.array(scores.reference), "twin": scores.twin}
     write_arrays(path, arrays | scores.values)
 
 
 def read_scores(path: Path) -> Scores:
-    """Scores from their file.
+    """Read scores from their file.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is damaged or something else.
+        FileError: if it cannot be read.
+        DataError: if it is damaged or another kind of file.
     """
     arrays = read_arrays(path, most=1 << 32)
     values = {name: arrays[name] for name in MEANINGS if name in arrays}
     shapes = {array.shape for name, array in arrays.items() if name in MEANINGS or name == "twin"}
     if not {"bank", "reference", "twin", "range"} <= set(arrays) or len(shapes) != 1:
-        raise DataError(f"{path} holds {sorted(arrays)}", "the scores of a bank", "Remove it, and curate again.")
+        raise DataError(f"{path} holds {sorted(arrays)}", "the scores of a bank", "Remove it and curate again.")
     return Scores(str(arrays["bank"]), str(arrays["reference"]), values, arrays["twin"])
 
 
 class _Mean:
-    """The mean of normalised histograms, in which every scan that has one counts alike; 0 where none has."""
+    """The mean of normalised histograms with equal weights; empty histograms are ignored."""
 
     def __init__(self, bins: int) -> None:
         self._total, self._count = np.zeros(bins), 0
@@ -149,7 +149,7 @@ class _Mean:
 
 
 def _means(histograms: Iterable[Histograms]) -> Histograms:
-    """The mean histograms of ranges and of classes, by those of each scan."""
+    """The mean histograms of ranges and of classes over all scans."""
     ranges, classes = _Mean(RANGE_BINS), _Mean(len(NAMES))
     for of_ranges, of_classes in histograms:
         ranges.add(of_ranges)
@@ -169,7 +169,7 @@ def _of_source(source: Source, sensor: Sensor, number: int) -> Histograms:
 
 
 def _distances(store: Store, key: str, mean: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N,) from each scan's histogram to a mean one."""
+    """(N,) Jensen-Shannon distance of each scan's histogram to a mean histogram."""
     known = mean.any()
     found = (
         jensen_shannon_distance(row, mean) if known and row.any() else FARTHEST

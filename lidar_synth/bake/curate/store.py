@@ -1,7 +1,6 @@
-"""The features of a bank's scans on disk, so that no bank is too large for the memory.
+"""The features of a bank's scans on disk, so that the bank may be larger than the memory.
 
-A file holds ``BLOCK`` scans, 2.4 kB each, and is there whole or not at all: a run that was killed resumes behind the
-files that are there.
+A file holds ``BLOCK`` scans, 2.4 kB each, and is written atomically: a killed run resumes after the existing files.
 """
 
 import shutil
@@ -25,24 +24,24 @@ from lidar_synth.files.disk import write_file
 from lidar_synth.formats.convert import in_processes
 
 BLOCK = 4096
-"""Scans of a file."""
+"""Scans per file."""
 
 FOLDER = ".curate"
-"""In a bank's folder, while its scans are measured."""
+"""Folder with the features, in the bank's folder while it is being scored."""
 
-_UNIT = 64  # scans that a worker takes at a time
+_UNIT = 64  # scans per task of a worker
 
 
 class Store:
     """Rows of features, one for each scan of a bank.
 
     Args:
-        folder: of the files.
-        count: rows when all are there.
-        names: of the numbers that are measured.
+        folder: folder of the files.
+        count: number of rows in the complete store.
+        names: names of the measured numbers.
 
     Attributes:
-        dtype: of a row: ``ranges``, ``classes``, ``numbers`` and ``signature``, as in ``Features``.
+        dtype: type of a row: ``ranges``, ``classes``, ``numbers`` and ``signature``, as in ``Features``.
     """
 
     def __init__(self, folder: Path, count: int, names: tuple[str, ...]) -> None:
@@ -56,7 +55,7 @@ class Store:
         return self.count
 
     def __getitem__(self, rows: "slice | NDArray[np.int64]") -> NDArray[np.float16]:
-        """The signatures of some rows; nothing of them stays in memory."""
+        """The signatures of some rows, read from the files without caching."""
         numbers = np.arange(self.count)[rows] if isinstance(rows, slice) else rows
         found = np.empty((len(numbers), SIGNATURE), np.float16)
         for block in np.unique(numbers // BLOCK).tolist():
@@ -65,11 +64,11 @@ class Store:
         return found
 
     def read(self, block: int) -> NDArray[Any]:
-        """The rows of a file, mapped from the disk.
+        """The rows of a file, memory-mapped.
 
         Raises:
-            FileError: where it cannot be read.
-            DataError: where it holds something else.
+            FileError: if it cannot be read.
+            DataError: if it holds other data.
         """
         path = self._path(block)
         try:
@@ -83,19 +82,19 @@ class Store:
         return rows
 
     def blocks(self) -> Iterator[NDArray[Any]]:
-        """The rows of all files, one file after the other."""
+        """The rows of each file, in order."""
         return map(self.read, range(-(-self.count // BLOCK)))
 
     def write(self, block: int, rows: NDArray[Any]) -> None:
-        """Write a file.
+        """Write the rows of a file.
 
         Raises:
-            FileError: where it cannot be written.
+            FileError: if it cannot be written.
         """
         write_file(self._path(block), lambda file: np.save(file, rows, allow_pickle=False), durable=True)
 
-    def there(self) -> int:
-        """How many rows are there, from the first on."""
+    def stored(self) -> int:
+        """Number of rows in the existing files, up to the first missing or damaged one."""
         for block in range(-(-self.count // BLOCK)):
             try:
                 self.read(block)
@@ -108,14 +107,14 @@ class Store:
 
 
 def measure(bank: Bank, folder: Path, jobs: int, progress: bool) -> Store:
-    """The features of all scans of a bank; those that are in the folder are not measured again.
+    """Measure the features of all scans of a bank; existing files in the folder are reused.
 
     Raises:
-        DataError, FileError: where a scan cannot be read, or the folder cannot be written.
+        DataError, FileError: if a scan cannot be read, or the folder cannot be written.
     """
-    own = folder / f"{bank.identity[:16]}-{lidar_synth.__version__}"  # what another bank or version left is of no use
+    own = folder / f"{bank.identity[:16]}-{lidar_synth.__version__}"  # not reused by others
     store = Store(own, len(bank), measured(bank.fields))
-    start = store.there()
+    start = store.stored()
     spans = [range(a, min(a + _UNIT, len(bank))) for a in range(start, len(bank), _UNIT)]
     waiting: list[NDArray[Any]] = []
     with (
@@ -143,9 +142,9 @@ def _rows(bank: Bank, store: Store, span: range) -> NDArray[Any]:
 
 @contextmanager
 def kept_in(root: Path) -> Iterator[Path]:
-    """A folder in a bank's own for the features of its scans; it stays when the run is killed or fails."""
+    """A folder in the bank's folder for its features; removed at the end, kept if the run is killed or fails."""
     with shared(root / INDEX):
         yield root / FOLDER
-    with alone(root / INDEX) as nobody_else, suppress(OSError):
-        if nobody_else:
+    with alone(root / INDEX) as exclusive, suppress(OSError):
+        if exclusive:
             shutil.rmtree(root / FOLDER)

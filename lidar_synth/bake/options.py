@@ -1,0 +1,51 @@
+"""The settings of a bake. The options of ``lidar-synth bake`` are generated from the fields of ``BakeJob``.
+
+This module imports no heavy library, so that the command line starts at once.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Count = Annotated[int, Field(ge=1)]
+
+
+class BakeJob(BaseModel):
+    """Settings of a bake; unknown keys are refused. ``BakeJob.model_fields`` describes each of them.
+
+    Example:
+        >>> job = BakeJob(count=20_000, seed=1)
+        >>> job.shard_size
+        1024
+        >>> BakeJob.model_fields["first"].description
+        'index of the first scan'
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    model: str = Field("town", description="name of a shipped model, or a .safetensors checkpoint")
+    count: Count = Field(1000, description="number of scans")
+    seed: int = Field(0, ge=0, lt=2**64, description="scan i is a function of the model, the seed and i")
+    first: int = Field(0, ge=0, lt=2**62, description="index of the first scan")
+    shard_size: Count = Field(1024, description="scans per file")
+    steps: Count | None = Field(None, description="steps of a uniform time grid [the model's own time grid]")
+    solver: str = Field("euler", description="ODE solver: euler | heun")
+    condition: str | None = Field(
+        None, description="dataset with the labels or camera images that a conditional model needs"
+    )
+    condition_layout: str | None = Field(None, description="layout of that dataset [detected]")
+    condition_split: str | None = Field(None, description="split of that dataset, for instance r2flow/train")
+    guidance: float = Field(1.0, ge=0, le=100, description="scale of classifier-free guidance; 1 = no guidance")
+    fields: tuple[str, ...] | None = Field(
+        None, description="what to store beside the range: reflectance,label,confidence [all that the model generates]"
+    )
+    batch: Count | None = Field(None, description="scans per batch [1 on a CPU, 16 on a GPU]")
+    dtype: str = Field("float32", description="data type of the network's computation: float32 | bfloat16")
+    device: Literal["cpu", "cuda"] = Field("cpu", description="device of the network: cpu | cuda")
+    threads: int = Field(
+        1, ge=1, le=1024, description="CPU threads of each worker; with 1, every engine writes the same bytes"
+    )
+    compression: Literal["gzip", "blosc2"] = Field("gzip", description="compression of the shards: gzip | blosc2")
+    layout: Literal["plain", "paged"] = Field(
+        "plain", description="layout of the HDF5 files: plain | paged (for reading over a network)"
+    )

@@ -1,0 +1,60 @@
+"""Command-line options generated from the fields of a pydantic model."""
+
+import inspect
+from collections.abc import Callable
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import typer
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+
+def options_from(kind: type[BaseModel], after: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator that replaces a command's ``**values`` by one option for each field of a pydantic model.
+
+    An option that is not given is None, so that the command can tell it from one that is given. The help text is the
+    field's description and default; the model itself checks the values.
+
+    Args:
+        kind: the model; its fields need descriptions.
+        after: the parameter of the command that the options follow in the help.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        parameters = []
+        for parameter in inspect.signature(command).parameters.values():
+            if parameter.kind is not inspect.Parameter.VAR_KEYWORD:
+                parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+            if parameter.name == after:
+                parameters += [_option(name, field) for name, field in kind.model_fields.items()]
+        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        return command
+
+    return decorate
+
+
+def _option(name: str, field: FieldInfo) -> inspect.Parameter:
+    """One field as a parameter that typer reads."""
+    text = f"{field.description}" + ("" if field.default is None else f" [{field.default}]")
+    base = _base_type(field.annotation)
+    annotation: Any
+    if base is tuple:
+        annotation = Annotated[Any, typer.Option(help=text, parser=_names, metavar="NAME,...")]
+    else:
+        annotation = Annotated[base | None, typer.Option(help=text)]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+
+def _base_type(annotation: Any) -> Any:
+    """int, float, str or tuple: what an annotation is without None, constraints and the list of its literals."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin in (Union, UnionType):
+        return _base_type(next(argument for argument in arguments if argument is not NoneType))
+    if origin is Annotated:
+        return _base_type(arguments[0])
+    return str if origin is Literal else origin or annotation
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(filter(None, text.split(",")))
