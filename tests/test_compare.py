@@ -115,7 +115,7 @@ def test_another_form_is_refused(case: str) -> None:
 @pytest.mark.parametrize(("theirs", "ours"), [(-1, 255), (255, -1), (255, 254), (-100, 255)])
 def test_another_value_for_ignored_labels_is_refused(name: str, theirs: int, ours: int) -> None:
     with pytest.raises(
-        ConfigError, match=f"holds {ours}, and none of the real ones does .*one value for ignored labels"
+        ConfigError, match=f"holds {ours}, which no real sample does .*one value for ignored labels"
     ):
         MixedScans.wrap(Theirs(FORMS[name], theirs), Endless(), 0.5, to_sample=as_sample(FORMS[name], ours))
 

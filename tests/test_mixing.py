@@ -225,7 +225,7 @@ def test_a_batch_without_a_valid_label_is_refused() -> None:
         train = MixedScans(Scans("r", 1), Endless(), 1, epoch_size=2, **options)
         return next(iter(loader(train, 0, batch_size=2)))
 
-    message = r"without one valid label or box \(scans .*'s0'.*balanced=True.*unlabelled='allow'"
+    message = r"without any valid label or box \(scans .*'s0'.*balanced=True.*unlabelled='allow'"
     with pytest.raises(DataError, match=message):
         synthetic_only(labels="ignore")
     assert (synthetic_only(labels="ignore", unlabelled="allow")["label"] == IGNORE).all()

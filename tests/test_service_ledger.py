@@ -121,10 +121,10 @@ def test_a_scan_that_is_read_stays_until_it_is_given_back() -> None:
 
 def test_a_scan_that_somebody_waits_for_is_not_given_up() -> None:
     ledger = Ledger(1, np.zeros(4, np.int64))
-    ledger._asked += [5, 6]  # as two readers leave it that have not woken up yet
+    ledger._awaited += [5, 6]  # as two readers leave it that have not woken up yet
     assert claimed(ledger) == [5]
     assert ledger._room(-1) is None
-    ledger._asked.remove(5)
+    ledger._awaited.remove(5)
     assert claimed(ledger) == [6]
 
 
