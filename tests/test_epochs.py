@@ -279,6 +279,6 @@ def test_batches_that_are_shared_twice_are_noticed_at_the_next_pass(
         list(loader)
         train.set_epoch(1)
         list(loader)
-        expected = ["of 26 samples that rank 0 of 2"] if shared and ranks == 2 else []
+        expected = ["of 26 samples for rank 0 of 2,"] if shared and ranks == 2 else []
         assert [str(w.message)[:30] for w in caught if "library" in str(w.message)] == expected
         caught.clear()

@@ -169,7 +169,7 @@ def wrong_labels() -> Any:
         (lambda: mixed().batches(2).load_state_dict({"seed": 1, "epoch": 0, "position": 0}), ConfigError,
          r"seed 1 for a mixture of seed 0"),
         (lambda: MixedScans(Scans("r", 2), Endless(("reflectance",))), ConfigError,
-         r"carry \['reflectance'\].*'ignore'"),
+         r"only have \['reflectance'\].*'ignore'"),
         (lambda: MixedScans(Scans("r", 2, load_sensor("os1_128")), Endless()), ConfigError,
          r"'os1_128' \(128 x 1024.*'small' \(8 x 32.*sensor=generator.sensor"),
         (lambda: MixedScans(Sources(Scans("r", 2), other_classes()), Endless()), ConfigError,
