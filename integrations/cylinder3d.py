@@ -38,7 +38,7 @@ def register() -> Any:
     """Register ``SemKITTI_mixed`` with Cylinder3D and return the class.
 
     Raises:
-        LibraryError: where Cylinder3D is not on the path.
+        LibraryError: if Cylinder3D is not on the path.
     """
     try:
         from dataloader.pc_dataset import SemKITTI_sk, register_dataset

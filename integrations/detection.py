@@ -39,7 +39,7 @@ def ground_plane(scan: Scan) -> NDArray[np.float64]:
     those that miss it by more than 0.3 m.
 
     Raises:
-        DataError: where there is no ground.
+        DataError: if there is no ground.
     """
     near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < NEAR
     points = scan.points[near].astype(np.float64)
@@ -69,7 +69,7 @@ def check_names(scan: Scan, classes: Collection[str]) -> None:
     """Boxes of which a trainer knows none would be left out one by one, and nobody would notice.
 
     Raises:
-        DataError: where there are boxes, and none is of these classes.
+        DataError: if there are boxes, and none is of these classes.
     """
     if scan.boxes is not None and len(scan.boxes) and not set(scan.boxes.names) & set(classes):
         raise DataError(
@@ -89,7 +89,7 @@ def in_view(scan: Scan, camera: Calibration) -> Scan:
     """What a camera sees of a scan: the points in its picture, and the boxes whose centre is.
 
     Raises:
-        DataError: where the camera's image size is not known.
+        DataError: if the camera's image size is not known.
     """
     size = camera.image_size
     if size is None:
@@ -142,7 +142,7 @@ def write_gt_database(
         The list's file.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     root, found, level = Path(root), dict[str, list[dict[str, Any]]](), difficulty(objects.boxes)
     for i, name in enumerate(objects.boxes.names):

@@ -52,7 +52,7 @@ def export_mixture(
     Raises:
         ConfigError: on another layout, or a mixture whose samples are no scans.
         DataError: on a scan without labels (``"semantic_kitti"``) or boxes (``"kitti"``).
-        FileError: where the folder cannot be written.
+        FileError: if the folder cannot be written.
     """
     if layout not in ("semantic_kitti", "kitti"):
         raise ConfigError(f"layout {layout!r}", "'semantic_kitti' or 'kitti'")
@@ -87,7 +87,7 @@ def write_planes(root: str | Path, split: str = "trainval") -> int:
 
     Raises:
         DataError: on a scan without ground or calibration.
-        FileError: where they cannot be written.
+        FileError: if they cannot be written.
     """
     scans, written = KITTIObject(root, split), 0
     for number, name in enumerate(tqdm(scans.ids, "fitting planes", unit="scan", leave=False, disable=None)):

@@ -39,7 +39,7 @@ def open_synthetic(where: Any) -> Any:
             in any layout that ``open_scans`` reads; or a source as it is.
 
     Raises:
-        ConfigError, FileError, DataError: where there is none.
+        ConfigError, FileError, DataError: if there is none.
     """
     if not isinstance(where, str | Path):
         return where
@@ -59,8 +59,8 @@ def read_settings(given: Any = None) -> dict[str, Any]:
         given: them, or a YAML file; without, the file that the environment's ``LIDAR_SYNTH_MIX`` names.
 
     Raises:
-        ConfigError: where there are none.
-        FileError, DataError: where the file cannot be read.
+        ConfigError: if there are none.
+        FileError, DataError: if the file cannot be read.
     """
     source = given if given is not None else os.environ.get(VARIABLE)
     if isinstance(source, str | Path):
@@ -150,7 +150,7 @@ def require_ids(learning_map: Mapping[int, int], table: NDArray[Any]) -> None:
         table: (256,) a trainer's id by train id, see ``id_table``.
 
     Raises:
-        ConfigError: where a class, or what is unlabelled, becomes another one.
+        ConfigError: if a class, or what is unlabelled, becomes another one.
     """
     classes = [*enumerate(SEMANTIC_KITTI.from_train or ()), (IGNORE, 0)]
     wrong = [(raw, learning_map.get(raw), int(table[i])) for i, raw in classes if learning_map.get(raw) != table[i]]

@@ -109,7 +109,7 @@ class SynthEpochHook(Hook):  # type: ignore[misc]
         """Check what will be trained on.
 
         Raises:
-            ConfigError: where no dataset is a mixed list, or the classes are not SemanticKITTI's.
+            ConfigError: if no dataset is a mixed list, or the classes are not SemanticKITTI's.
         """
         self._folders = [folder for _, folder in _mixed(runner.train_dataloader.dataset)]
         if not self._folders:

@@ -221,7 +221,7 @@ def require_boxes(scan: Scan) -> Boxes:
     """The boxes of a synthetic scan, for a detector.
 
     Raises:
-        DataError: where it has none, not even an empty list of them.
+        DataError: if it has none, not even an empty list of them.
     """
     if scan.boxes is None:
         raise DataError(

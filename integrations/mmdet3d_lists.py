@@ -23,7 +23,7 @@ def semantic_kitti_list(root: str | Path, out: str | Path, split: str = "train")
     """The list of a SemanticKITTI folder; its paths are relative to ``root``.
 
     Raises:
-        DataError, FileError: where the scans cannot be found, or the list cannot be written.
+        DataError, FileError: if the scans cannot be found, or the list cannot be written.
     """
     scans = SemanticKITTI(root, split)
     entries = []
@@ -47,7 +47,7 @@ def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: 
         points: folder of the points.
 
     Raises:
-        DataError, FileError: where a scan, its boxes or its calibration cannot be read, or the list not be written.
+        DataError, FileError: if a scan, its boxes or its calibration cannot be read, or the list not be written.
     """
     scans, entries = KITTIObject(root, split), []
     for number in range(len(scans)):

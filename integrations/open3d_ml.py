@@ -38,7 +38,7 @@ def dataset_class(package: str = "open3d.ml.datasets") -> Any:
         package: where its datasets are: in Open3D, or ``"ml3d.datasets"`` in a checkout of Open3D-ML.
 
     Raises:
-        LibraryError: where it cannot be imported.
+        LibraryError: if it cannot be imported.
     """
     try:
         stock = import_module(f"{package}.semantickitti")
@@ -122,7 +122,7 @@ def tell_epochs(pipeline: str = "open3d.ml.torch.pipelines") -> None:
         pipeline: where its pipelines are; ``"ml3d.torch.pipelines"`` in a checkout.
 
     Raises:
-        LibraryError: where they cannot be imported.
+        LibraryError: if they cannot be imported.
     """
     try:
         module = import_module(f"{pipeline}.semantic_segmentation")

@@ -41,7 +41,7 @@ def dataset_class() -> Any:
     """A subclass of the trainer's ``SemanticKitti`` whose scans are real and synthetic.
 
     Raises:
-        LibraryError: where the trainer's own parser cannot be imported.
+        LibraryError: if the trainer's own parser cannot be imported.
     """
     try:
         stock = import_module(STOCK)
@@ -153,7 +153,7 @@ def write_parser(settings: str | Path, folder: str | Path) -> Path:
     """A folder with the ``parser.py`` that the trainers load by name.
 
     Raises:
-        ConfigError, FileError: where the settings cannot be read, or the folder not be written.
+        ConfigError, FileError: if the settings cannot be read, or the folder not be written.
     """
     read_settings(settings)
     path = Path(folder) / "parser.py"

@@ -36,7 +36,7 @@ DRIVE = "data_poses/2013_05_28_drive_0000_sync/poses.txt"
         ("semantic_kitti", "sequences/00/poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0 " * 2, "rows of 12 numbers"),
         ("semantic_kitti", "sequences/00/calib.txt", f"P2: {'1 ' * 12}\nTr: {'1 ' * 12}", "not rigid"),
         ("kitti360", DRIVE, "7 " + "nan " * 12, "not rigid"),
-        ("kitti360", DRIVE, "7.5 1 0 0 0 0 1 0 0 0 0 1 0", "frames that are no numbers of one"),
+        ("kitti360", DRIVE, "7.5 1 0 0 0 0 1 0 0 0 0 1 0", "invalid or repeated frame numbers"),
         ("kitti360", DRIVE, "7 1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "or some twice"),
         ("kitti360", "calibration/calib_cam_to_pose.txt", "image_00: " + "1 " * 11, "'image_00': 11"),
         ("kitti360", "calibration/calib_cam_to_velo.txt", "1 0 0 0 0 1 0 0 0 0 0 0", "cam_to_velo: .*not rigid"),
@@ -168,7 +168,7 @@ def test_arrays_that_are_no_scan(tmp_path: Path) -> None:
         with pytest.raises(DataError, match=f"scan.npz.*{message}"):
             open_scans(path)[0]
     np.savez(path, **{name: values for name, values in good.items() if name != "sensor"})
-    with pytest.raises(DataError, match="does not tell its sensor"):
+    with pytest.raises(DataError, match="it has no sensor"):
         open_scans(path)[0]
     assert len(open_scans(path, sensor="hdl64e_kitti")[0]) == len(scan)
     np.savez(path, points=np.array([{"a": 1}], object))

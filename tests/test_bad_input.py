@@ -124,9 +124,9 @@ def test_a_label_file_that_is_missing(tmp_path: Path) -> None:
         (cut, "a multiple of 20: 5 float32"),
         (lambda p: spoil(p, np.nan), "NaN or infinite"),
         (lambda p: spoil(p, 300.0, 3), r"runs from .* to 300; expected values in \[0, 255\]"),
-        (lambda p: spoil(p, 3.5, 4), "is no ring"),
+        (lambda p: spoil(p, 3.5, 4), "is not a ring"),
         (lambda p: np.zeros((400, 5), "<f4").tofile(p), "all 400 points are nearer than 1 m"),
-        (lambda p: np.random.default_rng(0).random((400, 4), "f4").tofile(p), "is no ring"),
+        (lambda p: np.random.default_rng(0).random((400, 4), "f4").tofile(p), "is not a ring"),
     ],
     ids=["cut", "nan", "intensity", "ring", "zeros", "four floats"],
 )
@@ -324,7 +324,7 @@ def test_a_tar_member_larger_than_any_file(tmp_path: Path) -> None:
     content[148:156] = b"%06o\x00 " % sum(content[:512])
     path.write_bytes(content)
     with pytest.raises(
-        DataError, match=rf"{path.name} is cut, damaged or no tar file \(a member of 9223372036854775807"
+        DataError, match=rf"{path.name} is truncated, damaged or not a tar file \(a member of 9223372036854775807"
     ):
         open_scans(path)
 

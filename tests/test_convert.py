@@ -260,7 +260,7 @@ def test_scans_that_get_other_numbers_do_not_get_side_files_of_others(tmp_path: 
     given.rename(given.with_name("seven"))
     report = convert(open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
     assert report.left_out == [
-        "the calibration, poses and times of sequence seven: its scans get other numbers",
+        "calibration, poses and times of sequence seven: its scans are renumbered",
     ]
     assert not (tmp_path / "out" / "sequences" / "00" / "times.txt").exists()
     assert np.allclose(open_scans(tmp_path / "out")[1].pose, open_scans(tmp_path / "in")[1].pose)

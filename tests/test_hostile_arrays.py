@@ -175,5 +175,5 @@ def test_a_range_that_is_none_is_not_dropped(tmp_path: Path, value: float) -> No
     changed(path, range=distance)
     np.save(tmp_path / "alone.npy", distance)
     for file in (path, tmp_path / "alone.npy"):
-        with pytest.raises(DataError, match="1 cells whose range is negative or no number"):
+        with pytest.raises(DataError, match="1 cells whose range is negative or not finite"):
             open_scans(file)[0]

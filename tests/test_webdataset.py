@@ -183,9 +183,9 @@ def test_damaged_and_missing_files(tmp_path: Path) -> None:
     content = path.read_bytes()
     for length in (100, 700, len(content) // 2):
         path.write_bytes(content[:length])
-        with pytest.raises(DataError, match="scans-000001.tar is cut, damaged or no tar file"):
+        with pytest.raises(DataError, match="scans-000001.tar is truncated, damaged or not a tar file"):
             open_scans(tmp_path)
-        with pytest.raises(DataError, match="scans-000001.tar is cut, damaged or no tar file"):
+        with pytest.raises(DataError, match="scans-000001.tar is truncated, damaged or not a tar file"):
             convert([some_scan()], WebDatasetWriter(tmp_path), progress=False)
     path.write_bytes(content)
     scans = open_scans(tmp_path)

@@ -148,7 +148,7 @@ class Bank:
 
 
 def is_bank(path: str | Path) -> bool:
-    """Whether a folder holds a bank, or what is left of one."""
+    """Whether a folder holds a bank, complete or not."""
     return (Path(path) / INDEX).is_file() or any(Path(path).glob("shard-*.h5"))
 
 

@@ -59,7 +59,7 @@ def seen_by_model_of(path: Path) -> Recordings | None:
         path: a folder of ``lidar-synth sample``, or a bank.
 
     Raises:
-        FileError, DataError: where what stands beside them is damaged.
+        FileError, DataError: if what stands beside them is damaged.
     """
     if (path / NOTE).is_file():
         note = json.loads(read_text(path / NOTE))
@@ -79,7 +79,7 @@ def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recording
         path: where it is, as it was typed; stands for scans that no dataset is known of.
 
     Raises:
-        FileError, DataError: where the settings of an exported town are damaged.
+        FileError, DataError: if the settings of an exported town are damaged.
     """
     settings = Path(os.path.expandvars(path)) / SETTINGS
     if settings.is_file():  # in the layout of a dataset, with names like its own

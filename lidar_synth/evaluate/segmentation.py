@@ -120,7 +120,7 @@ class Judge:
         """Write it beside ``path``, then rename.
 
         Raises:
-            FileError: where it cannot be written.
+            FileError: if it cannot be written.
         """
         header = {"format": FORMAT, "sensor": self.sensor.to_dict(), "provenance": dict(self.provenance)}
         state = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
@@ -131,7 +131,7 @@ def load_judge(path: Path | None = None) -> Judge:
     """A saved segmenter, by default the one that comes with the package.
 
     Raises:
-        FileError: where it cannot be read.
+        FileError: if it cannot be read.
         DataError: on a file that is none, or of another version.
     """
     path = path or Path(str(files("lidar_synth.evaluate"))) / "segmenter.safetensors"

@@ -51,7 +51,7 @@ def write_file(
         overwrite: replace a file that is there; otherwise the first of several processes wins.
 
     Raises:
-        FileError: where the target cannot be written or the disk is full.
+        FileError: if the target cannot be written or the disk is full.
     """
     part = part_of(path)
     try:
@@ -98,8 +98,8 @@ def read_file(path: Path, expected: str = "a file of the dataset", at_most: int 
         at_most: bytes; a longer file is refused unread.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is longer.
+        FileError: if it cannot be read.
+        DataError: if it is longer.
     """
     try:
         with path.open("rb") as file:
@@ -115,7 +115,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
     """Write an ``.npz``, the same by every version of numpy; nothing is pickled.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
         DataError: on an array of Python objects.
     """
     values = {name: np.asanyarray(array) for name, array in arrays.items()}
@@ -129,7 +129,7 @@ def sha256(path: Path) -> str:
     """Of a file's bytes, in hexadecimal.
 
     Raises:
-        OSError: where it cannot be read.
+        OSError: if it cannot be read.
     """
     digest = hashlib.sha256()
     with path.open("rb") as file:
@@ -199,7 +199,7 @@ def list_files(folder: Path, *suffixes: str) -> list[Path]:
     """The files of a folder with one of the suffixes, by name; hidden ones (half-written) are left out.
 
     Raises:
-        FileError: where the folder cannot be read.
+        FileError: if the folder cannot be read.
     """
     try:
         names = sorted(e.name for e in os.scandir(folder) if e.name.endswith(suffixes) and e.name[0] != ".")
@@ -212,8 +212,8 @@ def read_values(path: Path, dtype: str) -> NDArray[Any]:
     """(N,) values of one type from a raw file.
 
     Raises:
-        FileError: where the file cannot be read.
-        DataError: where its size is not a whole number of values.
+        FileError: if the file cannot be read.
+        DataError: if its size is not a whole number of values.
     """
     content = read_file(path)
     width = np.dtype(dtype).itemsize
@@ -226,8 +226,8 @@ def read_text(path: Path, expected: str = "a file of the dataset", at_most: int 
     """The text of a file; the arguments are those of ``read_file``.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is no text, or longer.
+        FileError: if it cannot be read.
+        DataError: if it is no text, or longer.
     """
     try:
         return read_file(path, expected, at_most).decode()
@@ -239,7 +239,7 @@ def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
     """(N, columns) numbers of a text file, one row per line.
 
     Raises:
-        FileError: where it cannot be read.
+        FileError: if it cannot be read.
         DataError: on a line with something else.
     """
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
@@ -266,7 +266,7 @@ def read_named_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
     Lines whose values are not all numbers (dates) are left out.
 
     Raises:
-        FileError: where it cannot be read.
+        FileError: if it cannot be read.
     """
     matrices = {}
     for line in read_text(path).splitlines():
@@ -282,7 +282,7 @@ def write_named_matrices(path: Path, matrices: Mapping[str, NDArray[np.float64]]
     """The inverse of ``read_named_matrices``, with KITTI's 12 decimals.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     lines = [f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(m))}\n" for name, m in matrices.items()]
     write_file(path, "".join(lines).encode())

@@ -64,8 +64,8 @@ def read_yaml(path: Path, expected: str) -> Any:
         expected: what it should be, for the error.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is too long, or not UTF-8.
+        FileError: if it cannot be read.
+        DataError: if it is too long, or not UTF-8.
         ConfigError: as ``parse_yaml``.
     """
     return parse_yaml(read_text(path, expected, LONGEST_YAML), str(path))
@@ -126,8 +126,8 @@ def read_arrays(path: Path, only: Collection[str] | None = None, most: int = MOS
         most: bytes that may come out of a compressed file.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is no such file, is damaged, declares more than it holds or than ``most``, or holds
+        FileError: if it cannot be read.
+        DataError: if it is no such file, is damaged, declares more than it holds or than ``most``, or holds
             something else than numbers and text.
     """
     content = read_file(path)
@@ -187,7 +187,7 @@ def parse_npy(content: bytes, where: str) -> NDArray[Any]:
     """The array of an ``.npy`` file (https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html).
 
     Raises:
-        DataError: where it is none, holds fewer or more bytes than its header says, or something else than numbers
+        DataError: if it is none, holds fewer or more bytes than its header says, or something else than numbers
             and text.
     """
     width = {1: 2, 2: 4, 3: 4}.get(content[6], 0) if len(content) > 10 and content[:6] == b"\x93NUMPY" else 0
@@ -224,8 +224,8 @@ def read_picture(path: Path, expected: str = "a PNG or JPEG file") -> "Image":
     """A picture, decoded.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is none, is damaged, or has more than ``MOST_PIXELS``.
+        FileError: if it cannot be read.
+        DataError: if it is none, is damaged, or has more than ``MOST_PIXELS``.
     """
     from PIL import Image
 

@@ -60,7 +60,7 @@ class View:
         _close_gaps(self._front, self._height)
 
     def add(self, placed: Object, least: int) -> bool:
-        """Add an object to the view, and return True; if fewer than ``least`` returns are visible, only return False."""
+        """Add an object to the view, or return False if fewer than ``least`` of its returns are visible."""
         cell, distance, shown = locate(placed.scan.points, self.sensor)
         nearest = shown[shown >= 0]
         row, column = np.divmod(cell[nearest], self.sensor.columns)
