@@ -37,7 +37,7 @@ DRIVE = "data_poses/2013_05_28_drive_0000_sync/poses.txt"
         ("semantic_kitti", "sequences/00/calib.txt", f"P2: {'1 ' * 12}\nTr: {'1 ' * 12}", "not rigid"),
         ("kitti360", DRIVE, "7 " + "nan " * 12, "not rigid"),
         ("kitti360", DRIVE, "7.5 1 0 0 0 0 1 0 0 0 0 1 0", "invalid or repeated frame numbers"),
-        ("kitti360", DRIVE, "7 1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "or some twice"),
+        ("kitti360", DRIVE, "7 1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "invalid or repeated frame numbers"),
         ("kitti360", "calibration/calib_cam_to_pose.txt", "image_00: " + "1 " * 11, "'image_00': 11"),
         ("kitti360", "calibration/calib_cam_to_velo.txt", "1 0 0 0 0 1 0 0 0 0 0 0", "cam_to_velo: .*not rigid"),
     ],

@@ -247,7 +247,7 @@ def test_a_distributed_sampler_sees_every_sample(shuffle: bool) -> None:
 
 def test_a_long_plan_starts_at_once() -> None:
     """No list of all positions, steps or scans is made on the way to the first batch."""
-    train = MixedScans.wrap(range(75_000_000), Endless(), 0.25, to_sample=name)
+    train = MixedScans.wrap(range(75_000_000), Endless(), 0.25, to_sample=name, compare=False)
     assert len(train) == 10**8
     loader = DataLoader(train, batch_sampler=train.batches(8), collate_fn=list)
     assert len(loader) == 10**8 // 8

@@ -165,8 +165,8 @@ def damaged(path: Path, **members: bytes | None) -> None:
         ({"json": b"{"}, "JSONDecodeError"),
         ({"json": b"{}"}, "KeyError.*names"),
         ({"points_npy": None}, "KeyError.*points"),
-        ({"points_npy": b"no"}, "points.npy has no header of numpy's"),
-        ({"label_npy": b"\x93NUMPY"}, "label.npy has no header of numpy's"),
+        ({"points_npy": b"no"}, "points.npy has no header of an .npy file"),
+        ({"label_npy": b"\x93NUMPY"}, "label.npy has no header of an .npy file"),
     ],
 )
 def test_damaged_members_are_named_and_skipped(tmp_path: Path, members: dict[str, bytes | None], message: str) -> None:
