@@ -76,7 +76,7 @@ def test_a_changed_value_is_refused_by_the_name_of_its_file(
         list(open_scans(tmp_path, layout=layout))
 
 
-def test_a_picture_of_no_size_is_no_picture(tmp_path: Path) -> None:
+def test_an_image_of_size_zero_is_refused(tmp_path: Path) -> None:
     """A camera's size comes from its picture's header, and a black picture of that size is written where none is."""
     write_all("kitti_object", tmp_path, [some_scan()])
     path = tmp_path / "training" / "image_2" / "000000.png"
@@ -105,7 +105,7 @@ def test_names_of_frames_stay_in_their_folder(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("to", ["npz", "range", "webdataset"])
-def test_values_of_a_scan_that_none_has(tmp_path: Path, to: str, name: str, value: Any, message: str) -> None:
+def test_impossible_values_of_a_scan_are_refused(tmp_path: Path, to: str, name: str, value: Any, message: str) -> None:
     scan = some_scan()
     scan.confidence = np.ones(len(scan), np.float32)
     if name == "pose":
@@ -118,7 +118,7 @@ def test_values_of_a_scan_that_none_has(tmp_path: Path, to: str, name: str, valu
 
 
 @pytest.mark.parametrize("name", ["truncation", "image_box", "alpha", "dont_care"])
-def test_boxes_with_values_that_are_no_numbers(name: str) -> None:
+def test_boxes_with_invalid_numbers_are_refused(name: str) -> None:
     with pytest.raises(DataError, match="non-finite"):
         Boxes(np.ones((1, 7)), ("Car",), **{name: np.full((1, 4) if "_" in name else 1, np.nan)})
 
@@ -151,7 +151,7 @@ def test_damaged_files_with_a_header(tmp_path: Path, kind: str) -> None:
             open_scans(path)[0]
 
 
-def test_arrays_that_are_no_scan(tmp_path: Path) -> None:
+def test_arrays_that_are_not_scans_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "scan.npz"
     scan = some_scan()
     write_all("npz", tmp_path, [scan])

@@ -178,7 +178,9 @@ def test_a_path_in_no_known_layout(tmp_path: Path) -> None:
 def test_wrong_splits(tmp_path: Path) -> None:
     for layout in ("kitti360", "semantic_kitti", "kitti_object", "kitti_raw"):
         MAKERS[layout](tmp_path / layout)
-    with pytest.raises(ConfigError, match=r"KITTI-360 split 'train'; expected one of 'r2flow/train', .*whose split"):
+    with pytest.raises(
+        ConfigError, match=r"KITTI-360 split 'train'; expected one of 'r2flow/train', .*full name of a split"
+    ):
         open_scans(tmp_path / "kitti360", split="train")
     with pytest.raises(ConfigError, match="SemanticKITTI split 'valid'; expected one of 'train', 'val', 'test', 'all'"):
         open_scans(tmp_path / "semantic_kitti", split="valid")
@@ -262,7 +264,7 @@ def test_a_disk_that_is_full_leaves_no_half_scan(tmp_path: Path, to: str) -> Non
         ("png", "label"),
     ],
 )
-def test_a_scan_is_whole_only_when_all_its_files_are(tmp_path: Path, to: str, blocked: str) -> None:
+def test_a_scan_is_complete_only_with_all_its_files(tmp_path: Path, to: str, blocked: str) -> None:
     (tmp_path / blocked).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / blocked).write_text("in the way")
     writer = WRITERS[to](tmp_path)
@@ -271,7 +273,7 @@ def test_a_scan_is_whole_only_when_all_its_files_are(tmp_path: Path, to: str, bl
     assert not writer.complete(0)
 
 
-def test_a_failure_keeps_what_was_there(tmp_path: Path) -> None:
+def test_a_failed_write_keeps_the_existing_file(tmp_path: Path) -> None:
     path = tmp_path / "file"
     write_file(path, b"before")
 
@@ -288,7 +290,7 @@ def test_a_failure_keeps_what_was_there(tmp_path: Path) -> None:
     assert path.read_bytes() == b"after" and (tmp_path / "reader").read_bytes() == b"before"
 
 
-def test_a_half_written_file_is_read_by_nobody(tmp_path: Path) -> None:
+def test_partial_files_are_never_read(tmp_path: Path) -> None:
     """What a killed writer leaves is hidden from every reader."""
     for layout in ("folder", "kitti360", "semantic_kitti", "kitti_object"):
         path = MAKERS[layout](tmp_path / layout)[0]
@@ -332,5 +334,5 @@ def test_a_tar_member_larger_than_any_file(tmp_path: Path) -> None:
 def test_a_cloud_with_two_widths(tmp_path: Path) -> None:
     [path] = write_all("pcd", tmp_path, [some_scan()])
     path.write_bytes(path.read_bytes().replace(b"HEIGHT 1\n", b"HEIGHT 1 1\n"))
-    with pytest.raises(DataError, match=r"one each of WIDTH, HEIGHT, POINTS"):
+    with pytest.raises(DataError, match=r"one each for WIDTH, HEIGHT and POINTS"):
         open_scans(path)[0]

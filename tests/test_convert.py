@@ -50,7 +50,7 @@ def test_every_layout_becomes_every_format(tmp_path: Path, layout: str, to: str)
         np.testing.assert_allclose(scan.reflectance, expected.reflectance, atol=atol)
 
 
-def test_a_rerun_does_only_what_is_missing(tmp_path: Path) -> None:
+def test_a_rerun_writes_only_missing_scans(tmp_path: Path) -> None:
     MAKERS["kitti360"](tmp_path / "in")
     read: list[int] = []
 
@@ -69,7 +69,7 @@ def test_a_rerun_does_only_what_is_missing(tmp_path: Path) -> None:
     assert read == [0, 1, 2, 1] and files(tmp_path / "out") == whole
 
 
-def test_an_interrupted_run_goes_on_to_the_same_files(tmp_path: Path) -> None:
+def test_a_resumed_run_writes_the_same_files(tmp_path: Path) -> None:
     """Interrupted before the folder's own files are written; the next run has to write all frames' poses and boxes."""
     MAKERS["kitti360"](tmp_path / "in")
     source = open_scans(tmp_path / "in")
@@ -161,7 +161,7 @@ def test_a_full_target_stops_the_run_whatever_the_policy(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", presets())
-def test_another_sensor_sees_the_same_scan(tmp_path: Path, name: str) -> None:
+def test_conversion_to_another_sensor(tmp_path: Path, name: str) -> None:
     scan, sensor = some_scan(count=5000), load_sensor(name)
     convert([scan], WRITERS["npz"](tmp_path), as_sensor=sensor, progress=False)
     read = open_scans(tmp_path)[0]
@@ -208,7 +208,9 @@ def test_the_command_prints_what_it_skipped_and_why(dataset: Path, tmp_path: Pat
         (["--to", "kitti", "--on-bad", "ignore"], "on_bad='ignore'"),
     ],
 )
-def test_a_wrong_call_says_what_is_right(dataset: Path, tmp_path: Path, options: list[str], error: str) -> None:
+def test_the_error_of_a_wrong_call_names_the_right_one(
+    dataset: Path, tmp_path: Path, options: list[str], error: str
+) -> None:
     result = CliRunner().invoke(app, [str(dataset), str(tmp_path / "out"), *options])
     assert isinstance(result.exception, ConfigError) and error in str(result.exception)
     assert not (tmp_path / "out").exists()
@@ -266,7 +268,7 @@ def test_scans_that_get_other_numbers_do_not_get_side_files_of_others(tmp_path: 
     assert np.allclose(open_scans(tmp_path / "out")[1].pose, open_scans(tmp_path / "in")[1].pose)
 
 
-def test_the_command_says_what_was_left_out(tmp_path: Path) -> None:
+def test_the_command_reports_what_was_left_out(tmp_path: Path) -> None:
     a_sequence(tmp_path / "in", times=False)
     result = CliRunner().invoke(app, [str(tmp_path / "in"), str(tmp_path / "out"), "--to", "semantic_kitti"])
     assert result.exit_code == 0 and f"left out sequences/07/times.txt: {tmp_path / 'in'} has none" in result.output

@@ -30,7 +30,7 @@ def rings_of(seed: int) -> Scan:
     return replace(scan[np.lexsort((azimuth, row))], sensor=sensor)
 
 
-def test_unfolding_is_offered(tmp_path: Path) -> None:
+def test_conversion_unfolds_scans(tmp_path: Path) -> None:
     scans = [rings_of(i) for i in range(3)]
     write_all("kitti", tmp_path / "in", scans)
     options = [str(tmp_path / "in"), str(tmp_path / "out"), "--to", "range", "--unfold"]
@@ -129,7 +129,7 @@ def test_suffixes_in_capitals(tmp_path: Path, to: str) -> None:
 
 
 @pytest.mark.parametrize("to", ["kitti", "semantic_kitti", "kitti360", "range", "npz"])
-def test_what_was_made_stays_synthetic_from_format_to_format(tmp_path: Path, to: str) -> None:
+def test_synthetic_scans_stay_synthetic_in_every_format(tmp_path: Path, to: str) -> None:
     bank = write_bank(tmp_path / "bank", [some_image(i) for i in range(2)])[0].parent
     assert convert(open_scans(bank), WRITERS[to](tmp_path / "a"), progress=False).written == 2
     first = open_scans(tmp_path / "a")
@@ -140,7 +140,7 @@ def test_what_was_made_stays_synthetic_from_format_to_format(tmp_path: Path, to:
         assert open_scans(sorted((tmp_path / "a").rglob("*.bin"))[0])[0].domain == SYNTHETIC
 
 
-def test_what_was_measured_stays_real(tmp_path: Path) -> None:
+def test_real_scans_stay_real(tmp_path: Path) -> None:
     MAKERS["kitti360"](tmp_path / "in")
     convert(open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
     assert {scan.domain for scan in open_scans(tmp_path / "out")} == {REAL}
@@ -149,7 +149,7 @@ def test_what_was_measured_stays_real(tmp_path: Path) -> None:
     assert open_scans(tmp_path / "out")[0].domain == REAL
 
 
-def test_an_interrupted_run_marks_what_is_there(tmp_path: Path) -> None:
+def test_an_interrupted_run_marks_existing_scans_as_synthetic(tmp_path: Path) -> None:
     bank = write_bank(tmp_path / "bank", [some_image(i) for i in range(3)])[0].parent
     source, writer = open_scans(bank), WRITERS["kitti"](tmp_path / "out")
     read = source.read

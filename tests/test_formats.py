@@ -44,7 +44,7 @@ def test_every_reader_and_writer_is_tested() -> None:
 
 
 @pytest.mark.parametrize("to", POINT_LAYOUTS)
-def test_points_come_back_bit_for_bit(tmp_path: Path, to: str) -> None:
+def test_points_are_read_back_bit_for_bit(tmp_path: Path, to: str) -> None:
     scans = [some_scan(i) for i in range(3)]
     write_all(to, tmp_path, scans)
     source = back(to, tmp_path)
@@ -58,7 +58,7 @@ def test_points_come_back_bit_for_bit(tmp_path: Path, to: str) -> None:
 
 
 @pytest.mark.parametrize("to", KEEP_FIELDS)
-def test_labels_come_back_bit_for_bit(tmp_path: Path, to: str) -> None:
+def test_labels_are_read_back_bit_for_bit(tmp_path: Path, to: str) -> None:
     scan = some_scan()
     write_all(to, tmp_path, [scan])
     read = back(to, tmp_path)[0]
@@ -68,7 +68,7 @@ def test_labels_come_back_bit_for_bit(tmp_path: Path, to: str) -> None:
 
 
 @pytest.mark.parametrize("to", ["pcd", "ply", "npz", "webdataset"])
-def test_every_field_of_a_point_comes_back(tmp_path: Path, to: str) -> None:
+def test_every_field_of_a_point_is_read_back(tmp_path: Path, to: str) -> None:
     scan = some_scan()
     scan.ring = np.arange(len(scan), dtype=np.int16) % 64
     scan.confidence = (np.arange(len(scan), dtype=np.float32) / len(scan)).astype(np.float32)
@@ -147,7 +147,7 @@ def test_open3d_reads_our_clouds(tmp_path: Path, suffix: str) -> None:
         assert same(cloud.point[name].numpy()[:, 0].astype(expected.dtype), expected), name
 
 
-def test_npz_keeps_all_that_is_known(tmp_path: Path) -> None:
+def test_npz_preserves_all_fields(tmp_path: Path) -> None:
     scan = some_scan(sensor="os1_128")
     scan.domain, scan.id = 1, "somewhere"
     write_all("npz", tmp_path, [scan])
@@ -171,7 +171,7 @@ def test_a_scan_without_labels_still_gets_a_label_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("sensor", ["hdl64e_kitti", "os1_128", "hdl32e_nuscenes"])
-def test_range_images_come_back_in_every_cell(tmp_path: Path, sensor: str) -> None:
+def test_range_images_are_read_back_in_every_cell(tmp_path: Path, sensor: str) -> None:
     scan = some_scan(sensor=sensor)
     image = project(scan)
     write_all("range", tmp_path, [scan])
@@ -187,7 +187,7 @@ def test_range_images_come_back_in_every_cell(tmp_path: Path, sensor: str) -> No
 
 
 @pytest.mark.parametrize("sensor", ["hdl64e_kitti", "os1_128"])
-def test_png_loses_what_it_says_and_no_more(tmp_path: Path, sensor: str) -> None:
+def test_png_loses_only_what_is_documented(tmp_path: Path, sensor: str) -> None:
     scan = some_scan(sensor=sensor)
     image = project(scan)
     [path] = write_all("png", tmp_path, [scan])
@@ -253,7 +253,7 @@ def test_npy_and_other_fields_in_a_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("to", WRITERS)
-def test_a_writer_knows_what_is_there_and_leaves_nothing_else(tmp_path: Path, to: str) -> None:
+def test_a_writer_recognises_complete_scans_and_leaves_no_other_files(tmp_path: Path, to: str) -> None:
     writer = WRITERS[to](tmp_path)
     assert not writer.complete(0)
     for index in range(2):
@@ -343,7 +343,7 @@ def test_names_are_kept_where_a_layout_can_keep_them(tmp_path: Path) -> None:
     assert WRITERS["semantic_kitti"](tmp_path, sequence="21").path(7, "my_scan").stem == "000007"  # type: ignore[call-arg]
 
 
-def test_a_folder_of_npz_files_has_the_sensor_that_they_tell(tmp_path: Path) -> None:
+def test_a_folder_of_npz_files_has_the_sensor_stored_in_them(tmp_path: Path) -> None:
     sensor = presets()["os1_128"]
     WRITERS["npz"](tmp_path).write(random_scan(sensor, 500, seed=0), 0)
     assert open_scans(tmp_path).sensor == sensor

@@ -19,7 +19,7 @@ from lidar_synth.geometry.scan import Boxes, Scan
 
 
 @pytest.mark.parametrize("to", ["semantic_kitti", "kitti_object", "kitti360"])
-def test_the_camera_comes_back(tmp_path: Path, to: str) -> None:
+def test_the_camera_is_read_back(tmp_path: Path, to: str) -> None:
     camera, scan = some_camera(), some_scan()
     picture = np.random.default_rng(0).integers(0, 256, (260, 700, 3), np.uint8)
     writer = WRITERS[to](tmp_path, calibration=camera)
@@ -43,7 +43,7 @@ def test_the_camera_comes_back(tmp_path: Path, to: str) -> None:
 
 
 @pytest.mark.parametrize("to", ["semantic_kitti", "kitti_object", "kitti360"])
-def test_without_a_camera_an_ideal_one_looks_ahead(tmp_path: Path, to: str) -> None:
+def test_without_a_camera_an_ideal_forward_camera_is_written(tmp_path: Path, to: str) -> None:
     write_all(to, tmp_path, [some_scan()])
     camera = back(to, tmp_path).calibration(0)
     assert camera is not None
@@ -58,7 +58,7 @@ def test_without_a_camera_an_ideal_one_looks_ahead(tmp_path: Path, to: str) -> N
     st.lists(st.sampled_from(sorted(SEMANTIC_KITTI.to_train)), min_size=1, max_size=20),
     st.integers(0, 0xFFFF),
 )
-def test_semantic_kitti_labels_survive_whatever_they_are(classes: list[int], instance: int) -> None:
+def test_all_semantic_kitti_labels_are_preserved(classes: list[int], instance: int) -> None:
     raw = np.array(classes, np.uint32) | np.uint32(instance << 16)
     known = decode_labels(raw, SEMANTIC_KITTI, "here")
     scan = Scan(np.ones((len(raw), 3), np.float32), np.zeros(len(raw), np.float32), some_scan().sensor, **known)
@@ -177,7 +177,9 @@ def test_kitti_object_lists_what_the_camera_sees(tmp_path: Path) -> None:
 
 @settings(max_examples=25)
 @given(st.integers(0, 10_000))
-def test_kitti360_boxes_come_back_through_the_world(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+def test_kitti360_boxes_survive_the_conversion_to_the_world_frame(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
     root = tmp_path_factory.mktemp("boxes")
     scans = [some_scan(seed + i, count=40) for i in range(2)]
     write_all("kitti360", root, scans, calibration=some_camera())
@@ -194,7 +196,7 @@ def test_kitti360_boxes_come_back_through_the_world(tmp_path_factory: pytest.Tem
         assert same(scan.boxes.instance, expected.boxes.instance) and (scan.boxes.instance >= 24_000).all()
 
 
-def test_kitti360_boxes_that_stand_still_are_listed_near_their_window(tmp_path: Path) -> None:
+def test_static_kitti360_boxes_are_listed_near_their_window(tmp_path: Path) -> None:
     from lidar_synth.formats.kitti360_boxes import MARGIN, read_boxes
 
     entry = (
@@ -218,7 +220,7 @@ def test_kitti360_boxes_that_stand_still_are_listed_near_their_window(tmp_path: 
     assert len(boxes.at(701 + MARGIN, np.eye(4), 80)) == len(boxes.at(600, a_pose(), 80)) == 0
 
 
-def test_kitti_tracklets_stand_on_their_floor(tmp_path: Path) -> None:
+def test_positions_of_kitti_tracklets_are_centres_of_the_floor(tmp_path: Path) -> None:
     MAKERS["kitti_raw"](tmp_path)
     first, second, third = (scan.boxes for scan in open_scans(tmp_path))
     assert first is not None and len(first) == 0 and second is not None and third is not None
@@ -227,7 +229,7 @@ def test_kitti_tracklets_stand_on_their_floor(tmp_path: Path) -> None:
     assert (third.occlusion[0], third.truncation[0], third.instance[0]) == (1, 0, 0)
 
 
-def test_nuscenes_labels_go_with_their_points(tmp_path: Path) -> None:
+def test_nuscenes_labels_are_dropped_with_their_points(tmp_path: Path) -> None:
     from layouts import nuscenes_arrays
 
     from lidar_synth.datasets.classes import NUSCENES

@@ -38,7 +38,7 @@ def pcd(body: bytes | None = None, **changes: str) -> bytes:
     return lines.encode() + (BODIES[header["DATA"]] if body is None else body)
 
 
-LYING_PCD = {
+FALSE_PCD = {
     "many values per point": pcd(COUNT="100000 1 1 1"),
     "many values per point, compressed": pcd(COUNT="1 1 1 100000", DATA="binary_compressed"),
     "many values per point, in text": pcd(COUNT="1 100000 1 1", DATA="ascii"),
@@ -91,7 +91,7 @@ PLY = (
 )
 
 
-LYING_PLY = {
+FALSE_PLY = {
     "more points": PLY.replace(b"20", b"21") + BODIES["binary"],
     "fewer points": PLY.replace(b"20", b"19") + BODIES["binary"],
     "more points than memory": PLY.replace(b"20", b"999999999999") + BODIES["binary"],
@@ -109,11 +109,11 @@ LYING_PLY = {
 
 @needs_limits
 @pytest.mark.parametrize(
-    ("suffix", "name"), [(".pcd", name) for name in LYING_PCD] + [(".ply", name) for name in LYING_PLY]
+    ("suffix", "name"), [(".pcd", name) for name in FALSE_PCD] + [(".ply", name) for name in FALSE_PLY]
 )
-def test_a_header_that_lies(tmp_path: Path, suffix: str, name: str) -> None:
+def test_false_headers_are_refused(tmp_path: Path, suffix: str, name: str) -> None:
     path = tmp_path / f"scan{suffix}"
-    path.write_bytes({".pcd": LYING_PCD, ".ply": LYING_PLY}[suffix][name])
+    path.write_bytes({".pcd": FALSE_PCD, ".ply": FALSE_PLY}[suffix][name])
     found = in_limits(first_scan, path)
     assert found.startswith("DataError: "), found or "read without a word"
 
@@ -288,11 +288,11 @@ def table_of_numbers(root: Path) -> Path:
         big_picture, bigger_picture, deep_picture, text_bomb_in_a_picture, deep_table, table_of_numbers,
     ],
 )  # fmt: skip
-def test_what_stands_beside_the_points(tmp_path: Path, make: Callable[[Path], Path]) -> None:
+def test_hostile_side_files_are_refused(tmp_path: Path, make: Callable[[Path], Path]) -> None:
     assert in_limits(first_scan, make(tmp_path), seconds=30).startswith("DataError: ")
 
 
-def test_a_camera_picture_that_is_none(tmp_path: Path) -> None:
+def test_invalid_camera_images_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "image.jpg"
     scan = some_scan(count=60)
     scan.image_path = path

@@ -22,7 +22,7 @@ from lidar_synth.labels.bank import ObjectBank
 
 @needs_limits
 @pytest.mark.parametrize("name", HOSTILE_NPY)
-def test_an_array_that_is_no_scan(tmp_path: Path, name: str) -> None:
+def test_hostile_arrays_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "scan.npy"
     path.write_bytes(HOSTILE_NPY[name])
     assert in_limits(read_both, path, seconds=20) == ""
@@ -119,7 +119,7 @@ NPZ = ["a bomb", "a bomb of many", "a bomb that says it is small", "stored, and 
 
 @needs_limits
 @pytest.mark.parametrize("name", NPZ)
-def test_an_archive_that_is_no_scan(tmp_path: Path, name: str) -> None:
+def test_hostile_archives_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "scan.npz"
     path.write_bytes(hostile_npz(name))
     assert in_limits(read_archive, path, megabytes=300) == ""
@@ -159,7 +159,7 @@ def changed(path: Path, **arrays: object) -> None:
         ("reflectance", "bright", "reflectance is"),
     ],
 )  # fmt: skip
-def test_facts_that_are_none(tmp_path: Path, to: str, name: str, value: object, message: str) -> None:
+def test_invalid_facts_are_refused(tmp_path: Path, to: str, name: str, value: object, message: str) -> None:
     [path] = write_all(to, tmp_path, [some_scan()])
     changed(path, **{name: value})
     with pytest.raises(DataError, match=f"{path.name}.*({message})"):
@@ -167,7 +167,7 @@ def test_facts_that_are_none(tmp_path: Path, to: str, name: str, value: object, 
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
-def test_a_range_that_is_none_is_not_dropped(tmp_path: Path, value: float) -> None:
+def test_invalid_ranges_are_not_dropped_silently(tmp_path: Path, value: float) -> None:
     [path] = write_all("range", tmp_path, [some_scan()])
     with np.load(path) as loaded:
         distance = loaded["range"].copy()

@@ -51,7 +51,7 @@ TABLE = {"columns": 64, "elevations": [2.0, 1.0, 0.0], "range_min": 1.0, "range_
         ("text", "holds dict; expected a mapping from a sensor's name"),
     ],
 )
-def test_a_sensor_that_is_none(tmp_path: Path, values: object, message: str) -> None:
+def test_invalid_sensors_are_refused(tmp_path: Path, values: object, message: str) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump({"mine": values}))
     with pytest.raises(ConfigError, match=message):
@@ -100,13 +100,13 @@ def open_yaml(path: Path) -> None:
 
 @needs_limits
 @pytest.mark.parametrize("name", HOSTILE_YAML)
-def test_yaml_that_is_no_configuration(tmp_path: Path, name: str) -> None:
+def test_hostile_yaml_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(HOSTILE_YAML[name])
     assert in_limits(open_yaml, path, megabytes=200, seconds=30) == ""
 
 
-def test_yaml_that_is_no_text(tmp_path: Path) -> None:
+def test_yaml_that_is_not_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_bytes(b"mine: \xff\xfe")
     open_yaml(path)

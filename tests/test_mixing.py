@@ -51,7 +51,7 @@ def test_the_items_of_an_epoch() -> None:
     assert not torch.equal(*twice)  # a scan that is given again is augmented anew
 
 
-def test_what_is_drawn_for_a_sample_follows_from_seed_epoch_and_position() -> None:
+def test_random_numbers_of_a_sample_depend_only_on_seed_epoch_and_position() -> None:
     drawn: list[float] = []
     train = MixedScans(Scans("r", 3), Endless(), 0.5, seed=5, to_sample=lambda scan, rng: drawn.append(rng.random()))
     train.set_epoch(2)
@@ -61,7 +61,7 @@ def test_what_is_drawn_for_a_sample_follows_from_seed_epoch_and_position() -> No
 
 @pytest.mark.parametrize("persistent", [False, True])
 @pytest.mark.parametrize("workers", WORKERS)
-def test_workers_change_nothing(workers: int, persistent: bool) -> None:
+def test_the_number_of_workers_does_not_change_batches(workers: int, persistent: bool) -> None:
     train, alone = mixed(), mixed()
     load = loader(train, workers, batch_size=4, persistent_workers=persistent and workers > 0)
     for epoch in (0, 1, 5):
@@ -122,7 +122,7 @@ def free_port() -> int:
 
 @pytest.mark.parametrize("ranks", [1, 2, 3])
 @pytest.mark.parametrize("done", range(5))
-def test_going_on_with_other_ranks_and_workers_gives_the_rest(ranks: int, done: int) -> None:
+def test_resuming_with_other_ranks_and_workers_yields_the_remaining_samples(ranks: int, done: int) -> None:
     train = mixed(13)  # 22 samples
     train.set_epoch(1)
     every = ids(train)
@@ -176,7 +176,7 @@ def test_balanced_batches() -> None:
             assert sum(train.domain(i) for i in batch) == 1
 
 
-def test_wrap_adds_nothing() -> None:
+def test_wrap_returns_samples_of_the_wrapped_dataset_unchanged() -> None:
     def to_sample(scan: Scan, rng: np.random.Generator) -> dict[str, Any]:
         return {"pts": scan.points[:3].copy(), "name": scan.id}
 
@@ -261,7 +261,7 @@ def test_forms_of_batches() -> None:
         assert batch["box_offsets"].tolist() == [0, 0, 0, 0]
 
 
-def test_fewer_samples_than_ranks_is_said() -> None:
+def test_fewer_samples_than_ranks_gives_a_warning() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         list(mixed(1, 0.0).batches(1, rank=0, world_size=2))

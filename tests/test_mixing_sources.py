@@ -96,7 +96,7 @@ class Ahead(Endless):
         self.expected = list(numbers)
 
 
-def test_a_source_that_works_ahead_is_told_what_will_be_asked_for() -> None:
+def test_upcoming_scans_are_announced_to_a_source_that_works_ahead() -> None:
     source = Ahead()
     train = MixedScans(Scans("r", 6), source, 0.5)
 
@@ -182,12 +182,12 @@ def wrong_labels() -> Any:
         (wrong_labels, DataError, r"labels \[40\]; expected train ids 0..18, or 255"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_mixed(make: Callable[[], object], error: type[Exception], message: str) -> None:
+def test_invalid_mixtures_are_refused(make: Callable[[], object], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make()
 
 
-def test_sensors_that_look_the_same_way_may_be_mixed() -> None:
+def test_sensors_with_the_same_directions_can_be_mixed() -> None:
     kitti, far = load_sensor("hdl64e_semantic_kitti"), load_sensor("town")
     assert len(MixedScans(Scans("r", 3, kitti), Scans("s", 2, far), 0.25)) == 4
     other = Sensor("other", 32, 1.45, 80.0, rows=8, fov_up=2.0, fov_down=-25.0)
@@ -195,7 +195,7 @@ def test_sensors_that_look_the_same_way_may_be_mixed() -> None:
         MixedScans(Scans("r", 3), Scans("s", 2, other), 0.25)
 
 
-def test_held_scans_become_synthetic() -> None:
+def test_existing_scans_become_synthetic() -> None:
     held = make_synthetic(Scans("h", 2))
     assert (held.length, held[1].domain, held[1].id) == (2, SYNTHETIC, "h1")
     assert "label" in held.fields

@@ -331,7 +331,7 @@ def test_what_is_left_is_left_for_any_number_of_ranks() -> None:
         (lambda: Mixture((THREE,), (PlannedSource(3, 0.0),), make_schedule(0.5)), ConfigError, r"weight 0.0"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_planned(make: object, error: type[Exception], message: str) -> None:
+def test_invalid_plans_are_refused(make: object, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make()  # type: ignore[operator]
 

@@ -146,7 +146,7 @@ def test_threads_read_it(bank: RollingBank) -> None:
     assert {pid for pid, _ in bank._client._connections} == {os.getpid()}
 
 
-def test_what_was_told_is_there_before_it_is_asked_for(bank: RollingBank) -> None:
+def test_announced_scans_are_made_before_they_are_requested(bank: RollingBank) -> None:
     before = bank.counts()
     bank.expect([100, 102, 101])
     wait_until(lambda: bank.counts()["made"] >= before["made"] + 3)
@@ -187,7 +187,7 @@ def test_a_pool_is_refreshed_with_the_epoch(path: Path, generator: Generator) ->
         assert bank.counts()["made"] <= 8
 
 
-def test_a_starved_bank_serves_what_it_holds(path: Path, generator: Generator) -> None:
+def test_a_starved_bank_serves_scans_in_memory(path: Path, generator: Generator) -> None:
     with RollingBank(path, seed=SEED, slots=4, starved="reuse", threads=1, timeout=60) as bank:
         bank[0]
         for number in range(100, 160):
@@ -199,7 +199,7 @@ def test_a_starved_bank_serves_what_it_holds(path: Path, generator: Generator) -
         assert counts["waited"] <= 1
 
 
-def test_what_cannot_be_served_is_refused(path: Path, bank: RollingBank, tmp_path: Path) -> None:
+def test_invalid_options_and_requests_are_refused(path: Path, bank: RollingBank, tmp_path: Path) -> None:
     refusals: list[tuple[dict[str, Any], str]] = [
         ({"slots": 0}, "slots=0"),
         ({"timeout": 0}, "timeout=0"),
@@ -221,12 +221,12 @@ def test_what_cannot_be_served_is_refused(path: Path, bank: RollingBank, tmp_pat
         pickle.dumps(bank)
 
 
-def test_a_process_that_does_not_start_says_why(path: Path) -> None:
+def test_the_error_names_why_the_process_did_not_start(path: Path) -> None:
     with pytest.raises(ProcessError, match=r"died \(process \d+, exit code 1; .*device 'nowhere'|nowhere"):
         RollingBank(path, device="nowhere", timeout=60)
 
 
-def test_a_closed_bank_says_so(path: Path) -> None:
+def test_a_closed_bank_raises_an_error(path: Path) -> None:
     bank = RollingBank(path, seed=SEED, slots=2, threads=1, timeout=60)
     assert bank[0].id == f"small/{SEED}/0"
     bank.close()
@@ -246,7 +246,7 @@ def mixed(synth: Any) -> MixedScans:
     )
 
 
-def test_all_ways_give_the_same_scans_for_the_same_plan(bank: RollingBank, generator: Generator) -> None:
+def test_all_ways_of_loading_give_the_same_scans_for_the_same_plan(bank: RollingBank, generator: Generator) -> None:
     inside, rolling = mixed(generator), mixed(bank)
     mixer = BatchMixer(mixed(generator), batch_size=5, num_workers=1)
     for epoch in (0, 2):

@@ -10,7 +10,7 @@ from lidar_synth.mixing.service.ledger import COUNTERS, Ledger
 from lidar_synth.mixing.service.outlook import NEVER, KnownOrder, RotatingPool, SequentialPrefetch
 
 
-def test_an_outlook_that_counts_follows_the_requests() -> None:
+def test_sequential_prefetch_follows_the_requests() -> None:
     outlook = SequentialPrefetch(window=4)
     assert outlook.upcoming({0, 1, 3}) == (2, 2)
     outlook.answer(5)
@@ -24,7 +24,7 @@ def test_an_outlook_that_counts_follows_the_requests() -> None:
     assert outlook.upcoming({0}) == (1, 1)
 
 
-def test_an_outlook_that_was_told_knows_every_use() -> None:
+def test_a_known_order_predicts_every_use() -> None:
     outlook = KnownOrder([7, 9, 7, 8], window=4)
     assert outlook.upcoming(()) == (0, 7)
     assert outlook.upcoming({7}) == (1, 9)
@@ -67,7 +67,7 @@ def make_in_thread(ledger: Ledger, size: int) -> None:
     told=st.none() | st.lists(st.integers(0, 12), max_size=12),
     requests=st.lists(st.integers(0, 12) | st.integers(0, 2**62), max_size=20),
 )
-def test_every_request_gets_its_scan_whatever_was_told(
+def test_every_request_gets_its_scan_for_any_announced_order(
     slots: int, size: int, told: list[int] | None, requests: list[int]
 ) -> None:
     counters = np.zeros(len(COUNTERS), np.int64)
@@ -119,7 +119,7 @@ def test_a_scan_that_is_read_stays_until_it_is_given_back() -> None:
     assert (maker.is_alive(), thread.is_alive(), lent.number) == (False, False, 1)
 
 
-def test_a_scan_that_somebody_waits_for_is_not_given_up() -> None:
+def test_a_scan_for_which_a_reader_waits_is_not_overwritten() -> None:
     ledger = Ledger(1, np.zeros(4, np.int64))
     ledger._awaited += [5, 6]  # as two readers leave it that have not woken up yet
     assert claimed(ledger) == [5]

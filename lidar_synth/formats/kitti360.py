@@ -84,7 +84,12 @@ class KITTI360(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
-        wanted = choose("KITTI-360 split", split, SPLITS, "Published works split the drives differently.")
+        wanted = choose(
+            "KITTI-360 split",
+            split,
+            SPLITS,
+            "Published works split the drives differently: give the full name of a split.",
+        )
         existing = sorted(p.parent.parent.name for p in (root / "data_3d_raw").glob("*/velodyne_points/data"))
         drives = [d for d in existing if wanted is None or d in wanted]
         if not drives:
