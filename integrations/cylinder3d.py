@@ -4,8 +4,8 @@
     LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py \\
         --config_path config/mixed.yaml
 
-with ``pc_dataset_type: "SemKITTI_mixed"`` in that configuration. Cylinder3D turns points in place, so every sample is
-memory of its own, and tells nobody which epoch begins, so the launcher gives it a loader that does.
+with ``pc_dataset_type: "SemKITTI_mixed"`` in that configuration. Cylinder3D rotates points in place, so that every
+sample is a copy. It does not call ``set_epoch``, so that the launcher replaces its loader by one that does.
 """
 
 import runpy
@@ -38,7 +38,7 @@ def register() -> Any:
     """Register ``SemKITTI_mixed`` with Cylinder3D and return the class.
 
     Raises:
-        LibraryError: where Cylinder3D is not on the path.
+        LibraryError: if Cylinder3D is not on the path.
     """
     try:
         from dataloader.pc_dataset import SemKITTI_sk, register_dataset
@@ -48,7 +48,7 @@ def register() -> Any:
         ) from error
 
     class Mixed(SemKITTI_sk):  # type: ignore[misc]
-        """``SemKITTI_sk`` whose training set has synthetic scans among its own: (xyz, label (N, 1) uint8, strength)."""
+        """``SemKITTI_sk`` with synthetic scans in its training set: (xyz, label (N, 1) uint8, strength)."""
 
         def __init__(self, data_path: str, imageset: str = "train", **options: Any) -> None:
             super().__init__(data_path, imageset, **options)
@@ -60,7 +60,7 @@ def register() -> Any:
                 self.mixed = mix(len(self.im_idx), settings, lambda scan, rng: scan)
 
         def set_epoch(self, epoch: int) -> None:
-            """Choose the epoch; workers are told."""
+            """Set the epoch, also for workers."""
             if self.mixed is not None:
                 self.mixed.set_epoch(epoch)
 

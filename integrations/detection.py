@@ -1,7 +1,7 @@
-"""What detectors want beside points and boxes: the ground plane, the camera's view, difficulty, a database of objects.
+"""Additional data for detectors: ground plane, camera view, difficulty, and a database of objects.
 
-KITTI's trainers see the part of a scan that camera 2 sees, with the boxes there, and shift pasted objects to the ground
-by a plane ``a x + b y + c z + d = 0`` in the rectified camera frame, whose normal points up (b < 0).
+KITTI's trainers use the points and boxes in the view of camera 2, and shift pasted objects to the ground by a plane
+``a x + b y + c z + d = 0`` in the rectified camera frame, whose normal points up (b < 0).
 """
 
 import pickle
@@ -23,23 +23,23 @@ from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.ground import GROUND
 
 NEAR = 40.0
-"""Metres within which the ground counts."""
+"""Maximum distance of ground returns for the plane, metres."""
 
 LEVELS = ((40, 0.15, 0), (25, 0.30, 1), (25, 0.50, 2))
-"""KITTI's easy, moderate and hard: least height in pixels, most truncation, most occlusion (devkit's readme)."""
+"""KITTI's easy, moderate and hard: minimum height in pixels, maximum truncation and occlusion (devkit's readme)."""
 
 Origin = Literal["gravity", "bottom"]
-"""What of a box its place names: the centre of gravity (OpenPCDet) or the middle of its floor (MMDetection3D)."""
+"""The reference point of a box: its centre of gravity (OpenPCDet) or the centre of its floor (MMDetection3D)."""
 
 
 def ground_plane(scan: Scan) -> NDArray[np.float64]:
-    """(4,) a, b, c, d of the ground's plane in the sensor frame, (a, b, c) of length 1 and pointing up.
+    """Fit the ground plane: (4,) a, b, c, d in the sensor frame, with (a, b, c) of length 1 and pointing up.
 
-    Fitted to the returns that are labelled as ground, or without labels to the lowest in each square of 2 m, without
-    those that miss it by more than 0.3 m.
+    It is fitted to the returns with ground labels, or without labels to the lowest return in each square of 2 m;
+    returns farther than 0.3 m from the plane are outliers.
 
     Raises:
-        DataError: where there is no ground.
+        DataError: if there is no ground.
     """
     near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < NEAR
     points = scan.points[near].astype(np.float64)
@@ -66,30 +66,30 @@ def _lowest(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def check_names(scan: Scan, classes: Collection[str]) -> None:
-    """Boxes of which a trainer knows none would be left out one by one, and nobody would notice.
+    """Check that boxes have classes of the trainer, which would otherwise drop all of them silently.
 
     Raises:
-        DataError: where there are boxes, and none is of these classes.
+        DataError: if there are boxes, but none of these classes.
     """
     if scan.boxes is not None and len(scan.boxes) and not set(scan.boxes.names) & set(classes):
         raise DataError(
             f"boxes of {sorted(set(scan.boxes.names))} in synthetic scan {scan.id!r}",
             f"some of {', '.join(classes)}",
-            "Name them as the trainer does.",
+            "Rename the boxes to the trainer's classes.",
         )
 
 
 def plane_in_camera(plane: NDArray[np.float64], camera: Calibration) -> NDArray[np.float64]:
-    """(4,) a plane of the sensor frame in the camera's."""
+    """(4,) a plane of the sensor frame, transformed to the camera frame."""
     moved: NDArray[np.float64] = plane @ camera.sensor_from_camera
     return moved
 
 
 def in_view(scan: Scan, camera: Calibration) -> Scan:
-    """What a camera sees of a scan: the points in its picture, and the boxes whose centre is.
+    """Crop a scan to a camera's image: the points and the boxes whose centres project into it.
 
     Raises:
-        DataError: where the camera's image size is not known.
+        DataError: if the camera's image size is unknown.
     """
     size = camera.image_size
     if size is None:
@@ -108,9 +108,9 @@ def in_view(scan: Scan, camera: Calibration) -> Scan:
 
 
 def difficulty(boxes: Boxes) -> NDArray[np.int32]:
-    """(M,) KITTI's level of each box: 0 easy, 1 moderate, 2 hard, -1 none of them, or occlusion not known.
+    """(M,) KITTI's level of each box: 0 easy, 1 moderate, 2 hard, -1 none of them, or unknown occlusion.
 
-    The height in the picture, where it is not known, is that which KITTI's focal length gives it at its distance.
+    An unknown height in the image is computed from the box's height and distance with KITTI's focal length.
     """
     known = (boxes.image_box >= 0).all(1)
     distance = np.maximum(np.hypot(boxes.values[:, 0], boxes.values[:, 1]), 1)
@@ -126,10 +126,10 @@ def difficulty(boxes: Boxes) -> NDArray[np.int32]:
 def write_gt_database(
     objects: ObjectBank, root: str | Path, *, origin: Origin, folder: str = "gt_database", infos: str
 ) -> Path:
-    """A bank of objects as the database from which a trainer's GT sampling draws.
+    """Write a bank of objects as the database of a trainer's GT sampling.
 
-    Points stand relative to the box's place, as each trainer wants it. Both trainers read the list of objects as a
-    pickle, which is the reason why one is written; the package itself never reads one.
+    Points are relative to the trainer's reference point of the box. Both trainers read the list of objects as a pickle,
+    so that the package writes one; it never reads one.
 
     Args:
         objects: of any source with boxes, ``ObjectBank.from_scans(source)``.
@@ -142,7 +142,7 @@ def write_gt_database(
         The list's file.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     root, found, level = Path(root), dict[str, list[dict[str, Any]]](), difficulty(objects.boxes)
     for i, name in enumerate(objects.boxes.names):

@@ -1,7 +1,7 @@
-"""The way that every trainer takes: a mixture written once as SemanticKITTI's or KITTI's folders.
+"""Export of a mixture as SemanticKITTI's or KITTI's folders, which every trainer reads.
 
-What is written is complete: labels for every scan (a missing ``.label`` is read as "car" by some trainers), and for
-detectors label_2, calib, image_2, planes and ImageSets, so that a trainer's stock loader and converter read it.
+The folders are complete: labels for every scan (some trainers read a missing ``.label`` as "car"), and for detectors
+label_2, calib, image_2, planes and ImageSets, so that a trainer's stock loader and converter read them.
 """
 
 from pathlib import Path
@@ -33,26 +33,26 @@ def export_mixture(
     calibration: Calibration | None = None,
     progress: bool = True,
 ) -> int:
-    """Write what a mixture gives in an epoch; a rerun goes on where it stopped.
+    """Write all samples of a mixture in an epoch; a rerun resumes an interrupted export.
 
-    Scans are numbered by their positions, in sequence 00 or in ``training``. ``mixture.csv`` tells frame, domain and id
-    of each, with the plan's hash.
+    Scans are numbered by their positions, in sequence 00 or in ``training``. ``mixture.csv`` lists frame, domain and id
+    of each, and the plan's hash.
 
     Args:
-        mixed: of scans, with ``to_sample=lambda scan, rng: scan``.
-        out: folder to write to.
+        mixed: a mixture of scans, with ``to_sample=lambda scan, rng: scan``.
+        out: output folder.
         layout: ``"semantic_kitti"`` or ``"kitti"`` (the object set).
-        epoch: whose plan.
-        calibration: camera 2, for ``"kitti"``; by default an ideal one at the sensor.
-        progress: show a bar.
+        epoch: the epoch to write.
+        calibration: camera 2, for ``"kitti"``; by default an ideal camera at the sensor.
+        progress: whether to show a progress bar.
 
     Returns:
-        How many scans were written now.
+        Number of scans written by this run.
 
     Raises:
-        ConfigError: on another layout, or a mixture whose samples are no scans.
+        ConfigError: on another layout, or a mixture whose samples are not scans.
         DataError: on a scan without labels (``"semantic_kitti"``) or boxes (``"kitti"``).
-        FileError: where the folder cannot be written.
+        FileError: if the folder cannot be written.
     """
     if layout not in ("semantic_kitti", "kitti"):
         raise ConfigError(f"layout {layout!r}", "'semantic_kitti' or 'kitti'")
@@ -80,14 +80,14 @@ def export_mixture(
 
 
 def write_planes(root: str | Path, split: str = "trainval") -> int:
-    """Fit the ground planes that KITTI's folder lacks (``training/planes``), as GT sampling wants them.
+    """Fit and write the ground planes that are missing in ``training/planes`` of KITTI's folder, for GT sampling.
 
     Returns:
-        How many were written.
+        Number of planes written.
 
     Raises:
         DataError: on a scan without ground or calibration.
-        FileError: where they cannot be written.
+        FileError: if they cannot be written.
     """
     scans, written = KITTIObject(root, split), 0
     for number, name in enumerate(tqdm(scans.ids, "fitting planes", unit="scan", leave=False, disable=None)):

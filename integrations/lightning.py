@@ -1,11 +1,11 @@
-"""Lightning: a ``LightningDataModule`` around mixtures, with synthesis on the GPU after the transfer if it is wanted::
+"""Lightning: a ``LightningDataModule`` for mixtures, optionally with synthesis on the GPU after the batch transfer::
 
     data = MixedData(train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8, num_workers=4)
     trainer.fit(model, data)
 
-Set ``Trainer(use_distributed_sampler=False)``: the batch sampler shares the plan among ranks itself. Lightning asks for
-the number of batches once; where a later epoch has more of them (a rising ratio with ``epoch_size="add"``), set
-``reload_dataloaders_every_n_epochs=1`` as well. A checkpoint within an epoch goes on after its last batch.
+Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among ranks itself. Lightning
+reads the number of batches once; if a later epoch has more (an increasing ratio with ``epoch_size="add"``), also set
+``reload_dataloaders_every_n_epochs=1``. A checkpoint within an epoch resumes after its last batch.
 """
 
 from collections.abc import Iterator, Mapping
@@ -41,7 +41,7 @@ if lightning.__version__ in STOLEN:
 
 @dataclass(frozen=True)
 class Pending:
-    """A synthetic sample that is made after the transfer: its place in the plan and its number."""
+    """A synthetic sample that is still to be made, after the batch transfer: its place in the plan and its number."""
 
     epoch: int
     position: int
@@ -60,11 +60,11 @@ class OnDevice(Dataset[Any]):
 
     def __getitem__(self, index: int) -> Any:
         epoch = self.mixed.epoch_of(index)
-        made = self.mixed.plan(epoch)
-        source, number = made[index]
-        if source < made.reals:
+        plan = self.mixed.plan(epoch)
+        source, number = plan[index]
+        if source < plan.reals:
             return self.mixed.sample(epoch, index)
-        return Pending(epoch, index, source - made.reals, number)
+        return Pending(epoch, index, source - plan.reals, number)
 
 
 class Items(Dataset[Any]):
@@ -81,18 +81,18 @@ class Items(Dataset[Any]):
 
 
 class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
-    """Loaders for training on a mixture and for validation and test on real scans.
+    """Loaders for training on a mixture, and for validation and test on real scans.
 
     Args:
         train: the mixture.
-        val, test: scans; none = no such loader.
-        batch_size: samples of a batch, on each rank.
-        num_workers: of each loader. They are kept over the epochs.
-        on_device: make synthetic scans in the main process, after a batch was transferred, with generators that are on
-            its device; otherwise they come from workers, which have no GPU.
+        val, test: scans; None = no such loader.
+        batch_size: number of samples in a batch, on each rank.
+        num_workers: number of workers of each loader; they persist over the epochs.
+        on_device: whether the main process makes synthetic scans after the batch transfer, with generators on the
+            training device; otherwise workers, which have no GPU, make them.
 
     Raises:
-        ConfigError: with ``on_device``, on synthetic sources that are no generators.
+        ConfigError: with ``on_device``, on synthetic sources that are not generators.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         self._batches: _Epochs | None = None
 
     def train_dataloader(self) -> Any:
-        """Batches along the plan, shared among ranks; from where a checkpoint was taken, if one was loaded."""
+        """Batches in the order of the plan, divided among ranks; resumes if a checkpoint was loaded."""
         self._batches = _Epochs(self, MixedBatches(self.train, self.batch_size))
         if self._resume is not None:
             self._batches.load_state_dict(self._resume)
@@ -134,11 +134,11 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         return self._plain(self.test)
 
     def transfer_batch_to_device(self, batch: Any, device: Any, dataloader_idx: int) -> Any:
-        """The batch on the device; a list of samples waits until the synthetic ones are made."""
+        """Transfer a batch; a list of samples is transferred later, when its synthetic samples are made."""
         return batch if isinstance(batch, list) else super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
-        """Makes the synthetic samples of a batch, all of one generator at once, and collates."""
+        """Make the synthetic samples of a batch, all of one generator at once, and collate it."""
         if not isinstance(batch, list):
             return batch
         for number, source in enumerate(self.train.synthetic):
@@ -150,17 +150,17 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         return super().transfer_batch_to_device(self.train.collate(batch), device, dataloader_idx)
 
     def state_dict(self) -> dict[str, Any]:
-        """Where training stands, after the last batch that Lightning counts as processed."""
+        """The progress of training, after the last batch that Lightning counts as processed."""
         return make_state(self.train.mixture, 0, 0) if self._batches is None else self._batches.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on where a checkpoint was taken.
+        """Resume from a checkpoint.
 
         Raises:
-            ConfigError: on a checkpoint of another mixture; or of the middle of an epoch with batches of another size,
+            ConfigError: on a checkpoint of another mixture; or from the middle of an epoch with another batch size,
                 which Lightning would miscount.
         """
-        if set(state_dict) == {"seed"}:  # as before version 2, whose checkpoints did not tell the position
+        if set(state_dict) == {"seed"}:  # checkpoints before version 2 have no position
             state_dict = {"seed": state_dict["seed"], "epoch": 0, "position": 0}
         checked_state(state_dict, self.train.mixture)
         self._resume = state_dict
@@ -178,15 +178,15 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
 
 
 class _Epochs:
-    """A batch sampler that takes the epoch from Lightning before it begins, and tells its place as Lightning counts."""
+    """A batch sampler that reads the epoch from Lightning, and whose state follows Lightning's count of batches."""
 
     def __init__(self, data: MixedData, batches: MixedBatches) -> None:
         self._data, self._batches = data, batches
-        self._epoch = batches.dataset.epoch  # that began last
-        self._first = 0  # where a state says; Lightning's own count is one behind after the end of an epoch
+        self._epoch = batches.dataset.epoch  # the epoch that began last
+        self._first = 0  # the epoch of the loaded state; Lightning's count is one behind after the end of an epoch
 
     def __len__(self) -> int:
-        """Batches of the whole epoch: Lightning counts on from those that it had before a checkpoint."""
+        """Number of batches in the complete epoch; Lightning adds the batches before a checkpoint to its count."""
         try:
             return len(self._steps(self._current()))
         except ConfigError:  # after the last epoch of a schedule, when Lightning tidies up
@@ -199,7 +199,7 @@ class _Epochs:
         return iter(self._batches)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state after the batches that were processed, and how many samples all ranks take at a time."""
+        """The state after the processed batches, and the number of samples in a step of all ranks."""
         steps, trainer = self._steps(self._epoch), self._data.trainer
         done = trainer.fit_loop.epoch_loop.batch_progress.current.processed if trainer else 0
         mixture = self._batches.dataset.mixture
@@ -207,7 +207,7 @@ class _Epochs:
         return make_state(mixture, *place) | {"step": steps.size}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on there.
+        """Resume from a state.
 
         Raises:
             ConfigError: as ``MixedData.load_state_dict``.
@@ -216,7 +216,7 @@ class _Epochs:
         if state["position"] and state.get("step", size) != size:
             raise ConfigError(
                 f"a checkpoint from the middle of an epoch, {state['step']} samples a step, for {size} a step",
-                "the batch size and the number of devices that it was taken with",
+                "the batch size and the number of devices with which it was saved",
                 "A checkpoint from the end of an epoch fits any.",
             )
         self._batches.load_state_dict(state)
@@ -231,21 +231,21 @@ class _Epochs:
         return cut_steps(0, batches.dataset.length(epoch), batches.batch_size, batches.world_size)
 
     def _check_limit(self) -> None:
-        """Lightning keeps the first epoch's number of batches and would leave out what is beyond."""
+        """Refuse an epoch with more batches than the first one, because Lightning would skip the additional ones."""
         trainer = self._data.trainer
         if trainer is None or trainer.limit_train_batches != 1.0:
             return
         limits = getattr(trainer.fit_loop._combined_loader, "limits", None)
         if limits and limits[0] < len(self):
             raise ConfigError(
-                f"epoch {self._epoch} of {len(self)} batches, where Lightning counts on {limits[0]} as in the first",
+                f"epoch {self._epoch} of {len(self)} batches, but Lightning expects {limits[0]} as in the first epoch",
                 "epochs that do not grow",
                 "Set Trainer(reload_dataloaders_every_n_epochs=1), or epoch_size='replace' or a number of samples.",
             )
 
 
 class _Loader(DataLoader[Any]):
-    """A ``DataLoader`` with a state, which Lightning asks for."""
+    """A ``DataLoader`` with the state of its batch sampler, which Lightning saves."""
 
     batch_sampler: Any
 

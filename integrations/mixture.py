@@ -1,6 +1,6 @@
-"""What the adapters share: a mixture from plain settings, a loader that tells the epoch, labels in a trainer's ids.
+"""Shared parts of the integrations: mixtures from plain settings, a loader that sets the epoch, and class ids.
 
-A trainer's configuration is text, so a mixture is a dict of settings there::
+In a trainer's configuration, a mixture is a dict of settings::
 
     {"synthetic": "bank/", "ratio": 0.25, "labels": "generated", "seed": 0}
 """
@@ -25,21 +25,21 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
 
 VARIABLE = "LIDAR_SYNTH_MIX"
-"""Environment variable with the YAML file of settings, for trainers whose configuration takes no other keys."""
+"""Environment variable with the YAML file of settings, for trainers whose configuration allows no further keys."""
 
 OPTIONS = ("synthetic", "ratio", "labels", "seed", "reuse", "epoch_size", "label_options")
-"""Keys of the settings: where the synthetic scans come from, and arguments of ``MixedScans``."""
+"""Keys of the settings: the source of synthetic scans, and arguments of ``MixedScans``."""
 
 
 def open_synthetic(where: Any) -> Any:
-    """A source of synthetic scans from what a configuration names.
+    """Open the source of synthetic scans that a configuration names.
 
     Args:
-        where: a bank's folder or URL, a checkpoint (``.safetensors``) or the name of a shipped model, a folder of scans
-            in any layout that ``open_scans`` reads; or a source as it is.
+        where: a bank's folder or URL, a checkpoint (``.safetensors``), the name of a shipped model, or a folder of
+            scans in any layout that ``open_scans`` reads. Any other object is returned unchanged.
 
     Raises:
-        ConfigError, FileError, DataError: where there is none.
+        ConfigError, FileError, DataError: if there is no such source.
     """
     if not isinstance(where, str | Path):
         return where
@@ -48,19 +48,19 @@ def open_synthetic(where: Any) -> Any:
     if not Path(where).is_dir():
         return load_generator(where)
     scans = open_scans(where)
-    own = scans[0].sensor  # files may tell it themselves, which the folder does not know
+    own = scans[0].sensor  # files may store their own sensor
     return scans if scans.sensor.shape == own.shape else open_scans(where, sensor=own)
 
 
 def read_settings(given: Any = None) -> dict[str, Any]:
-    """The settings of a mixture, with keys in small letters.
+    """Read the settings of a mixture, with keys in lower case.
 
     Args:
-        given: them, or a YAML file; without, the file that the environment's ``LIDAR_SYNTH_MIX`` names.
+        given: the settings or a YAML file; by default the file in the environment variable ``LIDAR_SYNTH_MIX``.
 
     Raises:
-        ConfigError: where there are none.
-        FileError, DataError: where the file cannot be read.
+        ConfigError: if there are no settings.
+        FileError, DataError: if the file cannot be read.
     """
     source = given if given is not None else os.environ.get(VARIABLE)
     if isinstance(source, str | Path):
@@ -69,7 +69,7 @@ def read_settings(given: Any = None) -> dict[str, Any]:
         raise ConfigError(
             f"{source!r} as the settings of a mixture",
             f"a dict of {', '.join(OPTIONS)}, or a YAML file of them",
-            f"Name the file in the trainer's configuration or by {VARIABLE}=mix.yaml.",
+            f"Set the file in the trainer's configuration or by {VARIABLE}=mix.yaml.",
         )
     settings = {str(key).lower(): value for key, value in given.items()}
     if isinstance(options := settings.get("label_options"), Mapping):
@@ -78,15 +78,15 @@ def read_settings(given: Any = None) -> dict[str, Any]:
 
 
 def mix(real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.random.Generator], Any]) -> MixedScans:
-    """The mixture that settings describe, for a trainer whose real samples are counted only.
+    """Make a mixture from settings, for a trainer that loads real samples itself.
 
     Args:
-        real: how many real samples the trainer has.
+        real: number of the trainer's real samples.
         settings: keys of ``OPTIONS``; ``synthetic`` is required.
-        to_sample: what a synthetic scan becomes.
+        to_sample: ``(scan, rng) -> sample`` for synthetic scans.
 
     Returns:
-        A dataset whose real samples are their numbers, 0 <= n < real: the trainer loads them as it always does.
+        A dataset whose real samples are only their numbers, 0 <= n < real, by which the trainer loads them.
 
     Raises:
         ConfigError: on an unknown key, or settings that ``MixedScans`` refuses.
@@ -101,29 +101,29 @@ def mix(real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.ra
 
 
 def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:
-    """Settings under which a batch can be without one valid label, which makes the loss NaN.
+    """Refuse label policies with which a batch may have no valid label, because its loss would be NaN.
 
     Raises:
-        ConfigError: for the policies ``none`` and ``ignore``.
+        ConfigError: on the policies ``none`` and ``ignore``.
     """
     if settings.get("labels", "generated") in ("none", "ignore"):
         raise ConfigError(
             f"labels={settings['labels']!r} for {trainer}",
             "labels for every synthetic scan: 'generated', 'condition', 'pseudo' or 'mix'",
-            "It makes its batches itself; one of synthetic scans alone would have no valid label, and its loss, a mean "
-            "over none, is NaN.",
+            "The trainer makes its own batches; a batch of only synthetic scans would have no valid label, and its "
+            "loss, a mean over no label, is NaN.",
         )
 
 
 def class_ids(scan: Scan, table: NDArray[Any]) -> NDArray[Any]:
-    """(N,) labels in a trainer's ids.
+    """Convert a scan's labels to a trainer's class ids, (N,).
 
     Args:
-        scan: with labels.
-        table: (256,) a trainer's id by train id, see ``id_table``.
+        scan: a scan with labels.
+        table: (256,) the trainer's id by train id, see ``id_table``.
 
     Raises:
-        DataError: on a scan without one valid label: a batch of such scans would make the loss NaN.
+        DataError: on a scan without any valid label, because the loss of a batch of such scans would be NaN.
     """
     if scan.label is None or not (scan.label != IGNORE).any():
         raise DataError(
@@ -136,21 +136,21 @@ def class_ids(scan: Scan, table: NDArray[Any]) -> NDArray[Any]:
 
 
 def id_table(first: int, ignore: int, dtype: Any) -> NDArray[Any]:
-    """(256,) a trainer's id by train id: 19 in a row from ``first`` on, and ``ignore`` for everything else."""
+    """(256,) a trainer's id by train id: 19 consecutive ids from ``first`` on, and ``ignore`` for all other labels."""
     table = np.full(256, ignore, dtype)
     table[: len(NAMES)] = np.arange(first, first + len(NAMES))
     return table
 
 
 def require_ids(learning_map: Mapping[int, int], table: NDArray[Any]) -> None:
-    """A trainer's own map of SemanticKITTI's classes has to give the ids that synthetic labels get.
+    """Check that a trainer's own map of SemanticKITTI's classes gives the same ids as synthetic labels have.
 
     Args:
         learning_map: the trainer's id by the file's class.
-        table: (256,) a trainer's id by train id, see ``id_table``.
+        table: (256,) the trainer's id by train id, see ``id_table``.
 
     Raises:
-        ConfigError: where a class, or what is unlabelled, becomes another one.
+        ConfigError: if the ids of a class, or of unlabelled points, differ.
     """
     classes = [*enumerate(SEMANTIC_KITTI.from_train or ()), (IGNORE, 0)]
     wrong = [(raw, learning_map.get(raw), int(table[i])) for i, raw in classes if learning_map.get(raw) != table[i]]
@@ -163,30 +163,30 @@ def require_ids(learning_map: Mapping[int, int], table: NDArray[Any]) -> None:
 
 
 def points_of(scan: Scan) -> NDArray[np.float32]:
-    """(N, 4) float32 x, y, z, reflectance, in memory of its own: trainers turn points in place."""
+    """(N, 4) float32 x, y, z, reflectance, as a copy, because trainers rotate points in place."""
     points = np.empty((len(scan), 4), np.float32)
     points[:, :3], points[:, 3] = scan.points, scan.reflectance
     return points
 
 
 def inner(dataset: Any, names: tuple[str, ...] = ("dataset", "datasets", "point_cloud_dataset")) -> Iterator[Any]:
-    """A dataset and all that it wraps."""
+    """A dataset and all datasets that it wraps, recursively."""
     yield dataset
     for name in names:
-        held = vars(dataset).get(name) if hasattr(dataset, "__dict__") else None
-        for each in held if isinstance(held, list | tuple) else [held]:
+        wrapped = vars(dataset).get(name) if hasattr(dataset, "__dict__") else None
+        for each in wrapped if isinstance(wrapped, list | tuple) else [wrapped]:
             if each is not None:
                 yield from inner(each, names)
 
 
 class EpochLoader(DataLoader[Any]):
-    """A ``DataLoader`` that tells its dataset, before each pass, which epoch begins: for trainers that tell nobody."""
+    """A ``DataLoader`` that sets its dataset's epoch before each pass, for trainers that do not call ``set_epoch``."""
 
     passes = 0
 
     def __iter__(self) -> Any:
         for each in inner(self.dataset):
-            # Looked up in the class: a dataset that passes unknown names on to another would be told twice.
+            # Looked up in the class: a dataset that forwards unknown attributes would set the epoch twice.
             if hasattr(type(each), "set_epoch"):
                 each.set_epoch(self.passes)
         self.passes += 1

@@ -3,8 +3,8 @@
     custom_imports = dict(imports=["lidar_synth.integrations.mmdet3d"])
     custom_hooks = [dict(type="SynthEpochHook")]
 
-Segmentation uses the trainer's own datasets: points and labels of a synthetic entry come through the file backend.
-Detection needs ``SynthKittiDataset``, whose synthetic entries take their boxes and their ground plane from the scan.
+Segmentation uses the trainer's own datasets: the file backend serves points and labels of synthetic entries. Detection
+needs ``SynthKittiDataset``, whose synthetic entries get their boxes and ground plane from the scan.
 ``mmdet3d_infos.write_infos`` writes the list, ``tools/install_mmdet3d.sh`` installs the trainer.
 """
 
@@ -50,7 +50,7 @@ class SynthBackend(BaseStorageBackend):  # type: ignore[misc]
         return read_url(str(filepath))
 
     def get_text(self, filepath: str | Path, encoding: str = "utf-8") -> str:
-        """There is no text behind these paths.
+        """Refuse to read text, because these paths have none.
 
         Raises:
             DataError: always.
@@ -63,8 +63,8 @@ class SynthKittiDataset(KittiDataset):  # type: ignore[misc]
     """``KittiDataset`` for a mixed list: the boxes of a synthetic entry are those of its scan in this epoch.
 
     Args:
-        options: as for ``KittiDataset``. ``filter_empty_gt`` has to be False: a scan that is replaced by another one
-            when it has no boxes changes the ratio.
+        options: as for ``KittiDataset``. ``filter_empty_gt`` must be False: replacing scans without boxes by others
+            would change the ratio.
 
     Raises:
         ConfigError: on other boxes than LiDAR's, or ``filter_empty_gt``.
@@ -82,7 +82,7 @@ class SynthKittiDataset(KittiDataset):  # type: ignore[misc]
         super().__init__(**options)
 
     def get_data_info(self, idx: int) -> dict[str, Any]:
-        """The entry as the trainer holds it; a synthetic one with its boxes (floor's middle) and plane."""
+        """The trainer's entry; a synthetic one gets its boxes (centre of the floor) and its ground plane."""
         info: dict[str, Any] = super().get_data_info(idx)
         path = info["lidar_points"]["lidar_path"]
         if path.startswith(PREFIX):
@@ -103,13 +103,13 @@ class SynthKittiDataset(KittiDataset):  # type: ignore[misc]
 
 @HOOKS.register_module(force=True)
 class SynthEpochHook(Hook):  # type: ignore[misc]
-    """Tells every worker which epoch training is in, and checks before it starts that labels and classes fit."""
+    """Passes the epoch to every worker, and checks labels and classes before training starts."""
 
     def before_train(self, runner: Any) -> None:
-        """Check what will be trained on.
+        """Check the training data.
 
         Raises:
-            ConfigError: where no dataset is a mixed list, or the classes are not SemanticKITTI's.
+            ConfigError: if no dataset is a mixed list, or the classes are not SemanticKITTI's.
         """
         self._folders = [folder for _, folder in _mixed(runner.train_dataloader.dataset)]
         if not self._folders:
@@ -121,11 +121,11 @@ class SynthEpochHook(Hook):  # type: ignore[misc]
         self._tell(_epoch(runner))
 
     def before_train_epoch(self, runner: Any) -> None:
-        """A new epoch, before the loader's workers ask for its first scans."""
+        """Set the new epoch, before the loader's workers request its first scans."""
         self._tell(_epoch(runner))
 
     def before_train_iter(self, runner: Any, batch_idx: int, data_batch: Any = None) -> None:
-        """Loops by iterations know no epochs: one is a pass through the list, up to what workers prefetch."""
+        """Set the epoch in loops by iterations: one epoch is a pass through the list, up to prefetched batches."""
         if _by_iterations(runner) and runner.iter % _steps(runner) == 0:
             self._tell(_epoch(runner))
 

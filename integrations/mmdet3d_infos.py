@@ -1,14 +1,14 @@
-"""Info lists for MMDetection3D that hold real and synthetic scans side by side, and what a synthetic entry stands for.
+"""Info lists for MMDetection3D with real and synthetic scans, and the scans behind synthetic entries.
 
-``write_infos`` puts into one folder::
+``write_infos`` writes into one folder::
 
-    infos.json      the trainer's list: its own entries as they were, paths absolute, then a *slot* for each
-                    synthetic sample of an epoch, whose files are lsynth://<folder>/<slot>.bin and .label
+    infos.json      the trainer's list: its own entries with absolute paths, then a *slot* for each synthetic sample
+                    of an epoch, whose files are lsynth://<folder>/<slot>.bin and .label
     mixture.json    the settings of the mixture
-    epoch-<rank>    the epoch that training is in, written by the hook, read by every worker process
+    epoch-<rank>    the current epoch, written by the hook and read by every worker process
 
-Real and synthetic have to share one list, because LaserMix, PolarMix and FrustumMix draw partners from the dataset
-itself. Which scan a slot stands for follows from ``plan(seed, epoch)``: a fresh one each epoch.
+Real and synthetic scans must be in one list, because LaserMix, PolarMix and FrustumMix sample partners from the
+dataset itself. ``plan(seed, epoch)`` assigns a scan to each slot, a new one in each epoch.
 """
 
 import json
@@ -36,7 +36,7 @@ from lidar_synth.mixing.state import place
 PREFIX = "lsynth://"
 MIXTURE, INFOS, EPOCH = "mixture.json", "infos.json", "epoch"
 FORMAT = "lidar-synth-mmdet3d/1"
-_KEPT = 4  # scans that a process keeps: points, labels and boxes of one are asked for one after another
+_CACHED = 4  # number of scans in the cache of a process: points, labels and boxes of a scan are read one after another
 
 
 def write_infos(
@@ -51,13 +51,13 @@ def write_infos(
     """Write the mixed list beside the trainer's own.
 
     Args:
-        out: folder for it.
-        real: the trainer's own list (``.pkl`` or ``.json``), as its ``create_data.py`` wrote it.
-        settings: of the mixture, see ``mixture.OPTIONS``; one ratio for all epochs.
-        data_root: the folder that the paths in it are relative to.
-        points: the folder of the points under it (the configuration's ``data_prefix['pts']``).
-        view: for detection, keep of a synthetic scan what the camera of the first real entry sees, as
-            ``velodyne_reduced`` does.
+        out: output folder.
+        real: the trainer's own list (``.pkl`` or ``.json``), as written by its ``create_data.py``.
+        settings: settings of the mixture, see ``mixture.OPTIONS``; one ratio for all epochs.
+        data_root: the folder to which the paths in ``real`` are relative.
+        points: the folder of the points under ``data_root`` (the configuration's ``data_prefix['pts']``).
+        view: for detection, whether to crop synthetic scans to the view of the first real entry's camera, as in
+            ``velodyne_reduced``.
 
     Returns:
         The mixed list, for ``ann_file``.
@@ -102,12 +102,12 @@ class Folder:
 
     Args:
         path: the folder.
-        facts: of its ``mixture.json``.
+        facts: the content of its ``mixture.json``.
 
     Attributes:
         mixed: the mixture; its real samples are the numbers of the list's real entries.
-        slots: synthetic samples of the first epoch; a later one may have one fewer, and then gives one of its scans
-            again.
+        slots: number of synthetic samples in the first epoch; a later epoch may have one fewer, and then repeats one
+            of its scans.
     """
 
     def __init__(self, path: Path, facts: dict[str, Any]) -> None:
@@ -121,31 +121,31 @@ class Folder:
             )
         self.slots = len(self.mixed) - facts["real"]
         self._view = None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
-        self._kept: OrderedDict[tuple[int, int], Scan] = OrderedDict()
+        self._cached: OrderedDict[tuple[int, int], Scan] = OrderedDict()
         self._positions: tuple[int, NDArray[np.int64]] | None = None
 
     @classmethod
     def open(cls, path: Path) -> "Folder":
-        """The folder that ``write_infos`` wrote.
+        """Open a folder of ``write_infos``.
 
         Raises:
-            DataError: on another format, or synthetic scans that changed since: their plan is another.
+            DataError: on another format, or if the synthetic scans, and thus the plan, have changed since.
         """
         facts = json.loads(read_text(path / MIXTURE))
         if facts.get("format") != FORMAT:
-            raise DataError(f"{path / MIXTURE} has format {facts.get('format')!r}", FORMAT, "Write the list anew.")
+            raise DataError(f"{path / MIXTURE} has format {facts.get('format')!r}", FORMAT, "Write the list again.")
         folder = cls(path, facts)
         if folder.mixed.plan(0).hash != facts["plan"]:
             raise DataError(
                 f"{path}: the synthetic scans {folder.settings['synthetic']} are not those of the list",
-                "the bank or model that the list was written for",
-                "Write the list anew.",
+                "the bank or model for which the list was written",
+                "Write the list again.",
             )
         return folder
 
     @property
     def epoch(self) -> int:
-        """The epoch that training is in."""
+        """The current epoch of training."""
         file = self.path / f"{EPOCH}-{place(None, None)[0]}"
         return int(read_text(file)) if file.is_file() else 0
 
@@ -157,18 +157,18 @@ class Folder:
         """The scan of a slot in the current epoch, with its labels and boxes.
 
         Raises:
-            DataError: on a slot that is not there.
+            DataError: on a slot that does not exist.
         """
         key = (self.epoch, slot)
-        if key not in self._kept:
+        if key not in self._cached:
             scan = self.mixed.sample(*self._position(*key))
-            self._kept[key] = scan if self._view is None else in_view(scan, self._view)
-            if len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        return self._kept[key]
+            self._cached[key] = scan if self._view is None else in_view(scan, self._view)
+            if len(self._cached) > _CACHED:
+                self._cached.popitem(last=False)
+        return self._cached[key]
 
     def _position(self, epoch: int, slot: int) -> tuple[int, int]:
-        """Epoch and position of a slot: this epoch's, or, where it has no synthetic scan, the latest that has some."""
+        """Epoch and position of a slot: in this epoch, or in the latest one with synthetic scans if it has none."""
         if not 0 <= slot < self.slots:
             raise DataError(f"slot {slot} of {self.path}", f"0 to {self.slots - 1}")
         while not self.mixed.plan(epoch).synthetics:
@@ -191,10 +191,10 @@ def read_url(url: str) -> bytes:
     """The bytes of ``lsynth://<source>/<number>.bin`` (float32 x, y, z, reflectance) or ``.label`` (SemanticKITTI's).
 
     Args:
-        url: whose source is the folder of a mixed list, a bank, a checkpoint or a folder of scans.
+        url: the URL; its source is the folder of a mixed list, a bank, a checkpoint or a folder of scans.
 
     Raises:
-        DataError: on another URL, or labels of a scan that has none.
+        DataError: on any other URL, or on labels of a scan without labels.
     """
     source, _, name = url.removeprefix(PREFIX).rpartition("/")
     number, _, kind = name.partition(".")
@@ -218,10 +218,10 @@ def scan_of(source: str, number: int) -> Scan:
 
 
 def require_boxes(scan: Scan) -> Boxes:
-    """The boxes of a synthetic scan, for a detector.
+    """The boxes of a synthetic scan, for a detector; they may be zero in number.
 
     Raises:
-        DataError: where it has none, not even an empty list of them.
+        DataError: if ``scan.boxes`` is None.
     """
     if scan.boxes is None:
         raise DataError(

@@ -1,5 +1,8 @@
-"""Info lists of real scans for MMDetection3D 1.1 and later, from the datasets' own folders: what its ``create_data.py``
-writes, as far as training reads it, in JSON and without its compiled operators."""
+"""Info lists of real scans for MMDetection3D 1.1 and later, made from the datasets' own folders.
+
+They are the lists of its ``create_data.py``, reduced to the entries that training reads, in JSON, and made without its
+compiled operators.
+"""
 
 import json
 from pathlib import Path
@@ -16,14 +19,14 @@ from lidar_synth.formats.kitti_labels import boxes_to_camera
 from lidar_synth.geometry.scan import Boxes, Scan
 
 CLASSES = ("Pedestrian", "Cyclist", "Car", "Van", "Truck", "Person_sitting", "Tram", "Misc")
-"""``KittiDataset``'s, in its order."""
+"""The classes of ``KittiDataset``, in its order."""
 
 
 def semantic_kitti_list(root: str | Path, out: str | Path, split: str = "train") -> Path:
-    """The list of a SemanticKITTI folder; its paths are relative to ``root``.
+    """Write the list of a SemanticKITTI folder; its paths are relative to ``root``.
 
     Raises:
-        DataError, FileError: where the scans cannot be found, or the list cannot be written.
+        DataError, FileError: if the scans cannot be found, or the list cannot be written.
     """
     scans = SemanticKITTI(root, split)
     entries = []
@@ -36,9 +39,9 @@ def semantic_kitti_list(root: str | Path, out: str | Path, split: str = "train")
 
 
 def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: str = "velodyne_reduced") -> Path:
-    """The list of a KITTI object folder; its paths are relative to ``<root>/training/<points>``.
+    """Write the list of a KITTI object folder; its paths are relative to ``<root>/training/<points>``.
 
-    ``velodyne_reduced`` is written where it is missing. The ground plane is that of ``planes``, or fitted to the scan.
+    ``velodyne_reduced`` is written if it is missing. The ground plane is that of ``planes``, or fitted to the scan.
 
     Args:
         root: the folder that holds ``training`` and ``ImageSets``.
@@ -47,7 +50,7 @@ def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: 
         points: folder of the points.
 
     Raises:
-        DataError, FileError: where a scan, its boxes or its calibration cannot be read, or the list not be written.
+        DataError, FileError: if a scan, its boxes or its calibration cannot be read, or the list not be written.
     """
     scans, entries = KITTIObject(root, split), []
     for number in range(len(scans)):
@@ -66,7 +69,7 @@ def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: 
 
 
 def read_plane(path: Path) -> Any:
-    """(4,) a, b, c, d of a plane's file: the fourth line, as KITTI's planes are passed around."""
+    """Read (4,) a, b, c, d from a plane's file: the fourth line, as in the published planes of KITTI."""
     lines = read_text(path).splitlines()
     if len(lines) < 4:
         raise DataError(f"{path} has {len(lines)} lines", "four, the plane in the last one")

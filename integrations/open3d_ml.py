@@ -5,7 +5,7 @@
     dataset = dataset_class()(dataset_path="/data/SemanticKitti", mixture={"synthetic": "bank/", "ratio": 0.25})
     pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, ...)
 
-Its cache knows a sample by its name alone and would keep an epoch's synthetic scans for ever: ``use_cache`` is refused.
+Its cache identifies samples by name and would keep the synthetic scans of one epoch for ever: ``use_cache`` is refused.
 """
 
 from functools import cache
@@ -35,10 +35,10 @@ def dataset_class(package: str = "open3d.ml.datasets") -> Any:
     """The class ``MixedSemanticKITTI``, registered with Open3D-ML under that name.
 
     Args:
-        package: where its datasets are: in Open3D, or ``"ml3d.datasets"`` in a checkout of Open3D-ML.
+        package: the module of its datasets: that in Open3D, or ``"ml3d.datasets"`` in a checkout of Open3D-ML.
 
     Raises:
-        LibraryError: where it cannot be imported.
+        LibraryError: if it cannot be imported.
     """
     try:
         stock = import_module(f"{package}.semantickitti")
@@ -78,18 +78,18 @@ def dataset_class(package: str = "open3d.ml.datasets") -> Any:
 
 
 def _split_class(stock: Any) -> Any:
-    """The class of the training split, of the module with Open3D-ML's own."""
+    """Make the class of the training split from the module with Open3D-ML's own."""
 
     class MixedSplit(stock.SemanticKITTISplit):  # type: ignore[misc]
-        """The training split: real scans as they are and synthetic ones among them."""
+        """The training split: unchanged real scans, mixed with synthetic ones."""
 
         def __init__(self, dataset: Any, split: str = "training") -> None:
-            # The sampler, which the base makes, asks for the length.
+            # First, because the base class makes a sampler, which reads the length.
             self.mixed = mix(len(dataset.get_split_list(split)), dataset.mixture, lambda scan, rng: scan)
             super().__init__(dataset, split=split)
 
         def set_epoch(self, epoch: int) -> None:
-            """Choose the epoch; workers are told."""
+            """Set the epoch, also for workers."""
             self.mixed.set_epoch(epoch)
 
         def __len__(self) -> int:
@@ -105,7 +105,7 @@ def _split_class(stock: Any) -> Any:
             return {"point": points[:, :3], "feat": points[:, 3:], "label": class_ids(sample, _IDS)}
 
         def get_attr(self, idx: int) -> dict[str, Any]:
-            """Name and path; a synthetic scan's name tells its number, so that no two have the same."""
+            """Name and path; the name of a synthetic scan contains its number, and is therefore unique."""
             _, number = self.mixed.plan()[idx]
             if not self.mixed.domain(idx):
                 attr: dict[str, Any] = super().get_attr(number)
@@ -116,13 +116,13 @@ def _split_class(stock: Any) -> Any:
 
 
 def tell_epochs(pipeline: str = "open3d.ml.torch.pipelines") -> None:
-    """Have Open3D-ML's segmentation pipeline tell its training split which epoch begins.
+    """Make Open3D-ML's segmentation pipeline set the epoch of its training split.
 
     Args:
-        pipeline: where its pipelines are; ``"ml3d.torch.pipelines"`` in a checkout.
+        pipeline: the module of its pipelines; ``"ml3d.torch.pipelines"`` in a checkout.
 
     Raises:
-        LibraryError: where they cannot be imported.
+        LibraryError: if they cannot be imported.
     """
     try:
         module = import_module(f"{pipeline}.semantic_segmentation")

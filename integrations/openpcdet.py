@@ -4,8 +4,8 @@
     LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.openpcdet train.py \\
         --cfg_file cfgs/kitti_models/pointpillar.yaml --set DATA_CONFIG.DATASET MixedKitti
 
-The settings (``mixture.OPTIONS``) may as well stand in the data configuration, under ``LIDAR_SYNTH``. Nothing in
-OpenPCDet's tree is touched. KITTI's own samples pass through its own code.
+The settings (``mixture.OPTIONS``) may also be in the data configuration, under ``LIDAR_SYNTH``. OpenPCDet's files stay
+unchanged, and its own code processes KITTI's samples.
 """
 
 import runpy
@@ -38,16 +38,15 @@ NAME = "MixedKitti"
 
 
 class MixedKitti(KittiDataset):  # type: ignore[misc]
-    """KITTI with synthetic scans among its own, at the ratio of its settings; evaluation is on KITTI alone.
+    """KITTI mixed with synthetic scans at the ratio of its settings; evaluation uses only KITTI.
 
-    OpenPCDet replaces a scan that has no box after augmentation by a random other one. Here a real one is replaced
-    by a real one, and a synthetic one is refused by an error, so that the ratio holds: give synthetic scans boxes
-    by ``labels: mix``.
+    OpenPCDet replaces a scan without boxes after augmentation by another random scan. To keep the ratio, a real scan is
+    replaced by a real one here, and a synthetic one raises an error: ``labels: mix`` gives synthetic scans boxes.
     """
 
     def __init__(self, dataset_cfg: Any, class_names: Any, training: bool = True, **options: Any) -> None:
         super().__init__(dataset_cfg=dataset_cfg, class_names=class_names, training=training, **options)
-        self._asked: int | None = None  # the position whose sample is being made
+        self._current: int | None = None  # the position whose sample is being made
         self.mixed = None
         if training:
             self.mixed = mix(
@@ -58,54 +57,54 @@ class MixedKitti(KittiDataset):  # type: ignore[misc]
             self._check_boxes()
 
     def merge_all_iters_to_one_epoch(self, merge: bool = True, epochs: int | None = None) -> None:
-        """Not with a mixture: it changes from epoch to epoch.
+        """Refuse to merge epochs of a mixture, which differ from one another.
 
         Raises:
-            ConfigError: if asked to.
+            ConfigError: with ``merge`` for a mixture.
         """
         if merge and self.mixed is not None:
             raise ConfigError(f"merge_all_iters_to_one_epoch with {NAME}", "epochs one by one")
         super().merge_all_iters_to_one_epoch(merge, epochs)
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch; its workers are told."""
+        """Set the epoch, also for workers."""
         if self.mixed is not None:
             self.mixed.set_epoch(epoch)
 
     def domain(self, index: int) -> int:
-        """0 where a real sample stands in this epoch, 1 where a synthetic one does."""
+        """0 if the sample at ``index`` is real in this epoch, 1 if it is synthetic."""
         return 0 if self.mixed is None else self.mixed.domain(index)
 
     def __len__(self) -> int:
         # While KITTI's own code works, it counts KITTI's scans.
-        return super().__len__() if self.mixed is None or self._asked is not None else len(self.mixed)
+        return super().__len__() if self.mixed is None or self._current is not None else len(self.mixed)
 
     def __getitem__(self, index: int) -> Any:
         if self.mixed is None:
             return super().__getitem__(index)
-        if self._asked is not None:
-            return self._instead(index)
-        self._asked = index
+        if self._current is not None:
+            return self._replacement(index)
+        self._current = index
         try:
             sample = self.mixed[index]
             return self._synthetic(sample) if isinstance(sample, Scan) else super().__getitem__(int(sample))
         finally:
-            self._asked = None
+            self._current = None
 
-    def _instead(self, index: int) -> Any:
-        """What ``prepare_data`` asks for in the place of a scan without a box in the end."""
-        assert self.mixed is not None and self._asked is not None
-        if not self.mixed.domain(self._asked):
+    def _replacement(self, index: int) -> Any:
+        """The sample with which ``prepare_data`` replaces a scan without boxes after augmentation."""
+        assert self.mixed is not None and self._current is not None
+        if not self.mixed.domain(self._current):
             return super().__getitem__(index % len(self.kitti_infos))
-        scan = self.mixed[self._asked]
+        scan = self.mixed[self._current]
         raise DataError(
             f"synthetic scan {scan.id!r} has no box of {list(self.class_names)} in range after augmentation",
-            "at least one, or OpenPCDet would put another scan in its place",
-            "labels: mix with a bank of objects, and gt_sampling, give it some.",
+            "at least one, because OpenPCDet would replace the scan by another one",
+            "Use labels: mix with a bank of objects, and gt_sampling.",
         )
 
     def _synthetic(self, scan: Scan) -> Any:
-        """A synthetic scan through the trainer's own augmentation and processing."""
+        """Process a synthetic scan with the trainer's own augmentation and processing."""
         scan = in_view(scan, self._view[1]) if self.dataset_cfg.FOV_POINTS_ONLY else scan
         values = np.zeros((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()
         names = np.array([] if scan.boxes is None else scan.boxes.names, dtype=str)
@@ -125,7 +124,7 @@ class MixedKitti(KittiDataset):  # type: ignore[misc]
         return sample
 
     def _check_files(self) -> None:
-        """Every real scan needs a calibration, and a plane for GT sampling; OpenPCDet fails on the first without."""
+        """Check that every real scan has a calibration, and for GT sampling a plane, without which OpenPCDet fails."""
         frames = [info["point_cloud"]["lidar_idx"] for info in self.kitti_infos]
         needed = {"calib": ("KITTI's calibration of every scan", "")}
         if any(step.get("USE_ROAD_PLANE", False) for step in self._sampling()):
@@ -138,7 +137,7 @@ class MixedKitti(KittiDataset):  # type: ignore[misc]
                 raise ConfigError(f"{folder} without {len(missing)} scans ({missing[0]}, ...)", expected, hint)
 
     def _check_boxes(self) -> None:
-        """The first synthetic scan tells whether there are boxes, and of classes that are known here."""
+        """Check by the first synthetic scan that there are boxes of known classes."""
         assert self.mixed is not None
         for position in np.flatnonzero(self.mixed.plan().domain)[:1]:
             scan = self.mixed[int(position)]
@@ -157,10 +156,11 @@ class MixedKitti(KittiDataset):  # type: ignore[misc]
         return [s for s in steps.AUG_CONFIG_LIST if s.NAME == "gt_sampling" and s.NAME not in unused]
 
     def _camera(self) -> tuple[Any, Calibration, Any]:
-        """The camera of the first real scan, in which synthetic ones are seen, as OpenPCDet and as we hold it."""
-        asked = set(self.dataset_cfg.get("GET_ITEM_LIST", ["points"]))
-        if asked - {"points"}:
-            raise ConfigError(f"GET_ITEM_LIST {sorted(asked)} with {NAME}", "['points']: there is no picture")
+        """The camera of the first real scan, to which synthetic scans are cropped: OpenPCDet's object, our calibration,
+        and the image shape."""
+        items = set(self.dataset_cfg.get("GET_ITEM_LIST", ["points"]))
+        if items - {"points"}:
+            raise ConfigError(f"GET_ITEM_LIST {sorted(items)} with {NAME}", "['points']: there is no picture")
         info = self.kitti_infos[0]
         calib, shape = self.get_calib(info["point_cloud"]["lidar_idx"]), info["image"]["image_shape"]
         camera_from_sensor = homogeneous(calib.R0) @ homogeneous(calib.V2C)
@@ -168,22 +168,22 @@ class MixedKitti(KittiDataset):  # type: ignore[misc]
 
 
 def register() -> None:
-    """Make ``DATASET: MixedKitti`` known to OpenPCDet."""
+    """Register ``DATASET: MixedKitti`` with OpenPCDet."""
     pcdet.datasets.__all__[NAME] = MixedKitti
 
 
 def tell_epochs() -> None:
-    """Have OpenPCDet's training loop tell its dataset which epoch begins; ``tools`` has to be on the path."""
+    """Make OpenPCDet's training loop set the epoch of its dataset; ``tools`` must be on the path."""
     from train_utils import train_utils as loop
 
-    inner = loop.train_one_epoch
+    original = loop.train_one_epoch
 
-    def told(model: Any, optimizer: Any, train_loader: Any, *args: Any, **options: Any) -> Any:
+    def with_epoch(model: Any, optimizer: Any, train_loader: Any, *args: Any, **options: Any) -> Any:
         if hasattr(train_loader.dataset, "set_epoch"):
             train_loader.dataset.set_epoch(options["cur_epoch"])
-        return inner(model, optimizer, train_loader, *args, **options)
+        return original(model, optimizer, train_loader, *args, **options)
 
-    loop.train_one_epoch = told
+    loop.train_one_epoch = with_epoch
 
 
 def main() -> None:

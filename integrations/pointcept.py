@@ -1,4 +1,4 @@
-"""Pointcept: SemanticKITTI with synthetic scans among its own, registered when a configuration imports this module::
+"""Pointcept: SemanticKITTI mixed with synthetic scans, registered when a configuration imports this module::
 
     custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False)
     hooks = [dict(type="SynthEpoch"), ...]
@@ -41,7 +41,7 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
 
     Args:
         mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them.
-        options: as for ``SemanticKITTIDataset``. ``cache`` is refused: it knows a sample by its name alone.
+        options: as for ``SemanticKITTIDataset``. ``cache`` is refused, because it identifies samples by name only.
 
     Raises:
         ConfigError: on settings that cannot be served, ``test_mode`` or ``cache``.
@@ -58,11 +58,11 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
         self.mixed = mix(len(self.data_list), settings, lambda scan, rng: scan)
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch; workers are told, persistent ones too."""
+        """Set the epoch, also for workers, persistent ones included."""
         self.mixed.set_epoch(epoch)
 
     def domain(self, index: int) -> int:
-        """0 where a real sample stands in this epoch, 1 where a synthetic one does."""
+        """0 if the sample at ``index`` is real in this epoch, 1 if it is synthetic."""
         return int(self.mixed.domain(index % len(self.mixed)))
 
     def __len__(self) -> int:
@@ -85,14 +85,14 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
 
 @HOOKS.register_module()
 class SynthEpoch(HookBase):  # type: ignore[misc]
-    """Tells the dataset the next epoch when one ends: Pointcept's loader asks for its scans before hooks are called."""
+    """Sets the next epoch when one ends, because Pointcept's loader requests scans before it calls hooks."""
 
     def before_train(self) -> None:
-        """The epoch in which training begins."""
+        """Set the epoch in which training begins."""
         self._tell(self.trainer.start_epoch)
 
     def after_epoch(self) -> None:
-        """The epoch that comes."""
+        """Set the next epoch."""
         self._tell(self.trainer.epoch + 1)
 
     def _tell(self, epoch: int) -> None:

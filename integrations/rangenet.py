@@ -1,10 +1,9 @@
-"""RangeNet++ (lidar-bonnetal) and SalsaNext: a ``parser.py`` that they load by the name in their data configuration.
+"""RangeNet++ (lidar-bonnetal) and SalsaNext: a ``parser.py`` that they load by the name in their data configuration::
 
     python -m lidar_synth.integrations.rangenet mix.yaml train/tasks/semantic/dataset/mixed
 
-writes that folder, two lines that say which settings to use; ``name: "mixed"`` in the data YAML selects it. The
-trainer's own parser reads every scan: a synthetic one goes through a file in memory (``/dev/shm`` on Linux), which is
-gone when it has been read.
+writes that folder with two lines that name the settings; ``name: "mixed"`` in the data YAML selects it. The trainer's
+own parser reads every scan: a synthetic one is passed through a temporary file in memory (``/dev/shm`` on Linux).
 """
 
 import sys
@@ -38,10 +37,10 @@ _MEMORY = next((str(folder) for folder in (Path("/dev/shm"),) if folder.is_dir()
 
 @cache
 def dataset_class() -> Any:
-    """A subclass of the trainer's ``SemanticKitti`` whose scans are real and synthetic.
+    """Make a subclass of the trainer's ``SemanticKitti`` that mixes real and synthetic scans.
 
     Raises:
-        LibraryError: where the trainer's own parser cannot be imported.
+        LibraryError: if the trainer's own parser cannot be imported.
     """
     try:
         stock = import_module(STOCK)
@@ -51,7 +50,7 @@ def dataset_class() -> Any:
         ) from error
 
     class Mixed(stock.SemanticKitti):  # type: ignore[misc, name-defined]
-        """The trainer's dataset with synthetic scans among its own."""
+        """The trainer's dataset, mixed with synthetic scans."""
 
         scan_files: Any
         label_files: Any
@@ -65,7 +64,7 @@ def dataset_class() -> Any:
             self.mixed = mix(len(self.scan_files), settings, lambda scan, rng: scan)
 
         def set_epoch(self, epoch: int) -> None:
-            """Choose the epoch; workers are told."""
+            """Set the epoch, also for workers."""
             self.mixed.set_epoch(epoch)
 
         def __len__(self) -> int:
@@ -93,10 +92,10 @@ def dataset_class() -> Any:
 
 
 def make_parser(settings: Any) -> Any:
-    """The class ``Parser`` for a ``parser.py``: the trainer's own, with a mixed training set.
+    """Make the class ``Parser`` for a ``parser.py``: the trainer's own, with a mixed training set.
 
     Args:
-        settings: of the mixture, or a YAML file of them.
+        settings: settings of the mixture, or a YAML file of them.
     """
     settings = read_settings(settings)
     stock = import_module(STOCK)
@@ -127,7 +126,7 @@ def make_parser(settings: Any) -> Any:
 
 
 def _write(folder: Path, scan: Scan) -> tuple[str, str]:
-    """The scan as the two files of sequence ``synthetic``; the trainer takes names from the path."""
+    """Write the scan as the two files of sequence ``synthetic``; the trainer reads names from the path."""
     name = "".join(letter if letter.isalnum() else "_" for letter in scan.id)
     class_ids(scan, _TRAIN_IDS)  # refuses a scan without a valid label
     paths = [folder / "synthetic" / kind / f"{name}.{ext}" for kind, ext in (("velodyne", "bin"), ("labels", "label"))]
@@ -138,7 +137,7 @@ def _write(folder: Path, scan: Scan) -> tuple[str, str]:
 
 
 def _check_classes(learning_map: dict[int, int], inverse: dict[int, int]) -> None:
-    """The trainer's classes have to keep our 19 apart: each of the file's classes comes back from its own."""
+    """Check that the trainer's classes distinguish our 19: mapping each class and back must not change it."""
     raw = SEMANTIC_KITTI.from_train or ()
     lost = [c for c in raw if inverse.get(learning_map.get(c, -1)) != c]
     if lost or learning_map.get(0) != 0:
@@ -150,10 +149,10 @@ def _check_classes(learning_map: dict[int, int], inverse: dict[int, int]) -> Non
 
 
 def write_parser(settings: str | Path, folder: str | Path) -> Path:
-    """A folder with the ``parser.py`` that the trainers load by name.
+    """Write a folder with the ``parser.py`` that the trainers load by name.
 
     Raises:
-        ConfigError, FileError: where the settings cannot be read, or the folder not be written.
+        ConfigError, FileError: if the settings cannot be read, or the folder not be written.
     """
     read_settings(settings)
     path = Path(folder) / "parser.py"

@@ -69,7 +69,7 @@ def check(accelerator: Any) -> None:
             if isinstance(by_default, MixedStream)
             else DataLoader(train, batch_sampler=by_default, collate_fn=train.collate)
         )
-        with pytest.raises(ConfigError, match=r"of 2 by default, and an Accelerator.*rank=0, world_size=1"):
+        with pytest.raises(ConfigError, match=r"of 2 and an Accelerator.*rank=0, world_size=1"):
             iter(by_default)
         prepared = accelerator.prepare(twice)
         if accelerator.is_main_process:  # that of a stream is the only one to read

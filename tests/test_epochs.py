@@ -20,7 +20,7 @@ from lidar_synth.mixing.epochs import Position
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
 REAL = 200
-LATE = r"set_epoch\(1\) while a DataLoader was going through epoch 0.*before iter.*batch_sampler=train.batches"
+LATE = r"set_epoch\(1\) while a DataLoader was iterating over epoch 0.*before iter.*batch_sampler=train.batches"
 
 
 def mixed(real: int = REAL, ratio: Any = 0.25, **options: Any) -> MixedScans:
@@ -179,7 +179,7 @@ def caught() -> Iterator[list[warnings.WarningMessage]]:
         yield messages
 
 
-AGAIN = "epoch 0 begins once more"
+AGAIN = "epoch 0 begins again"
 
 
 def test_an_epoch_that_comes_again_is_said_once(caught: list[warnings.WarningMessage]) -> None:
@@ -279,6 +279,6 @@ def test_batches_that_are_shared_twice_are_noticed_at_the_next_pass(
         list(loader)
         train.set_epoch(1)
         list(loader)
-        expected = ["of 26 samples that rank 0 of 2"] if shared and ranks == 2 else []
+        expected = ["of 26 samples for rank 0 of 2,"] if shared and ranks == 2 else []
         assert [str(w.message)[:30] for w in caught if "library" in str(w.message)] == expected
         caught.clear()

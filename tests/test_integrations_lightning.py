@@ -175,7 +175,7 @@ def test_a_checkpoint_within_an_epoch_needs_steps_of_its_size() -> None:
 def test_epochs_that_grow_are_not_cut_short(tmp_path: Path) -> None:
     mixed = MixedScans(Scans("r", 8), Endless(), ratio=[0.0, 0.5])
     data = module.MixedData(mixed, batch_size=4)
-    with pytest.raises(ConfigError, match="epoch 1 of 4 batches, where Lightning counts on 2.*reload_dataloaders"):
+    with pytest.raises(ConfigError, match="epoch 1 of 4 batches, but Lightning expects 2.*reload_dataloaders"):
         trainer(tmp_path, 2, enable_checkpointing=False).fit(Model(), data)
     model = Model()
     trainer(tmp_path, 2, enable_checkpointing=False, reload_dataloaders_every_n_epochs=1).fit(model, data)

@@ -270,7 +270,7 @@ def test_a_bank_is_read_by_url(made: Path) -> None:
 def test_what_cannot_be_trained_on_is_refused_before(made: Path, tmp_path: Path) -> None:
     listed, root = made / "sk" / "train.json", {"data_root": made / "sk"}
     for labels in ("none", "ignore"):
-        with pytest.raises(ConfigError, match="its loss, a mean over none, is NaN"):
+        with pytest.raises(ConfigError, match="loss, a mean over no label, is NaN"):
             write_infos(tmp_path / "a", listed, MIX | {"synthetic": made / "synthetic", "labels": labels}, **root)
     unlabelled = synthetic(tmp_path / "unlabelled", 2, labels=False)
     with pytest.raises(ConfigError, match="a model or bank with labels"):

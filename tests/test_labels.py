@@ -285,10 +285,10 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
     bare, labelled = [replace(cast(), label=None, boxes=None)], [replace(cast(), boxes=None, instance=None)]
     plain = frozenset({"reflectance"})
     return [
-        ("generated", {"fields": plain}, "labels='generated', but the synthetic scans carry.*Use labels='none'"),
+        ("generated", {"fields": plain}, "labels='generated', but .* the synthetic scans only have.*Use labels='none'"),
         ("generated", {"fields": frozenset({"label"}), "threshold": 0.5}, "without confidence"),
         ("generated", {"threshold": 1.5}, "threshold 1.5; expected a number from 0 to 1"),
-        ("condition", {"fields": plain}, "labels='condition', but the synthetic scans carry"),
+        ("condition", {"fields": plain}, "labels='condition', but .* the synthetic scans only have"),
         ("pseudo", {}, "teacher=None; expected a function"),
         ("pseudo", {"teacher": teacher, "threshold": -1}, "threshold -1"),
         ("none", {"threshold": 0.5}, "labels='none'.*'threshold'; expected no options"),

@@ -145,7 +145,7 @@ COLLISIONS = {
 def test_two_scans_never_share_a_file(out: Path, to: str) -> None:
     for number, ids in enumerate(COLLISIONS[to]):
         folder = out / str(number)
-        with pytest.raises(DataError, match=r"scan 1 is called .*that no scan before it has"):
+        with pytest.raises(DataError, match=r"scan 1 is called .*that no earlier scan has"):
             convert(Named(*ids), WRITERS[to](folder / "a"), progress=False)
         for expected in (Report(written=1), Report(kept=1)):
             report = convert(Named(*ids), WRITERS[to](folder / "b"), on_bad="skip", progress=False)

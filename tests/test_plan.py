@@ -325,13 +325,13 @@ def test_what_is_left_is_left_for_any_number_of_ranks() -> None:
         (lambda: mixture(seed=-1), ConfigError, r"seed -1"),
         (lambda: mixture(real=0), DataError, r"a source without scans"),
         (lambda: Mixture((), (ENDLESS,), make_schedule(0.5), epoch_size=4), DataError, r"no real scans.*ratio=1"),
-        (lambda: Mixture((), (ENDLESS,), make_schedule(1.0)), DataError, r"no real scans.*give epoch_size"),
+        (lambda: Mixture((), (ENDLESS,), make_schedule(1.0)), DataError, r"no real scans.*set epoch_size"),
         (lambda: Mixture((THREE,), (), make_schedule(0.5)), ConfigError, r"ratio 0.5 .* without a synthetic source"),
         (lambda: Mixture((WEIGHED,), (ENDLESS,), make_schedule(0.5)), ConfigError, r"weights of real sources"),
         (lambda: Mixture((THREE,), (PlannedSource(3, 0.0),), make_schedule(0.5)), ConfigError, r"weight 0.0"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_planned(make: object, error: type[Exception], message: str) -> None:
+def test_invalid_plans_are_refused(make: object, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make()  # type: ignore[operator]
 

@@ -102,7 +102,7 @@ def test_a_damaged_judge_is_refused(judge: Judge, tmp_path: Path, damage: Callab
     path = tmp_path / "a.safetensors"
     judge.save(path)
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(DataError, match=r"no segmenter of this version"):
+    with pytest.raises(DataError, match=r"not a segmenter of this version"):
         load_judge(path)
 
 

@@ -79,7 +79,7 @@ def test_a_bank_outlives_a_worker_and_names_a_dead_generator(bank: RollingBank) 
     with pytest.raises(ProcessError, match=message):
         list(batches)
     for _ in range(2):  # a line that was open, and a new one
-        with pytest.raises(ProcessError, match=message + ", exit code -9; it said nothing"):
+        with pytest.raises(ProcessError, match=message + ", exit code -9; no message"):
             bank[0]
 
 

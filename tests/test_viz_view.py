@@ -80,7 +80,7 @@ def test_view_accepts_a_sensor_and_writes_a_sheet(view: View) -> None:
     (["--out", "scan.jpg"], r"scan\.jpg; expected a file that ends in \.png or \.html"),
     (["--sensor", "velodyne"], r"sensor 'velodyne'; expected one of"),
 ])  # fmt: skip
-def test_invalid_arguments_are_explained(view: View, args: list[str], message: str) -> None:
+def test_the_error_of_a_wrong_call_names_the_right_one(view: View, args: list[str], message: str) -> None:
     result = view(*args)
     assert isinstance(result.exception, ConfigError)
     assert re.search(message, str(result.exception))

@@ -165,8 +165,8 @@ def damaged(path: Path, **members: bytes | None) -> None:
         ({"json": b"{"}, "JSONDecodeError"),
         ({"json": b"{}"}, "KeyError.*names"),
         ({"points_npy": None}, "KeyError.*points"),
-        ({"points_npy": b"no"}, "points.npy has no header of numpy's"),
-        ({"label_npy": b"\x93NUMPY"}, "label.npy has no header of numpy's"),
+        ({"points_npy": b"no"}, "points.npy has no header of an .npy file"),
+        ({"label_npy": b"\x93NUMPY"}, "label.npy has no header of an .npy file"),
     ],
 )
 def test_damaged_members_are_named_and_skipped(tmp_path: Path, members: dict[str, bytes | None], message: str) -> None:
@@ -183,9 +183,9 @@ def test_damaged_and_missing_files(tmp_path: Path) -> None:
     content = path.read_bytes()
     for length in (100, 700, len(content) // 2):
         path.write_bytes(content[:length])
-        with pytest.raises(DataError, match="scans-000001.tar is cut, damaged or no tar file"):
+        with pytest.raises(DataError, match="scans-000001.tar is truncated, damaged or not a tar file"):
             open_scans(tmp_path)
-        with pytest.raises(DataError, match="scans-000001.tar is cut, damaged or no tar file"):
+        with pytest.raises(DataError, match="scans-000001.tar is truncated, damaged or not a tar file"):
             convert([some_scan()], WebDatasetWriter(tmp_path), progress=False)
     path.write_bytes(content)
     scans = open_scans(tmp_path)

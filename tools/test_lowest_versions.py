@@ -22,10 +22,10 @@ ROOT = Path(__file__).parent.parent
 KEPT = ("torch", "open3d")
 """Dependencies whose version stays that of the environment that runs this."""
 
-TESTS = ("test_formats.py", "test_bad_input.py", "test_bank.py", "test_bank_encoding.py", "test_bank_damage.py",
-         "test_bank_hostile.py",
-         "test_bank_url.py", "test_convert.py",
-         "test_paste.py", "test_curate.py", "test_curated_banks.py", "test_curate_rules.py",
+TESTS = ("test_formats.py", "test_formats_annotations.py", "test_bad_input.py", "test_bad_files.py", "test_bank.py",
+         "test_bank_encoding.py", "test_bank_damage.py", "test_bank_hostile.py", "test_bank_url.py",
+         "test_convert.py", "test_convert_content.py", "test_paste.py", "test_object_bank.py",
+         "test_curate.py", "test_curated_banks.py", "test_curate_rules.py",
          "test_verify.py", "test_projection.py", "test_sensor.py",
          "test_config.py", "test_checkpoint.py", "test_files.py")  # fmt: skip
 

@@ -200,7 +200,7 @@ class View(io.RawIOBase):
 
 
 def is_url(path: str | Path) -> bool:
-    """Whether a path is a URL."""
+    """Whether a path is a URL, which fsspec opens."""
     return isinstance(path, str) and "://" in path
 
 

@@ -1,6 +1,6 @@
-"""What the labels mean: SemanticKITTI's 19 training classes and the tables of other datasets.
+"""Semantic classes: SemanticKITTI's 19 training classes, and the mappings of other datasets to them.
 
-Inside the package a label is a train id 0..18 as uint8, and ``IGNORE`` (255) where there is none.
+Inside the package a label is a train id 0..18 as uint8, or ``IGNORE`` (255) for unlabelled points.
 The sources are http://www.semantic-kitti.org/dataset.html (``semantic-kitti.yaml``),
 https://www.cvlibs.net/datasets/kitti-360/documentation.php and
 https://www.nuscenes.org/nuscenes#lidarseg.

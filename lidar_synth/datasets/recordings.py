@@ -1,13 +1,13 @@
-"""Which recorded frames a set of scans holds, so that no model is measured on what it was trained on.
+"""The recorded frames of a set of scans, to detect evaluation of a model on its training data.
 
-A frame is a dataset, a drive of it and a number. Names of splits do not tell: what LiDM trains on (``lidm/train``) and
-what R2Flow tests on (``r2flow/test``) share two drives of KITTI-360. Nor do names of datasets: the sequences of
-SemanticKITTI are those of KITTI's odometry benchmark, which were cut from KITTI's raw drives. Both are kept as raw
-drives here, by the table of the odometry devkit's readme (``ODOMETRY``). KITTI-360 was recorded two years later and
-shares nothing with them.
+A frame is identified by dataset, drive and number. Names of splits are not sufficient: the training data of LiDM
+(``lidm/train``) and the test data of R2Flow (``r2flow/test``) share two drives of KITTI-360. Neither are names of
+datasets: the sequences of SemanticKITTI are those of KITTI's odometry benchmark, which are parts of KITTI's raw
+drives. Both are therefore represented as raw drives, by the table in the odometry devkit's readme (``ODOMETRY``).
+KITTI-360 was recorded two years later and has no frames in common with them.
 
-KITTI's object set was drawn from the raw drives too, in random order; which frame is which stands only in its devkit
-(mapping/), so that it counts as a dataset of its own.
+KITTI's object set was also sampled from the raw drives, in random order. Only its devkit (mapping/) contains the
+mapping, so that the object set counts as a dataset of its own.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,10 +17,10 @@ from typing import Any
 from lidar_synth.errors import DataError
 
 KITTI360, KITTI, KITTI_OBJECT, TOWN, FILES = "KITTI-360", "KITTI", "KITTI object", "town", "files"
-"""Datasets. A drive of the town is a seed; one of ``FILES``, a path whose scans no dataset is known of."""
+"""Names of datasets. A drive of the town is a seed; a drive of ``FILES`` is a path with scans of an unknown dataset."""
 
 Frames = tuple[tuple[int, int], ...] | None
-"""Frames of a drive: first and last of each run of them, rising; None = all."""
+"""Frames of a drive as increasing intervals (first, last); None = all."""
 
 
 def _drives(*drives: int) -> tuple[str, ...]:
@@ -36,7 +36,7 @@ KITTI360_SPLITS: dict[str, tuple[str, ...] | None] = {
     "lidm-camera/val": _drives(3),
     "all": None,
 }
-"""Drives of KITTI-360's splits, by the work that introduced each; None = all that are there."""
+"""Drives of KITTI-360's splits, named after the work that introduced each; None = all existing drives."""
 
 ODOMETRY = {
     "00": ("2011_10_03_drive_0027", 0, 4540),
@@ -54,15 +54,15 @@ ODOMETRY = {
 """Raw drive, first and last frame of each sequence of the odometry benchmark; those of 11 to 21 are not published."""
 
 NOTE = ".sample.json"
-"""The file beside generated scans that says how they were made, and what their model has seen."""
+"""The file beside generated scans with the settings of generation and the training data of the model."""
 
-_MOST_RUNS = 200  # of a drive; more are kept as one from the first frame to the last
-_SHOWN = 6  # drives in a message
+_MOST_RUNS = 200  # maximum number of intervals of a drive; more become one from the first frame to the last
+_SHOWN = 6  # number of drives in a message
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """A set of recorded frames; ``|`` joins two, ``&`` gives what they share.
+    """A set of recorded frames; ``|`` is the union of two sets, ``&`` their intersection.
 
     Args:
         drives: {(dataset, drive): frames}.
@@ -76,8 +76,8 @@ class Recordings:
     def __or__(self, other: "Recordings") -> "Recordings":
         joined = dict(self.drives)
         for key, frames in other.drives.items():
-            held = joined.get(key, ())
-            joined[key] = None if frames is None or held is None else _merged([*held, *frames])
+            own = joined.get(key, ())
+            joined[key] = None if frames is None or own is None else _merged([*own, *frames])
         return Recordings(joined)
 
     def __and__(self, other: "Recordings") -> "Recordings":
@@ -86,15 +86,15 @@ class Recordings:
 
     def __str__(self) -> str:
         named = [
-            f"{dataset} {drive} ({_told(frames)})"
+            f"{dataset} {drive} ({_in_words(frames)})"
             for (dataset, drive), frames in sorted(self.drives.items(), key=lambda d: d[0])
         ]
         more = f" and {len(named) - _SHOWN} more drives" if len(named) > _SHOWN else ""
         return ", ".join(named[:_SHOWN]) + more
 
     def to_list(self) -> list[dict[str, Any]]:
-        """Plain values, as a checkpoint's provenance holds them: for each dataset its drives, and for each drive the
-        first and the last frame of its runs, or null for the whole drive."""
+        """Convert to plain values, for a checkpoint's provenance: for each dataset its drives, and for each drive the
+        intervals (first, last) of its frames, or null for all frames."""
         values: dict[str, dict[str, list[list[int]] | None]] = {}
         for (dataset, drive), frames in sorted(self.drives.items(), key=lambda d: d[0]):
             values.setdefault(dataset, {})[drive] = None if frames is None else [list(run) for run in frames]
@@ -105,7 +105,7 @@ class Recordings:
         """The inverse of ``to_list``.
 
         Raises:
-            DataError: on values that are none of it.
+            DataError: on values of another form.
         """
         try:
             drives = {(str(p["dataset"]), str(d)): frames for p in values for d, frames in p["drives"].items()}
@@ -125,8 +125,8 @@ def frames_of(layout: str, ids: Iterable[str]) -> Recordings:
     """The recordings behind the ids of scans, or of whole drives.
 
     Args:
-        layout: one of ``PLACES``; nothing is known of the scans of others.
-        ids: ``drive/frame`` of each scan as the layout's reader names them, or ``drive`` for all of its frames.
+        layout: one of ``PLACES``; the result for any other layout is empty.
+        ids: ``drive/frame`` of each scan in the layout's naming, or ``drive`` for all of its frames.
     """
     numbers: dict[str, set[str]] = {}
     for name in ids if layout in PLACES else ():
@@ -143,7 +143,7 @@ def frames_of(layout: str, ids: Iterable[str]) -> Recordings:
 
 
 Place = tuple[str, str, int, int | None]
-"""Dataset, drive, and the numbers that the first and the last frame have in it (None = to its end)."""
+"""Dataset, drive, and the numbers of the first and the last frame within the drive (None = to its end)."""
 
 
 def _sequence(name: str) -> Place:
@@ -159,17 +159,17 @@ PLACES: dict[str, Callable[[str], Place]] = {
     "semantic_kitti": _sequence,
     "kitti_object": lambda part: (KITTI_OBJECT, part, 0, None),
 }
-"""Where a drive of a layout was recorded."""
+"""{layout: function from its drive to the recording}."""
 
 
 def _runs(numbers: Sequence[int]) -> Frames:
-    """Numbers of frames as runs."""
+    """Convert numbers of frames to intervals."""
     runs = _merged([(n, n) for n in numbers])
     return runs if len(runs) <= _MOST_RUNS else ((runs[0][0], runs[-1][1]),)
 
 
 def _merged(runs: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """Rising runs, those that touch joined."""
+    """Sort intervals, and merge those that touch or overlap."""
     joined: list[tuple[int, int]] = []
     for first, last in sorted(runs):
         if joined and first <= joined[-1][1] + 1:
@@ -180,14 +180,14 @@ def _merged(runs: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
 
 
 def _shared(some: Frames, others: Frames) -> Frames:
-    """Frames that are in both."""
+    """The intersection of two sets of frames."""
     if some is None or others is None:
         return others if some is None else some
     both = ((max(a, c), min(b, d)) for a, b in some for c, d in others)
     return _merged([(first, last) for first, last in both if first <= last])
 
 
-def _told(frames: Frames) -> str:
+def _in_words(frames: Frames) -> str:
     if frames is None:
         return "all frames"
     count = sum(last - first + 1 for first, last in frames)

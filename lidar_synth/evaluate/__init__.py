@@ -1,7 +1,8 @@
-"""First measures of realism. A name such as JSD or MMD means different things in different papers, so that
-every figure carries the protocol it was measured by; figures of two protocols are not comparable.
+"""Metrics of realism. Names such as JSD or MMD have different definitions in different papers. Every score therefore
+carries its protocol; scores of different protocols are not comparable.
 
-To add a protocol: one file with ``cloud``, what is kept of a cloud, and ``compare``; one line in ``PROTOCOLS``.
+To add a protocol, write a module with ``cloud``, a description of a cloud, and ``compare``, and add a line to
+``PROTOCOLS``.
 """
 
 from lidar_synth.evaluate.distances import frechet_distance, jensen_shannon_distance, squared_mmd

@@ -1,4 +1,4 @@
-"""Distances between two distributions, each given by numbers alone: histograms or feature vectors."""
+"""Distances between two distributions of histograms or feature vectors."""
 
 from typing import Protocol
 
@@ -9,8 +9,8 @@ from lidar_synth.errors import DataError
 
 
 def jensen_shannon_distance(p: NDArray[np.number], q: NDArray[np.number]) -> float:
-    """Square root of the Jensen-Shannon divergence (natural logarithm), in [0, sqrt(log 2)]; what both peers
-    report as JSD.
+    """Square root of the Jensen-Shannon divergence (natural logarithm), in [0, sqrt(log 2)]; LiDM and R2Flow both
+    report it as JSD.
 
     Args:
         p: non-negative weights of any shape; need not be normalised.
@@ -54,7 +54,7 @@ def frechet_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
 
 
 class Chooser(Protocol):
-    """What ``squared_mmd`` draws with: a ``numpy.random.Generator`` or a ``RandomState``."""
+    """A sampler for ``squared_mmd``: a ``numpy.random.Generator`` or a ``RandomState``."""
 
     def choice(self, a: int, size: int, replace: bool) -> NDArray[np.int64]: ...
 
@@ -72,9 +72,9 @@ def squared_mmd(
     Args:
         real: (N, D) features.
         generated: (M, D) features of the same extractor.
-        rng: draws the subsets; seed 0 by default.
-        subsets: how many.
-        size: of a subset, at most; never more than N or M.
+        rng: samples the subsets; by default with seed 0.
+        subsets: number of subsets.
+        size: maximum size of a subset; also limited by N and M.
 
     Raises:
         DataError: as ``frechet_distance``.

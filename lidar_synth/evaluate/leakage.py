@@ -1,8 +1,8 @@
-"""What a model was trained on, and whether that is what it is measured on.
+"""Detection of data leakage: the recordings a model was trained on, and their overlap with evaluation data.
 
-A checkpoint's provenance holds under ``seen`` all recordings that its weights know: its own training data and those of
-its teacher, its start and its autoencoder. Provenances without it, of version 0.1.0, name a split or a path instead; a
-split whose drives are known stands for them, a path for itself.
+A checkpoint's provenance lists under ``seen`` all recordings that influenced its weights: its own training data and
+those of its teacher, its initial weights and its autoencoder. Provenances of version 0.1.0 have no ``seen`` but a split
+or a path; a split with known drives is replaced by these drives, a path is kept as a path.
 """
 
 import json
@@ -34,17 +34,17 @@ from lidar_synth.town.export import SETTINGS
 
 
 def seen_by(provenance: Mapping[str, Any]) -> Recordings:
-    """All recordings that weights know by their provenance, through teachers, starts and autoencoders.
+    """All recordings that influenced weights, also through teachers, initial weights and autoencoders.
 
     Raises:
-        DataError: on recordings that are none.
+        DataError: on invalid recordings.
     """
     own = Recordings.from_list(provenance["seen"]) if "seen" in provenance else _older(provenance)
     return own | inherited(provenance)
 
 
 def inherited(provenance: Mapping[str, Any]) -> Recordings:
-    """The recordings known to the checkpoints that weights were made from; raises as ``seen_by``."""
+    """The recordings behind the checkpoints from which weights were made; raises as ``seen_by``."""
     seen = Recordings()
     for key, value in provenance.items():
         if key.endswith("_provenance") and isinstance(value, Mapping):
@@ -53,13 +53,13 @@ def inherited(provenance: Mapping[str, Any]) -> Recordings:
 
 
 def seen_by_model_of(path: Path) -> Recordings | None:
-    """What the model of generated scans was trained on; None where nothing beside the scans tells.
+    """The training data of the model that generated scans; None if nothing beside the scans records it.
 
     Args:
         path: a folder of ``lidar-synth sample``, or a bank.
 
     Raises:
-        FileError, DataError: where what stands beside them is damaged.
+        FileError, DataError: if what stands beside them is damaged.
     """
     if (path / NOTE).is_file():
         note = json.loads(read_text(path / NOTE))
@@ -71,36 +71,36 @@ def seen_by_model_of(path: Path) -> Recordings | None:
 
 
 def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recordings:
-    """The recordings that a source on disk holds.
+    """The recordings in a source on disk.
 
     Args:
-        source: as ``open_scans`` gives it.
+        source: the result of ``open_scans``.
         layout: its layout, a name of ``READERS``.
-        path: where it is, as it was typed; stands for scans that no dataset is known of.
+        path: its path as given by the user; represents scans of an unknown dataset.
 
     Raises:
-        FileError, DataError: where the settings of an exported town are damaged.
+        FileError, DataError: if the settings of an exported town are damaged.
     """
     settings = Path(os.path.expandvars(path)) / SETTINGS
-    if settings.is_file():  # in the layout of a dataset, with names like its own
+    if settings.is_file():  # a town has the layout and the names of a dataset
         return town(json.loads(read_text(settings)).get("seed", 0))
-    if isinstance(source, BankScans):  # what its model knows comes with its scans
+    if isinstance(source, BankScans):  # includes the training data of its model
         return whole(FILES, [str(path)]) | _of_bank(source.bank)
     return frames_of(layout, source.ids) if layout in PLACES else whole(FILES, [str(path)])
 
 
 def measured(source: ScanFiles, layout: str, path: Path, split: str | None) -> Recordings:
-    """What a model must not have been trained on: the recordings of a reference, and its path."""
+    """The recordings of a reference, and its path: data on which an evaluated model must not have been trained."""
     return recordings_of(source, layout, path) | whole(FILES, [str(path)] + ([f"{path}#{split}"] if split else []))
 
 
 def overlap(seen: Recordings, reference: Recordings) -> Recordings:
-    """The recordings of a reference that a model has seen; paths are compared as the places that they lead to."""
+    """The recordings of a reference on which a model was trained; paths are resolved before comparison."""
     return _resolved(seen) & _resolved(reference)
 
 
 def undecided(seen: Recordings, reference: Recordings) -> bool:
-    """Whether one of the two is of KITTI's object set and the other of the raw drives that it was drawn from."""
+    """Whether one is from KITTI's object set and the other from the raw drives from which that was sampled."""
     some, others = ({dataset for dataset, _ in part.drives} for part in (seen, reference))
     return (KITTI in some and KITTI_OBJECT in others) or (KITTI_OBJECT in some and KITTI in others)
 
@@ -118,7 +118,7 @@ def _of_bank(bank: Bank) -> Recordings:
 
 
 def _older(provenance: Mapping[str, Any]) -> Recordings:
-    """By a provenance without recordings: what its split, town or path stands for."""
+    """The recordings of a provenance without ``seen``, from its split, town or path."""
     if provenance.get("source") == lidm.SOURCE:
         return lidm.seen(str(provenance.get("data")), generates=True)
     data, split = provenance.get("data"), provenance.get("split")
@@ -137,7 +137,7 @@ def _older(provenance: Mapping[str, Any]) -> Recordings:
 
 
 def _resolved(recordings: Recordings) -> Recordings:
-    """With the places that paths lead to."""
+    """The recordings with resolved paths."""
     result = Recordings()
     for (dataset, drive), frames in recordings.drives.items():
         if dataset == FILES:

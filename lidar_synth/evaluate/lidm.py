@@ -21,7 +21,7 @@ HALF = 50
 """Half the side of the bird's-eye square around the sensor, metres."""
 
 FINE, COARSE = 0.05, 0.5
-"""Cells in metres: for the Jensen-Shannon distance, for the minimum matching distance."""
+"""Size of cells in metres, for the Jensen-Shannon distance and for the minimum matching distance."""
 
 _SENSOR = Sensor("lidm", 1024, float(np.nextafter(np.float32(1), np.float32(2))),
                  float(np.nextafter(np.float32(56), np.float32(0))), rows=64, fov_up=3.0, fov_down=-25.0)  # fmt: skip
@@ -63,7 +63,7 @@ def occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:
 
 
 def occupancy(points: NDArray[np.float32]) -> Occupancy:
-    """What the protocol keeps of a cloud (N, 3)."""
+    """The occupied cells of a cloud (N, 3), which the protocol compares."""
     return Occupancy(occupied(points, FINE), occupied(points, COARSE))
 
 

@@ -21,12 +21,12 @@ Extractor = Callable[[Sequence[Scan]], NDArray[np.floating]]
 
 @dataclass(frozen=True)
 class Score:
-    """One figure and what it has to be read with.
+    """One value of a metric with its protocol.
 
     Args:
-        metric: what was measured.
-        value: lower is better.
-        protocol: by whose definition.
+        metric: name of the metric.
+        value: the value; lower is better.
+        protocol: name of the protocol that defines the metric.
         real: number of real scans.
         generated: number of generated scans.
     """
@@ -43,13 +43,13 @@ class Score:
 
 
 class Protocol(NamedTuple):
-    """How two sets of scans are compared.
+    """A definition of how two sets of scans are compared.
 
     Args:
-        cloud: scan, whether it is of the generated set -> (N, 3) points that count.
-        describe: points -> what is kept of them.
-        compare: what was kept of the real and of the generated clouds -> figures by name.
-        limit: real scans at most; of more, a fixed random choice.
+        cloud: ``(scan, generated) -> (N, 3)`` points to compare; ``generated`` is whether the scan is a generated one.
+        describe: ``points -> description`` of a cloud.
+        compare: ``(real descriptions, generated descriptions) -> {metric: value}``.
+        limit: maximum number of real scans; of more, a fixed random subset is used.
     """
 
     cloud: Callable[[Scan, bool], NDArray[np.float32]]
@@ -65,7 +65,7 @@ def _own_cloud(scan: Scan, generated: bool) -> NDArray[np.float32]:
 PROTOCOLS = {
     "r2flow": Protocol(r2flow.cloud, r2flow.bev_histogram, r2flow.compare, limit=10_000),
     "lidm": Protocol(lidm.cloud, lidm.occupancy, lidm.compare),
-    # R2Flow's measures of scans of any sensor, both sets through the centres of its own cells.
+    # R2Flow's metrics for scans of any sensor, with both sets projected to the centres of its own cells.
     "town": Protocol(_own_cloud, r2flow.bev_histogram, r2flow.compare),
 }
 """Protocols by name."""
@@ -79,19 +79,19 @@ def evaluate(
     batch: int = 16,
     progress: bool = True,
 ) -> list[Score]:
-    """Compares two sets of scans.
+    """Compare two sets of scans.
 
     Args:
         real: real scans.
         generated: generated scans.
         protocol: a name of ``PROTOCOLS``.
         extractors: feature extractors by name; each adds a Frechet distance and a squared maximum mean discrepancy.
-        batch: scans at a time, for the extractors.
-        progress: show a bar.
+        batch: number of scans that extractors process at a time.
+        progress: whether to show a progress bar.
 
     Raises:
         ConfigError: on an unknown protocol.
-        DataError: on an empty set, or a scan without a return where the protocol looks.
+        DataError: on an empty set, or a scan without returns in the protocol's area.
     """
     if protocol not in PROTOCOLS:
         raise ConfigError(f"protocol {protocol!r}", f"one of {', '.join(PROTOCOLS)}")

@@ -37,13 +37,13 @@ def cloud(scan: Scan, generated: bool) -> NDArray[np.float32]:
 
 
 def bev_histogram(points: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """(100, 100) how many points stand in each bin of x (first axis) and y; 3 m < range < 70 m.
+    """(100, 100) number of points in each bin of x (first axis) and y; only points with 3 m < range < 70 m count.
 
     Args:
         points: (N, 3) float32 metres.
 
     Raises:
-        DataError: if there is none.
+        DataError: if no point counts.
     """
     xyz = torch.from_numpy(np.ascontiguousarray(points, np.float32))
     distance = xyz.norm(dim=1)
@@ -63,7 +63,7 @@ def jsd(real: Sequence[NDArray[np.uint32]], generated: Sequence[NDArray[np.uint3
 
 def maximum_mean_discrepancy(real: Sequence[NDArray[np.uint32]], generated: Sequence[NDArray[np.uint32]]) -> float:
     """Squared maximum mean discrepancy of the normalised histograms, kernel exp(-|p - q|^2 / (2 sigma^2)) with
-    sigma = 0.5, a sample with itself included. The paper's tables show it times 10^4."""
+    sigma = 0.5, including pairs of a sample with itself. The paper's tables show it times 10^4."""
     return _kernel(real, real) + _kernel(generated, generated) - 2 * _kernel(real, generated)
 
 
@@ -76,8 +76,8 @@ def compare(real: Sequence[NDArray[np.uint32]], generated: Sequence[NDArray[np.u
 
 
 def _kernel(a: Sequence[NDArray[np.uint32]], b: Sequence[NDArray[np.uint32]]) -> float:
-    """Mean of the kernel less 1. The kernel is close to 1 everywhere, and the ones cancel: without them float32
-    is enough."""
+    """Mean of the kernel minus 1. The kernel is close to 1 everywhere and the ones cancel in the sum, so that float32
+    suffices without them."""
     total = 0.0
     for i in range(0, len(a), _BLOCK):
         p = _normalised(a[i : i + _BLOCK])

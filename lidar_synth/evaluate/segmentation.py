@@ -1,7 +1,7 @@
-"""How well labels agree, and scans seen through the eyes of a segmenter that knows only real scans of the town.
+"""Agreement of labels (IoU), and evaluation of scans by a segmentation network trained on scans of the town.
 
-The small range-view segmenter that comes with the package was trained on scans of the town. Its features tell two sets
-of scans apart; where it gives the labels that a scan carries, these lie on the right things.
+Distances between two sets of scans can be computed on the features of this small range-view network, which ships with
+the package. If its predictions agree with the labels of a scan, the labels lie on the right objects.
 """
 
 import json
@@ -34,23 +34,23 @@ Images = Mapping[str, Tensor]
 
 
 def confusion(network: nn.Module, batches: Iterable[Images], height: Tensor) -> NDArray[np.int64]:
-    """(19, 19) cells by their label (row) and by what the network says (column); ignored cells are left out."""
+    """(19, 19) number of cells by label (row) and prediction (column), without ignored cells."""
     count = len(NAMES)
     table = torch.zeros(count * count, dtype=torch.int64)
     with torch.inference_mode():
         for batch in batches:
-            said = network(segmenter_input(batch["range"], batch["reflectance"], height)).argmax(1)
+            predicted = network(segmenter_input(batch["range"], batch["reflectance"], height)).argmax(1)
             valid = batch["label"] != IGNORE
-            pairs = batch["label"][valid].long() * count + said[valid]
+            pairs = batch["label"][valid].long() * count + predicted[valid]
             table += torch.bincount(pairs.cpu(), minlength=count * count)
     return table.reshape(count, count).numpy()
 
 
 def class_ious(table: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(19,) intersection over union of every class; NaN for one that is neither there nor said to be.
+    """(19,) intersection over union of every class; NaN for a class that is neither labelled nor predicted.
 
     Args:
-        table: (19, 19) of ``confusion``.
+        table: (19, 19) the result of ``confusion``.
     """
     hit = np.diagonal(table)
     union = table.sum(0) + table.sum(1) - hit
@@ -58,10 +58,10 @@ def class_ious(table: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def mean_iou(table: NDArray[np.int64]) -> float:
-    """Mean of ``class_ious`` over the classes that are labelled at all, in [0, 1].
+    """Mean of ``class_ious`` over the classes that occur in the labels, in [0, 1].
 
     Raises:
-        DataError: on a table without one labelled cell.
+        DataError: on a table without any labelled cell.
     """
     labelled = table.sum(1) > 0
     if not labelled.any():
@@ -71,12 +71,12 @@ def mean_iou(table: NDArray[np.int64]) -> float:
 
 @dataclass(frozen=True)
 class Judge:
-    """A trained segmenter and the grid that it sees.
+    """A trained segmentation network and its grid.
 
     Args:
-        network: in evaluation mode.
-        sensor: onto whose grid scans are projected first.
-        provenance: what it was trained on, and how well it does there.
+        network: the network in evaluation mode.
+        sensor: defines the grid onto which scans are projected.
+        provenance: its training data and its accuracy on them.
     """
 
     network: RangeSegmenter
@@ -89,14 +89,14 @@ class Judge:
         return torch.from_numpy(np.sin(self.sensor.ray_angles()[0]))
 
     def features(self, scans: Sequence[Scan]) -> NDArray[np.floating]:
-        """(n, D) of n scans; an ``Extractor`` for ``evaluate``."""
+        """(n, D) features of n scans; an ``Extractor`` for ``evaluate``."""
         batch = self._images(scans)
         with torch.inference_mode():
             inputs = segmenter_input(batch["range"], batch["reflectance"], self.height)
             return self.network.features(inputs).double().numpy()
 
     def agreement(self, scans: Iterable[Scan]) -> NDArray[np.int64]:
-        """(19, 19) cells by the label that the scans carry (row) and by what the segmenter says (column).
+        """(19, 19) number of cells by the scans' labels (row) and the network's prediction (column).
 
         Raises:
             DataError: on a scan without labels.
@@ -117,10 +117,10 @@ class Judge:
         return {k: torch.from_numpy(v) for k, v in {"range": np.stack([i.range for i in images]), **stacked}.items()}
 
     def save(self, path: Path) -> None:
-        """Write it beside ``path``, then rename.
+        """Save the network atomically.
 
         Raises:
-            FileError: where it cannot be written.
+            FileError: if it cannot be written.
         """
         header = {"format": FORMAT, "sensor": self.sensor.to_dict(), "provenance": dict(self.provenance)}
         state = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
@@ -128,11 +128,11 @@ class Judge:
 
 
 def load_judge(path: Path | None = None) -> Judge:
-    """A saved segmenter, by default the one that comes with the package.
+    """Load a saved segmenter, by default the one that ships with the package.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: on a file that is none, or of another version.
+        FileError: if it cannot be read.
+        DataError: if the file is not a segmenter, or of another version.
     """
     path = path or Path(str(files("lidar_synth.evaluate"))) / "segmenter.safetensors"
     content = read_file(path)
@@ -145,4 +145,4 @@ def load_judge(path: Path | None = None) -> Judge:
         network.load_state_dict(load(content))
         return Judge(network.eval(), Sensor.from_dict(header["sensor"]), header["provenance"])
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise DataError(f"{path} is no segmenter of this version ({error})", f"a file of {FORMAT}") from error
+        raise DataError(f"{path} is not a segmenter of this version ({error})", f"a file of {FORMAT}") from error

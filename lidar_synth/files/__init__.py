@@ -1,1 +1,1 @@
-"""How bytes come from disk and go to disk: whole files, bounded parsers, clear errors."""
+"""Reading and writing of files: atomic writes, parsers with limits, and clear errors."""

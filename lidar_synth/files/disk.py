@@ -1,6 +1,6 @@
-"""How bytes come off the disk and onto it: whole files, the numbers in text files, and clear errors.
+"""Reading and writing of files and of numbers in text files, with clear errors.
 
-A file is written beside its place and renamed, so that a reader never meets half of one.
+A file is written under a temporary name and then renamed, so that a reader never sees a partial file.
 """
 
 import hashlib
@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError, FileError, shorten
 
 LARGEST_IMAGE = 65535
-"""Pixels of an image's width or height at most."""
+"""Maximum width and height of an image in pixels."""
 
-_BLOCK = 1 << 20  # bytes read at a time
+_BLOCK = 1 << 20  # number of bytes read at a time
 STRAY = "allow_pickle"
-"""Name of an array that is none: numpy before 2.2 stores the option of that name."""
+"""Name of a spurious array: numpy before 2.2 stores the option of that name as an array."""
 
-SKIP_HINT = "Copy the file again, or leave it out with on_bad='skip'."
+SKIP_HINT = "Copy the file again, or skip it with on_bad='skip'."
 
 LONGEST_NAME = 200
-"""Bytes of a file's name; file systems take 255, and a file that is being written has a longer name for a while."""
+"""Maximum length of a file's name in bytes. File systems allow 255, but the temporary name while writing is longer."""
 
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
@@ -35,29 +35,29 @@ _NOT_ON_WINDOWS = re.compile(r'[<>:"|?*]|[. ]$|^(?i:con|prn|aux|nul|com\d|lpt\d)
 
 
 def part_of(path: Path) -> Path:
-    """A name beside ``path`` for a file that is being written; no other call, process or machine gets the same."""
+    """A unique temporary name beside ``path``, for a file that is being written."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
 
 
 def write_file(
     path: Path, content: bytes | Callable[[BinaryIO], object], *, durable: bool = False, overwrite: bool = True
 ) -> None:
-    """Write beside ``path``, then rename; a failure leaves what was there before.
+    """Write a temporary file beside ``path``, then rename it; a failure leaves an existing file unchanged.
 
     Args:
-        path: where the file will stand; its folder is made.
+        path: the output file; its folder is created.
         content: the bytes, or a function that writes them to an open binary file.
-        durable: have the bytes on the disk before the rename, so that a power cut leaves a whole file too.
-        overwrite: replace a file that is there; otherwise the first of several processes wins.
+        durable: whether to flush the bytes to disk before the rename, so that the file is complete after a power cut.
+        overwrite: whether to replace an existing file; otherwise the first of several processes wins.
 
     Raises:
-        FileError: where the target cannot be written or the disk is full.
+        FileError: if the target cannot be written or the disk is full.
     """
     part = part_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.unlink(missing_ok=True)
-        with part.open("xb") as file:  # a new file, never one that a link of this name leads to
+        with part.open("xb") as file:  # always a new file, never the target of a link with this name
             if callable(content):
                 content(file)
             else:
@@ -70,8 +70,8 @@ def write_file(
     except OSError as error:
         raise FileError(
             f"{path} cannot be written ({error.strerror or error})",
-            "a folder that may be written to, on a disk with room",
-            "Choose another output folder or free some space, then run the same again: what is whole is kept.",
+            "a writable folder on a disk with free space",
+            "Choose another output folder or free some space, then run the same again: complete files are kept.",
         ) from error
     finally:
         with suppress(OSError):
@@ -79,7 +79,7 @@ def write_file(
 
 
 def _linked(part: Path, path: Path) -> bool:
-    """Put a file in its place unless one is there; False where the file system has no second names."""
+    """Link a file to its final path unless that exists; False if the file system has no hard links."""
     try:
         os.link(part, path)
     except FileExistsError:
@@ -90,16 +90,16 @@ def _linked(part: Path, path: Path) -> bool:
 
 
 def read_file(path: Path, expected: str = "a file of the dataset", at_most: int | None = None) -> bytes:
-    """The bytes of a file.
+    """Read the bytes of a file.
 
     Args:
         path: the file.
-        expected: what it should be, for the error.
-        at_most: bytes; a longer file is refused unread.
+        expected: description of the expected file, for the error.
+        at_most: maximum size in bytes; a longer file is refused.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is longer.
+        FileError: if it cannot be read.
+        DataError: if it is longer.
     """
     try:
         with path.open("rb") as file:
@@ -112,10 +112,10 @@ def read_file(path: Path, expected: str = "a file of the dataset", at_most: int 
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
-    """Write an ``.npz``, the same by every version of numpy; nothing is pickled.
+    """Write an ``.npz`` file that is the same with every version of numpy; nothing is pickled.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
         DataError: on an array of Python objects.
     """
     values = {name: np.asanyarray(array) for name, array in arrays.items()}
@@ -126,10 +126,10 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
 
 
 def sha256(path: Path) -> str:
-    """Of a file's bytes, in hexadecimal.
+    """The SHA-256 of a file's bytes, as hexadecimal digits.
 
     Raises:
-        OSError: where it cannot be read.
+        OSError: if it cannot be read.
     """
     digest = hashlib.sha256()
     with path.open("rb") as file:
@@ -144,15 +144,15 @@ def unreadable(path: Path, error: OSError, expected: str = "a file of the datase
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The path under a folder of a name that comes from elsewhere: from a bank, an archive or a table.
+    """The path under a folder of an untrusted name, such as one from a bank, an archive or a table.
 
     Args:
-        folder: where the path has to stay.
-        name: parts with / between them.
+        folder: the folder in which the path must be.
+        name: relative path with / as separator.
 
     Raises:
-        DataError: on a name that leads out of the folder, that another name could share its file with, or that a file
-            cannot have everywhere.
+        DataError: on a name that leads out of the folder, that could denote the same file as another name, or that is
+            not a valid file name on every system.
     """
     if fault := _name_fault(name):
         raise DataError(
@@ -163,7 +163,7 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def _name_fault(name: str) -> str:
-    """What is wrong with a name as the path of a file; "" where nothing is."""
+    """Why a name cannot be the path of a file; "" if it can."""
     parts = name.split("/")
     if _UNPRINTABLE.search(name):
         return "it has a control character or half a character"
@@ -179,10 +179,10 @@ def _name_fault(name: str) -> str:
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse an output folder with a link that leads out of it: what is written there would land elsewhere.
+    """Refuse an output folder with a link that leads out of it, because files would be written elsewhere.
 
     Raises:
-        FileError: naming the link.
+        FileError: if there is such a link; the message names it.
     """
     home = folder.resolve()
     for parent, names, _ in os.walk(folder):
@@ -196,10 +196,10 @@ def refuse_links(folder: Path) -> None:
 
 
 def list_files(folder: Path, *suffixes: str) -> list[Path]:
-    """The files of a folder with one of the suffixes, by name; hidden ones (half-written) are left out.
+    """The files of a folder with one of the suffixes, sorted by name; hidden (partial) files are skipped.
 
     Raises:
-        FileError: where the folder cannot be read.
+        FileError: if the folder cannot be read.
     """
     try:
         names = sorted(e.name for e in os.scandir(folder) if e.name.endswith(suffixes) and e.name[0] != ".")
@@ -209,11 +209,11 @@ def list_files(folder: Path, *suffixes: str) -> list[Path]:
 
 
 def read_values(path: Path, dtype: str) -> NDArray[Any]:
-    """(N,) values of one type from a raw file.
+    """Read (N,) values of one type from a raw file.
 
     Raises:
-        FileError: where the file cannot be read.
-        DataError: where its size is not a whole number of values.
+        FileError: if the file cannot be read.
+        DataError: if its size is not a whole number of values.
     """
     content = read_file(path)
     width = np.dtype(dtype).itemsize
@@ -223,11 +223,11 @@ def read_values(path: Path, dtype: str) -> NDArray[Any]:
 
 
 def read_text(path: Path, expected: str = "a file of the dataset", at_most: int | None = None) -> str:
-    """The text of a file; the arguments are those of ``read_file``.
+    """Read the text of a file; the arguments are those of ``read_file``.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is no text, or longer.
+        FileError: if it cannot be read.
+        DataError: if it is not UTF-8 text, or too long.
     """
     try:
         return read_file(path, expected, at_most).decode()
@@ -236,11 +236,11 @@ def read_text(path: Path, expected: str = "a file of the dataset", at_most: int 
 
 
 def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
-    """(N, columns) numbers of a text file, one row per line.
+    """Read (N, columns) numbers of a text file, one row per line.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: on a line with something else.
+        FileError: if it cannot be read.
+        DataError: on a line that does not consist of ``columns`` numbers.
     """
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
     try:
@@ -253,7 +253,7 @@ def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
 
 @contextmanager
 def naming(where: str | Path) -> Iterator[None]:
-    """Name a file in the errors of what is made from its values."""
+    """Prefix errors raised in this context with the name of a file."""
     try:
         yield
     except DataError as error:
@@ -261,12 +261,12 @@ def naming(where: str | Path) -> Iterator[None]:
 
 
 def read_named_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
-    """{name: (N,) values} of KITTI's calibration files: ``name: number number ...`` per line.
+    """Read {name: (N,) values} from KITTI's calibration files: ``name: number number ...`` per line.
 
-    Lines whose values are not all numbers (dates) are left out.
+    Lines whose values are not all numbers (dates) are skipped.
 
     Raises:
-        FileError: where it cannot be read.
+        FileError: if it cannot be read.
     """
     matrices = {}
     for line in read_text(path).splitlines():
@@ -282,14 +282,14 @@ def write_named_matrices(path: Path, matrices: Mapping[str, NDArray[np.float64]]
     """The inverse of ``read_named_matrices``, with KITTI's 12 decimals.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     lines = [f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(m))}\n" for name, m in matrices.items()]
     write_file(path, "".join(lines).encode())
 
 
 def png_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) of a PNG, from its header; None where there is no such file, or its header is damaged."""
+    """(width, height) of a PNG, from its header; None if the file is missing or its header damaged."""
     try:
         with path.open("rb") as file:
             header = file.read(24)
@@ -302,5 +302,5 @@ def png_size(path: Path) -> tuple[int, int] | None:
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Values of a text file so that reading them gives the same float64."""
+    """Format numbers for a text file, such that reading them gives the same float64 values."""
     return " ".join(repr(float(v)) for v in values)

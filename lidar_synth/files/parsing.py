@@ -1,7 +1,7 @@
-"""Bytes of unknown origin into plain values: JSON, YAML, numpy's arrays and pictures, within limits.
+"""Safe parsers with limits for untrusted files: JSON, YAML, numpy arrays and images.
 
-A file may declare more than it holds: a size, a depth, an alias of an alias. What it declares is compared with what it
-holds, and with a limit, before memory is taken for it; and whatever is wrong with it is an error of this package.
+A hostile file may declare huge sizes, depths or nested aliases. What it declares is compared with its actual size and
+with a limit before memory is allocated, and every fault becomes an error of this package.
 """
 
 import json
@@ -27,28 +27,28 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 MOST_BYTES = 128 << 20
-"""Bytes that may come out of a file by decompression, all its arrays together: 8 million points with reflectance."""
+"""Maximum size of all decompressed arrays of a file in bytes: 8 million points with reflectance."""
 
 MOST_PIXELS = 1 << 25
-"""Pixels of a picture."""
+"""Maximum number of pixels of an image."""
 
 LONGEST_YAML = 1 << 18
-"""Characters of a YAML text."""
+"""Maximum number of characters of a YAML text."""
 
 LONGEST_PLAIN = 3000
-"""Characters of a value in it without quotes."""
+"""Maximum number of characters of an unquoted YAML value."""
 
 MOST_NODES, DEEPEST = 20_000, 64
-"""Values in a YAML text, each alias counted as all that it stands for, and levels of them."""
+"""Maximum number of values in a YAML text, with all aliases expanded, and maximum number of levels."""
 
 ARRAYS = "arrays of numbers written by numpy, none of them pickled"
 
 
 def parse_json(text: str | bytes, where: str, expected: str = "JSON") -> Any:
-    """The values of a JSON text.
+    """Parse a JSON text.
 
     Raises:
-        DataError: on what is no JSON, or too deep.
+        DataError: if it is not JSON, or nested too deeply.
     """
     try:
         return json.loads(text)
@@ -57,25 +57,25 @@ def parse_json(text: str | bytes, where: str, expected: str = "JSON") -> Any:
 
 
 def read_yaml(path: Path, expected: str) -> Any:
-    """The values of a YAML file.
+    """Read a YAML file.
 
     Args:
         path: the file.
-        expected: what it should be, for the error.
+        expected: description of the expected file, for the error.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is too long, or not UTF-8.
+        FileError: if it cannot be read.
+        DataError: if it is too long, or not UTF-8.
         ConfigError: as ``parse_yaml``.
     """
     return parse_yaml(read_text(path, expected, LONGEST_YAML), str(path))
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """The plain values of a YAML text.
+    """Parse the plain values of a YAML text.
 
     Raises:
-        ConfigError: on what is no YAML, on tags, and on more values or levels than a configuration has.
+        ConfigError: if it is not YAML, has tags, or exceeds the limits on values and levels.
     """
     try:
         fault = _yaml_fault(yaml.parse(text, Loader=yaml.SafeLoader))
@@ -88,7 +88,7 @@ def parse_yaml(text: str, where: str) -> Any:
 
 
 def _yaml_fault(events: Iterable[Any]) -> str:
-    """Why the events of a YAML text are not to be made into values; "" where they are."""
+    """Why a YAML text is refused, by its events; "" if it is accepted."""
     count, opened = 0, []
     sizes: dict[str, int] = {}
     for event in events:
@@ -118,17 +118,17 @@ def _yaml_fault(events: Iterable[Any]) -> str:
 
 
 def read_arrays(path: Path, only: Collection[str] | None = None, most: int = MOST_BYTES) -> dict[str, NDArray[Any]]:
-    """The arrays of an ``.npz``, or the one of an ``.npy`` under the name ``array``.
+    """Read the arrays of an ``.npz`` file, or that of an ``.npy`` file under the name ``array``.
 
     Args:
         path: the file.
-        only: names of the arrays that are wanted; by default all.
-        most: bytes that may come out of a compressed file.
+        only: names of the arrays to read; by default all.
+        most: maximum size of all decompressed arrays in bytes.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is no such file, is damaged, declares more than it holds or than ``most``, or holds
-            something else than numbers and text.
+        FileError: if it cannot be read.
+        DataError: if it is not such a file, is damaged, declares more than it holds or than ``most``, or holds
+            anything but numbers and text.
     """
     content = read_file(path)
     if not content.startswith(b"PK"):
@@ -149,7 +149,7 @@ def _unzip(content: bytes, where: str, only: Collection[str] | None, most: int) 
                 name = info.filename.removesuffix(".npy")
                 if only is None or name in only:
                     with archive.open(info) as file:
-                        members[name] = file.read(info.file_size)  # read() alone would take whatever comes out
+                        members[name] = file.read(info.file_size)  # read() alone has no limit
     # The exceptions of zipfile on a damaged file; encrypted members and unknown methods are a RuntimeError.
     except (zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, OverflowError,
             RuntimeError) as error:  # fmt: skip
@@ -160,7 +160,7 @@ def _unzip(content: bytes, where: str, only: Collection[str] | None, most: int) 
 
 
 def _zip_fault(infos: list[zipfile.ZipInfo], size: int, most: int) -> str:
-    """Why the members of a ZIP file of this size are not to be read; "" where they are."""
+    """Why the members of a ZIP file of this size are refused; "" if they are accepted."""
     names = [info.filename for info in infos]
     if len(set(names)) < len(names):
         return "holds two arrays of one name"
@@ -180,20 +180,20 @@ _DESCRIPTION = re.compile(
 """The header of numpy's format, without white space: a dictionary of these three, in any order."""
 
 _TYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|U[1-9]\d{0,6})")
-"""The types that are read: truth values, whole and floating-point numbers, and text."""
+"""The supported types: booleans, integers, floating-point numbers, and text."""
 
 
 def parse_npy(content: bytes, where: str) -> NDArray[Any]:
-    """The array of an ``.npy`` file (https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html).
+    """Parse the array of an ``.npy`` file (https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html).
 
     Raises:
-        DataError: where it is none, holds fewer or more bytes than its header says, or something else than numbers
-            and text.
+        DataError: if it is not such a file, its size does not match its header, or it holds anything but numbers and
+            text.
     """
     width = {1: 2, 2: 4, 3: 4}.get(content[6], 0) if len(content) > 10 and content[:6] == b"\x93NUMPY" else 0
     start = 8 + width + int.from_bytes(content[8 : 8 + width], "little")
     if not width or start > min(len(content), 10_000):
-        raise DataError(f"{where} has no header of numpy's", ARRAYS, SKIP_HINT)
+        raise DataError(f"{where} has no header of an .npy file", ARRAYS, SKIP_HINT)
     header = re.sub(r"\s", "", content[8 + width : start].decode("latin-1"))
     found = _DESCRIPTION.fullmatch(header)
     dtype = _TYPE.fullmatch(found["descr"] or "") if found else None
@@ -206,26 +206,26 @@ def parse_npy(content: bytes, where: str) -> NDArray[Any]:
 def _array(
     content: bytes, start: int, dtype: np.dtype[Any], shape: tuple[int, ...], fortran: bool, where: str
 ) -> NDArray[Any]:
-    """The array whose values stand in ``content`` from ``start`` on."""
+    """The array whose values are stored in ``content`` from ``start`` on."""
     held = len(content) - start
     if prod(shape) * dtype.itemsize != held or len(shape) > 8 or prod(max(n, 1) for n in shape) >= 1 << 58:
         raise DataError(
-            f"{where} holds {held} bytes for {dtype} of shape {shape}", "as many as its shape says", SKIP_HINT
+            f"{where} holds {held} bytes for {dtype} of shape {shape}", "as many as its shape requires", SKIP_HINT
         )
     values = np.frombuffer(content, dtype, offset=start).copy()
     if dtype.kind == "U":
         codes = values.view(np.dtype("u4").newbyteorder(dtype.byteorder))
         if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes < 0xE000))).any():
-            raise DataError(f"{where} holds text that is none", ARRAYS, SKIP_HINT)
+            raise DataError(f"{where} holds invalid text", ARRAYS, SKIP_HINT)
     return values.reshape(shape, order="F" if fortran else "C")
 
 
 def read_picture(path: Path, expected: str = "a PNG or JPEG file") -> "Image":
-    """A picture, decoded.
+    """Read and decode an image.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is none, is damaged, or has more than ``MOST_PIXELS``.
+        FileError: if it cannot be read.
+        DataError: if it is not an image, is damaged, or has more than ``MOST_PIXELS``.
     """
     from PIL import Image
 

@@ -1,7 +1,7 @@
-"""Datasets and file formats: scans in, scans out.
+"""Readers and writers of datasets and file formats.
 
-A reader is an indexable source of ``Scan`` (source.py), a writer puts scans into one output folder (writer.py). One
-file per dataset or format holds both. To add a format, write such a file and add its classes to ``READERS`` and
+A reader is an indexable source of ``Scan`` (source.py); a writer writes scans into one output folder (writer.py). Each
+dataset or format has one module with both. To add a format, write such a module and add its classes to ``READERS`` and
 ``WRITERS``; ``open_scans``, the command line and the parametrised tests then include it.
 """
 
@@ -61,7 +61,7 @@ READERS: dict[str, type[ScanFiles]] = {
     "png": RangePNG,
     "folder": Folder,
 }
-"""Reader by layout."""
+"""{layout: reader}."""
 
 WRITERS: dict[str, type[Writer]] = {
     "kitti": KITTIWriter,
@@ -75,7 +75,7 @@ WRITERS: dict[str, type[Writer]] = {
     "png": PNGWriter,
     "webdataset": WebDatasetWriter,
 }
-"""Writer by format."""
+"""{format: writer}."""
 
 SIGNS: dict[str, Callable[[Path], bool]] = {
     "kitti360": lambda root: (root / "data_3d_raw").is_dir(),
@@ -93,7 +93,7 @@ SIGNS: dict[str, Callable[[Path], bool]] = {
         root.suffix.lower() in SUFFIXES or any(p.suffix.lower() in SUFFIXES for p in root.rglob("*"))
     ),
 }
-"""How a layout is recognised, in this order."""
+"""{layout: test of a path} by which layouts are recognised, in this order."""
 
 
 def open_scans(
@@ -109,14 +109,14 @@ def open_scans(
     """Open the scans at a path: a dataset's root, a bank, a folder of scans, or one file.
 
     Args:
-        path: of the scans; for a bank also a URL.
+        path: path of the scans; a bank may also be at a URL.
         sensor: the sensor that recorded the scans, if it is not the layout's own.
         layout: one of ``READERS``; by default it is recognised from the files.
-        split: name of a split, for the layouts that have splits.
+        split: name of a split, if the layout has splits.
         fields: floats per point of plain ``.bin`` files.
-        reflectance_max: the upper end of the reflectance in plain files, such as 255; values are divided by it.
-        on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` leaves it out, with a warning;
-            ``"drop-points"`` leaves out points that are NaN or infinite, and counts them.
+        reflectance_max: maximum of the reflectance in plain files, such as 255; values are divided by it.
+        on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` skips it, with a warning;
+            ``"drop-points"`` drops points that are NaN or infinite, and counts them.
 
     Returns:
         An indexable source of ``Scan``.
@@ -147,31 +147,31 @@ def open_scans(
     plain = {"fields": fields, "reflectance_max": reflectance_max}
     if reader is not Folder and any(v is not None for v in plain.values()):
         wrong = ", ".join(f"{k}={v}" for k, v in plain.items() if v is not None)
-        raise ConfigError(f"{wrong} for {path}", f"neither: the files of layout {name!r} have one form", _AS_FOLDER)
+        raise ConfigError(f"{wrong} for {path}", f"neither: layout {name!r} has a fixed file format", _AS_FOLDER)
     options |= plain
     return reader(path, on_bad=on_bad, **{k: v for k, v in options.items() if v is not None})  # type: ignore[arg-type]
 
 
-_AS_FOLDER = "--layout folder (layout='folder') reads the files below as plain ones."
+_AS_FOLDER = "--layout folder (layout='folder') reads its files as plain ones."
 
 
 def layout_of(path: Path) -> str:
-    """The layout of what is at a path.
+    """Recognise the layout of the scans at a path.
 
     Raises:
-        FileError: where there is nothing.
-        DataError: where it is none that a reader reads.
+        FileError: if the path does not exist.
+        DataError: if no reader recognises it.
     """
     if not path.exists():
         raise FileError(f"{path} does not exist", "a dataset's root, a folder of scans, or one file")
-    found = next((name for name, sign in SIGNS.items() if sign(path)), None)
-    if found is None:
+    layout = next((name for name, sign in SIGNS.items() if sign(path)), None)
+    if layout is None:
         raise DataError(
             f"{path} holds no scan in a layout that is known",
             f"one of {', '.join(READERS)}, or {', '.join(SUFFIXES)} files",
-            "Give the dataset's root, the folder that holds data_3d_raw, sequences, training or samples for instance.",
+            "Give the dataset's root, for instance the folder with data_3d_raw, sequences, training or samples.",
         )
-    return found
+    return layout
 
 
 def _holds_range_images(root: Path) -> bool:

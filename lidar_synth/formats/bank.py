@@ -1,4 +1,4 @@
-"""Banks, "lidar-synth-bank/1", as a source among the others; the format is in ``lidar_synth.bank``."""
+"""Reader of banks ("lidar-synth-bank/1"); ``lidar_synth.bank`` describes the format."""
 
 from pathlib import Path
 
@@ -10,17 +10,17 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 
 class BankScans(ScanFiles):
-    """A bank: <root>/index.json and its shards; on disk, or at a URL that fsspec knows.
+    """A bank: <root>/index.json and its shards; on disk, or at a URL that fsspec supports.
 
     Args:
         root: the bank's folder, or its URL.
-        sensor: what the scans are expected to be of; the bank tells it.
+        sensor: the expected sensor; by default the bank's own.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        FileError: where there is no bank, or a shard is missing.
-        DataError: where the index is damaged or of another version.
-        ConfigError: where the bank is of another sensor.
+        FileError: if there is no bank, or a shard is missing.
+        DataError: if the index is damaged or of another version.
+        ConfigError: if the bank has another sensor.
         LibraryError: on a URL whose file system is not installed.
     """
 

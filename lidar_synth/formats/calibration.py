@@ -1,4 +1,4 @@
-"""A camera beside the sensor: how points of the sensor frame fall into its image."""
+"""Camera calibration: the projection of points from the sensor frame into a camera's image."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from lidar_synth.files.disk import LARGEST_IMAGE
 Matrix = NDArray[np.float64]
 
 NOT_RIGID = 0.01
-"""By how much a product R R^T may be off the identity: KITTI's files have rotations of six digits."""
+"""Tolerance of R R^T against the identity; rotations in KITTI's files have six digits."""
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,12 @@ class Calibration:
     Args:
         projection: (3, 4) float64, the camera's P: pixels of points in the rectified camera frame.
         camera_from_sensor: (4, 4) float64 rigid transform from the sensor frame to the camera frame.
-        image_size: (width, height) in pixels; None where no file tells it.
-        matrices: the matrices of the dataset's own calibration files by their names there, so that writing
-            them back loses nothing.
+        image_size: (width, height) in pixels; None if unknown.
+        matrices: the original matrices of the dataset's calibration files by name, so that they can be written back
+            without loss.
 
     Raises:
-        DataError: on another shape, a transform that is not rigid, or an image of a size that no camera takes.
+        DataError: on another shape, a transform that is not rigid, or an impossible image size.
     """
 
     projection: Matrix
@@ -47,7 +47,7 @@ class Calibration:
 
     @property
     def image_from_sensor(self) -> Matrix:
-        """(3, 4) the whole way: homogeneous pixels of homogeneous points in the sensor frame."""
+        """(3, 4) projection from homogeneous points in the sensor frame to homogeneous pixels."""
         return self.projection @ self.camera_from_sensor
 
     @property
@@ -56,14 +56,14 @@ class Calibration:
         return np.asarray(np.linalg.inv(self.camera_from_sensor), np.float64)
 
     def pixels(self, points: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
-        """Where points fall in the image.
+        """Project points into the image.
 
         Args:
             points: (N, 3) metres, sensor frame.
 
         Returns:
             (N, 2) column and row in pixels, NaN for points in or behind the camera's plane, and (N,) depth in
-            metres along the optical axis. A point is in the picture where its pixel is within ``image_size``.
+            metres along the optical axis. A point is in the image if its pixel is within ``image_size``.
         """
         matrix = self.image_from_sensor
         homogeneous = np.asarray(points, np.float64) @ matrix[:, :3].T + matrix[:, 3]
@@ -74,14 +74,14 @@ class Calibration:
 
 
 def check_rigid(transforms: Matrix, where: str) -> None:
-    """Refuse what moves and turns nothing rigidly: a pose or a calibration with a wrong number.
+    """Refuse poses or calibrations that are not rigid transforms.
 
     Args:
         transforms: (..., 4, 4), or (..., 3, 4) without the last row.
-        where: what to name in the error.
+        where: name of the transforms in the error.
 
     Raises:
-        DataError: on values that are not finite, or a left part that is no rotation to within ``NOT_RIGID``.
+        DataError: on values that are not finite, or a left 3 x 3 part that is not a rotation within ``NOT_RIGID``.
     """
     rotations = transforms[..., :3, :3].reshape(-1, 3, 3)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -98,10 +98,10 @@ def check_rigid(transforms: Matrix, where: str) -> None:
 
 
 def read_image_size(values: Matrix, where: str) -> tuple[int, int]:
-    """(width, height) in pixels of a line of a calibration file.
+    """Parse an image size, (width, height) in pixels, of a calibration file.
 
     Raises:
-        DataError: on anything but two whole numbers that a camera may have.
+        DataError: on anything but two integers of a possible image size.
     """
     if values.shape != (2,) or not ((values >= 1) & (values <= LARGEST_IMAGE) & (values == np.rint(values))).all():
         raise DataError(f"{where}: an image of {values.tolist()} pixels", f"two whole numbers, 1 to {LARGEST_IMAGE}")
@@ -109,7 +109,7 @@ def read_image_size(values: Matrix, where: str) -> tuple[int, int]:
 
 
 def homogeneous(matrix: Matrix) -> Matrix:
-    """(4, 4) of 9 values (a rotation) or 12 (rotation and translation, row by row)."""
+    """(4, 4) homogeneous matrix of 9 values (a rotation) or 12 (rotation and translation, row by row)."""
     result = np.eye(4)
     matrix = np.asarray(matrix, np.float64).reshape(3, -1)
     result[:3, : matrix.shape[1]] = matrix
@@ -117,15 +117,15 @@ def homogeneous(matrix: Matrix) -> Matrix:
 
 
 AXES_CAMERA_FROM_SENSOR: Matrix = np.array([(0, -1, 0, 0), (0, 0, -1, 0), (1, 0, 0, 0), (0, 0, 0, 1)], np.float64)
-"""(4, 4) the turn from x forward, y left, z up to a camera's x right, y down, z forward."""
+"""(4, 4) rotation from x forward, y left, z up to a camera's x right, y down, z forward."""
 
 
 def ideal_camera(focal: float, image_size: tuple[int, int]) -> Calibration:
-    """A pinhole camera that stands in the sensor's origin and looks straight ahead.
+    """A pinhole camera at the sensor's origin that faces forward.
 
     Args:
         focal: focal length in pixels.
-        image_size: (width, height) in pixels; the optical axis meets the middle.
+        image_size: (width, height) in pixels; the principal point is the centre.
     """
     width, height = image_size
     projection = np.array([(focal, 0, width / 2, 0), (0, focal, height / 2, 0), (0, 0, 1, 0)])

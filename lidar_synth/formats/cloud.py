@@ -1,7 +1,8 @@
-"""What PCD and PLY files have in common: named values per point, as records or as text, and the scan that they make.
+"""Shared parts of PCD and PLY: named values per point, as records or as text, and their conversion to scans.
 
-Reflectance stands in the field ``intensity``, which other tools know, and every other field of a scan under its own
-name. ``raw_label`` is stored as the same bits, signed: not every reader of PLY knows unsigned 32-bit values.
+Reflectance is stored in the field ``intensity``, which other tools understand; all other fields of a scan keep their
+names. ``raw_label`` is stored bit for bit as a signed integer, because not every PLY reader supports unsigned 32-bit
+values.
 """
 
 import io
@@ -17,15 +18,15 @@ from lidar_synth.files.disk import SKIP_HINT
 from lidar_synth.geometry.scan import Scan
 
 STORED = {"label": "<u1", "raw_label": "<i4", "instance": "<i4", "ring": "<i4", "confidence": "<f4"}
-"""Type on disk of each field of a scan beside its reflectance."""
+"""Type on disk of each field of a scan except reflectance."""
 
 IN_MEMORY = {"label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2", "confidence": "f4"}
 
 WANTED = ("x", "y", "z", "intensity", "reflectance", *STORED)
-"""The fields of a file that are read; others are passed over."""
+"""The fields that are read from a file; all others are ignored."""
 
 WIDEST = 1 << 20
-"""Bytes of one point."""
+"""Maximum number of bytes of one point."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class Field:
 
     Args:
         name: its name.
-        type: numpy's type of one value, byte order and all.
-        count: values per point.
+        type: numpy type of one value, with byte order.
+        count: number of values per point.
     """
 
     name: str
@@ -49,27 +50,29 @@ class Field:
 
 
 def cut(where: str, held: int, wanted: int, unit: str = "bytes") -> DataError:
-    """The error for a file that does not hold what its header says."""
-    given = "has been cut" if held < wanted else "holds more than its header says"
+    """The error for a file whose size does not match its header."""
+    given = "is truncated" if held < wanted else "holds more than its header declares"
     return DataError(f"{where} {given}: {held} {unit} of points", f"{wanted}, by its header", SKIP_HINT)
 
 
 def check_size(body: bytes, size: int, where: str, *, more: bool = False) -> None:
-    """Refuse a body of another length than its header says, but for the end of a line; ``more`` may follow.
+    """Refuse a body whose length does not match the header.
+
+    A final line break is allowed, and with ``more`` any further bytes.
 
     Raises:
-        DataError: saying which of the two it is.
+        DataError: if it is too short or too long.
     """
     if len(body) < size or not (more or body[size:] in (b"", b"\n", b"\r\n")):
         raise cut(where, len(body), size)
 
 
 def check_fields(fields: Sequence[Field], count: int, where: str) -> None:
-    """Refuse fields that make no scan.
+    """Refuse fields from which no scan can be made.
 
     Raises:
-        DataError: where x, y or z is missing, a wanted field stands there twice or has several values per point, a
-            point has more than ``WIDEST`` bytes, or there are no points.
+        DataError: if x, y or z is missing, a wanted field occurs twice or has several values per point, a point has
+            more than ``WIDEST`` bytes, or there are no points.
     """
     names = [field.name for field in fields if field.name in WANTED]
     if len(set(names)) < len(names) or any(field.count != 1 for field in fields if field.name in WANTED):
@@ -83,7 +86,7 @@ def check_fields(fields: Sequence[Field], count: int, where: str) -> None:
 
 
 def from_records(body: bytes, fields: Sequence[Field], count: int) -> dict[str, NDArray[Any]]:
-    """{name: (N,)} the wanted fields of points that stand one after another; ``body`` holds them all."""
+    """{name: (N,)} the wanted fields of points stored as consecutive records; ``body`` must be long enough."""
     wanted, offset = [], 0
     for field in fields:
         if field.name in WANTED:
@@ -96,10 +99,10 @@ def from_records(body: bytes, fields: Sequence[Field], count: int) -> dict[str, 
 
 
 def from_text(text: str, fields: Sequence[Field], count: int, where: str) -> dict[str, NDArray[Any]]:
-    """{name: (N,)} the wanted fields of points that stand one in a line.
+    """{name: (N,)} the wanted fields of points stored as text, one point per line.
 
     Raises:
-        DataError: on another number of lines or values, or a value that its type cannot hold.
+        DataError: on a wrong number of lines or values, or a value out of range of its type.
     """
     columns = sum(field.count for field in fields)
     lines = sum(1 for line in text.splitlines() if line.strip())
@@ -111,37 +114,40 @@ def from_text(text: str, fields: Sequence[Field], count: int, where: str) -> dic
         raise DataError(f"{where}: {error}", f"{columns} numbers in each line", SKIP_HINT) from error
     if table.shape != (count, columns):
         raise DataError(f"{where} has {table.shape[1]} values in a line", f"{columns}, by its header", SKIP_HINT)
-    found, column = {}, 0
+    arrays, column = {}, 0
     for field in fields:
         if field.name in WANTED:
-            found[field.name] = _typed(table[:, column], field, where)
+            arrays[field.name] = _typed(table[:, column], field, where)
         column += field.count
-    return found
+    return arrays
 
 
 def _typed(values: NDArray[np.float64], field: Field, where: str) -> NDArray[Any]:
-    """Numbers of a text as the type that its header gives them."""
+    """Convert numbers from text to the type that the header declares."""
     dtype = np.dtype(field.type)
     if dtype.kind == "f":
         with np.errstate(over="ignore"):
             return values.astype(dtype)
     limits = np.iinfo(dtype)
     if not ((values == np.floor(values)) & (values >= limits.min) & (values <= limits.max)).all():
-        raise DataError(f"{where}: field {field.name!r} holds other values than {dtype}", "whole numbers", SKIP_HINT)
+        raise DataError(f"{where}: field {field.name!r} holds other values than {dtype}", "integers", SKIP_HINT)
     return values.astype(dtype)
 
 
-def to_arrays(found: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The fields of a file as a ``Scan`` names them; those of its own only where they have the type of ``STORED``."""
+def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Rename and convert a file's fields to those of a ``Scan``.
+
+    Label, ring and the like are read only if they have the type of ``STORED``; other programs use the names otherwise.
+    """
     with np.errstate(over="ignore"):
-        points = np.column_stack([found[axis] for axis in "xyz"]).astype(np.float32)
-        intensity = found.get("intensity", found.get("reflectance", np.zeros(len(points)))).astype(np.float32)
-    ours = [n for n, kind in STORED.items() if n in found and found[n].dtype.newbyteorder("<") == np.dtype(kind)]
-    return {"points": points, "reflectance": intensity} | {n: found[n].astype(IN_MEMORY[n]) for n in ours}
+        points = np.column_stack([stored[axis] for axis in "xyz"]).astype(np.float32)
+        intensity = stored.get("intensity", stored.get("reflectance", np.zeros(len(points)))).astype(np.float32)
+    own = [n for n, kind in STORED.items() if n in stored and stored[n].dtype.newbyteorder("<") == np.dtype(kind)]
+    return {"points": points, "reflectance": intensity} | {n: stored[n].astype(IN_MEMORY[n]) for n in own}
 
 
 def to_records(scan: Scan) -> NDArray[np.void]:
-    """The points of a scan, one after another; ``to_arrays`` is the inverse."""
+    """The points of a scan as consecutive records; ``to_arrays`` is the inverse."""
     values = dict(zip("xyz", scan.points.T, strict=True)) | {"intensity": scan.reflectance}
     values |= {name: array.astype(STORED[name]) for name, array in scan.fields().items() if name in STORED}
     records = np.empty(len(scan), [(name, STORED.get(name, "<f4")) for name in values])

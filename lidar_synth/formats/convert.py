@@ -1,8 +1,8 @@
-"""From any source of scans to any format, in parallel, going on where an earlier run stopped.
+"""Conversion of any source of scans to any format, in parallel and resumable.
 
-A scan that is already there whole is not read again; a scan that cannot be read stops the run, or is counted, named
-and left out. Each worker process has its own copy of source and writer, and the main one writes what belongs to a
-whole folder at the end.
+Scans that were written completely by an earlier run are not read again. A scan that cannot be read stops the run, or
+is skipped and reported. Each worker process has its own copy of source and writer; the main process writes the files
+of the whole folder at the end.
 """
 
 import os
@@ -26,23 +26,23 @@ from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 
 CHUNK = 8
-"""Scans that a worker takes at a time."""
+"""Number of scans that a worker takes at a time."""
 
 
 SETTINGS = ".convert.json"
-"""File in the output folder that says what it was filled with."""
+"""File in the output folder with the settings of the conversion."""
 
 
 @dataclass
 class Report:
-    """What a conversion did.
+    """The result of a conversion.
 
     Args:
-        written: scans written now.
-        kept: scans that were there already.
+        written: number of scans written by this run.
+        kept: number of scans that existed already.
         skipped: {id: reason} of the scans that could not be read or written.
-        dropped: {id: number} of points that were left out of a scan because they are NaN or infinite.
-        left_out: what the format has a place for beside the scans and the source does not tell, in words.
+        dropped: {id: number} of points that were dropped because they are NaN or infinite.
+        left_out: descriptions of files that the format supports but the source does not have.
     """
 
     written: int = 0
@@ -53,13 +53,13 @@ class Report:
 
 
 class Outcome(NamedTuple):
-    """What became of one scan.
+    """The result for one scan.
 
     Args:
         number: its index in the source.
-        skipped: why it was not written; "" where it was.
-        dropped: points that were left out of it.
-        domain: of the scan; None where it was not read.
+        skipped: the reason why it was not written; "" if it was.
+        dropped: number of points that were dropped.
+        domain: domain of the scan; None if it was not read.
     """
 
     number: int
@@ -78,26 +78,26 @@ def convert(
     unfold: bool = False,
     progress: bool = True,
 ) -> Report:
-    """Write every scan of a source; rerun to go on where it stopped.
+    """Write every scan of a source; a rerun resumes an interrupted conversion.
 
     Args:
-        source: the scans; it is asked for one index at a time. With more than one job it is pickled.
-        writer: where they go. The scans of a dataset keep their names there.
-        jobs: worker processes.
-        on_bad: ``"error"`` stops at the first scan that cannot be read or held by the format; ``"skip"`` leaves it
-            out and reports it; ``"drop-points"`` leaves out points that are NaN or infinite, counts them, and stops at
-            everything else.
+        source: the scans, read one at a time. With more than one job it is pickled.
+        writer: the output. The scans of a dataset keep their names.
+        jobs: number of worker processes.
+        on_bad: ``"error"`` stops at the first scan that cannot be read, or that the format cannot represent;
+            ``"skip"`` skips and reports it; ``"drop-points"`` drops points that are NaN or infinite, counts them, and
+            stops at any other fault.
         as_sensor: re-project every scan to this sensor's grid first.
-        unfold: put every scan on a grid with one row per laser, ring by ring (``projection.unfold``); of
-            ``as_sensor``'s lasers, or of the scan's own sensor.
-        progress: show a bar.
+        unfold: unfold every scan to a grid with one row per laser (``projection.unfold``), with the lasers of
+            ``as_sensor`` or of the scan's own sensor.
+        progress: whether to show a progress bar.
 
     Returns:
-        How many scans were written and kept, what was skipped and why, and what was left out.
+        Number of scans written and kept, skipped scans with reasons, and what was left out.
 
     Raises:
-        ConfigError: on fewer than one job, or an output folder that was filled from something else.
-        FileError: where the output cannot be written, whatever ``on_bad`` says.
+        ConfigError: on fewer than one job, or an output folder with the scans of another conversion.
+        FileError: if the output cannot be written, for any ``on_bad``.
         DataError: on a bad scan, unless ``on_bad="skip"``.
     """
     if jobs < 1:
@@ -131,11 +131,11 @@ def _count(report: Report, done: Outcome, name: str) -> None:
 
 
 def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], Report]:
-    """Indices of the scans that are not there yet, and what is known before any is read.
+    """Indices of the scans that are still to be written, and a report of the existing ones.
 
     Raises:
-        DataError: on a scan whose name is no path under the output folder, or that of a scan before it, with
-            ``on_bad="error"``.
+        DataError: with ``on_bad="error"``, on a scan whose name cannot be a path under the output folder, or is
+            that of an earlier scan.
     """
     report, missing = Report(), []
     taken: set[str] = set()
@@ -144,7 +144,7 @@ def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], 
         try:
             places = {os.path.normcase(writer.path(index, name))} | ({f"id {name}"} if name is not None else set())
             if places & taken:
-                raise DataError(f"scan {index} is called {name!r}", "a name, and a file, that no scan before it has")
+                raise DataError(f"scan {index} is called {name!r}", "a name, and a file, that no earlier scan has")
             taken |= places
         except DataError as error:
             if on_bad == "error":
@@ -161,7 +161,7 @@ def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], 
 def convert_one(
     source: Source, writer: Writer, grid: Callable[[Scan], Scan] | None, on_bad: OnBad, index: int
 ) -> Outcome:
-    """Write the scan at ``index``, on another grid if there is one.
+    """Write the scan at ``index``, re-projected if a grid is given.
 
     Raises:
         DataError, FileError: as ``convert``.
@@ -169,7 +169,7 @@ def convert_one(
     camera, dropped = None, 0
     try:
         if isinstance(source, ScanFiles):
-            # Not source[index]: a source that skips would give the next scan in a bad one's place, under its name.
+            # Not source[index]: with on_bad="skip" that would be the next scan, under the name of the bad one.
             scan, camera = source.load(index, on_bad == "drop-points"), source.calibration(index)
             dropped = source.dropped.get(source.ids[index], 0)
         else:
@@ -189,14 +189,14 @@ def convert_one(
 
 
 def reproject(scan: Scan, sensor: Sensor | None = None, unfold: bool = False) -> Scan:
-    """The scan as another sensor's grid would hold it: one return per cell, through the cell's centre.
+    """Re-project a scan to a sensor's grid: one return per cell, on the ray through the cell's centre.
 
-    What stands in the scan's frame (boxes, pose, image) stays as it is.
+    Boxes, pose and image stay unchanged.
 
     Args:
         scan: N points.
-        sensor: whose grid; the scan's own by default.
-        unfold: one row per laser, ring by ring, in the place of rows of elevation.
+        sensor: defines the grid; by default the scan's own sensor.
+        unfold: whether rows are lasers instead of equal steps of elevation.
 
     Raises:
         DataError: on a scan that cannot be unfolded.
@@ -208,12 +208,12 @@ def reproject(scan: Scan, sensor: Sensor | None = None, unfold: bool = False) ->
 
 
 def name_of(source: Source, index: int) -> str | None:
-    """The id of a scan that is not read yet; None where the source does not tell it."""
+    """The id of a scan that has not been read; None if the source has no ids."""
     return source.ids[index] if isinstance(source, ScanFiles) else None
 
 
 def _settings(source: Source, writer: Writer, as_sensor: Sensor | None, unfold: bool) -> dict[str, Any]:
-    """What decides which scans are written, as far as the source tells it."""
+    """The settings that determine which scans are written, as far as the source has them."""
     settings: dict[str, Any] = {"scans": len(source), "writer": type(writer).__name__, "unfold": unfold}
     if isinstance(source, ScanFiles):
         settings |= {"root": str(source.root.resolve()), "sensor": (as_sensor or source.sensor).to_dict()}
@@ -227,7 +227,7 @@ _work: Callable[[Any], Any] | None = None
 
 
 def _start(work: Callable[[Any], Any]) -> None:
-    """Give a worker what it works with once, and not with every item."""
+    """Pass the function to a worker once, instead of with every item."""
     global _work
     _work = work
 
@@ -241,19 +241,19 @@ def _next(item: Any) -> Any:
 def in_processes(
     work: Callable[[Item], Result], items: Sequence[Item], jobs: int, chunk: int = 1
 ) -> Iterator[Iterator[Result]]:
-    """The results of ``work`` on each item, in order, by as many processes as there are jobs.
+    """Map ``work`` over items in several processes, with results in order.
 
     Args:
         work: a function that can be pickled.
-        items: what to work on.
-        jobs: processes; with one, the work is done here.
-        chunk: items that a worker takes at a time.
+        items: its arguments.
+        jobs: number of processes; 1 = this process.
+        chunk: number of items that a worker takes at a time.
     """
     if jobs == 1 or len(items) < 2:
         yield map(work, items)
         return
-    # Spawned, not forked: the parent may hold threads (numba, torch) that a fork would break. One process per core
-    # does the work: threads inside numpy would only fight for the cores.
+    # Spawned, not forked: a fork would break threads of the parent (numba, torch). With one process per core, threads
+    # inside numpy would only compete for the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
         try:

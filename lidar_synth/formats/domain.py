@@ -1,4 +1,4 @@
-"""Whether a folder of scans is synthetic: most layouts have no place for that, so a file beside the scans says it."""
+"""Marks folders of synthetic scans by a file beside the scans, because most layouts cannot store the domain."""
 
 import re
 from pathlib import Path
@@ -7,13 +7,13 @@ from lidar_synth.files.disk import write_file
 from lidar_synth.geometry.scan import REAL, SYNTHETIC
 
 MARK = "synthetic.json"
-"""File in the root of a folder all of whose scans are synthetic."""
+"""File in the root of a folder that marks all of its scans as synthetic."""
 
 TOWN = "town.json"
 """File in the root of a town, with its settings."""
 
 LEVELS = 6
-"""Folders above a scan in which a mark is looked for."""
+"""Number of folders above a scan that are searched for a mark."""
 
 _OF_A_LAYOUT = re.compile(
     r"velodyne(_points|_reduced)?|data|data_3d_raw|2013_05_28_drive_\d{4}_sync|sequences|\d\d|training|testing"
@@ -21,10 +21,10 @@ _OF_A_LAYOUT = re.compile(
 
 
 def domain_of(root: Path) -> int:
-    """``SYNTHETIC`` where a mark says so, beside the scans or above the folders of their layout; else ``REAL``.
+    """``SYNTHETIC`` if there is a mark beside the scans, or above the folders of their layout; else ``REAL``.
 
     Args:
-        root: what was opened: a dataset's root, one of its folders, or one scan.
+        root: a dataset's root, one of its folders, or one scan.
     """
     root = root.resolve()
     folder = root.parent if root.is_file() else root
@@ -38,10 +38,10 @@ def domain_of(root: Path) -> int:
 
 
 def mark_synthetic(root: Path) -> None:
-    """Say in a folder that all of its scans are synthetic.
+    """Mark all scans of a folder as synthetic.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     if domain_of(root) == REAL:
         text = '{"domain": "synthetic", "meaning": "made by a model or in a procedural town; none was measured"}\n'

@@ -1,11 +1,11 @@
 """A plain folder of scans, one file each: ``.bin``, ``.npy``, ``.npz``, ``.pcd`` or ``.ply``; or one such file.
 
-- ``.bin``: float32 x, y, z, reflectance per point, as KITTI's; beside it ``NAME.label`` with SemanticKITTI's labels.
-- ``.npy``: the same as an array (N, 4), or with more columns, of which the first four count.
-- ``.npz``: the package's own, see npz.py.
+- ``.bin``: float32 x, y, z, reflectance per point, as in KITTI; optional ``NAME.label`` with SemanticKITTI's labels.
+- ``.npy``: the same as an array (N, 4); further columns are ignored.
+- ``.npz``: the package's own format, see npz.py.
 - ``.pcd``, ``.ply``: see pcd.py and ply.py.
 
-Files in subfolders belong to it; a scan's id is its path there without the suffix.
+Files in subfolders are included; a scan's id is its relative path without the suffix.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.npz import check_numbers, decode_scan, told_sensor, write_scan
+from lidar_synth.formats.npz import check_numbers, decode_scan, stored_sensor, write_scan
 from lidar_synth.formats.pcd import read_pcd, write_pcd
 from lidar_synth.formats.ply import read_ply, write_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
@@ -37,15 +37,15 @@ class Folder(ScanFiles):
 
     Args:
         root: the folder or the file.
-        sensor: which sensor took the scans; an ``.npz`` tells its own.
+        sensor: the sensor that recorded the scans; an ``.npz`` file names its own.
         fields: floats per point of ``.bin`` files.
-        reflectance_max: the upper end of the reflectance in the files; it is divided by it.
+        reflectance_max: maximum of the reflectance in the files; values are divided by it.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        FileError: where there is no such path.
-        ConfigError: where files of several kinds are there, or on fields or a reflectance that no file has.
-        DataError: where there is none.
+        FileError: if the path does not exist.
+        ConfigError: if there are files of several kinds; on invalid ``fields`` or ``reflectance_max``.
+        DataError: if there is no file.
     """
 
     def __init__(
@@ -63,8 +63,8 @@ class Folder(ScanFiles):
         base, self._paths = scan_paths(root, SUFFIXES)
         ids = [path.relative_to(base).with_suffix("").as_posix() for path in self._paths]
         first = self._paths[0]
-        told = told_sensor(first) if sensor is None and first.suffix.lower() == ".npz" else None
-        super().__init__(root, ids, sensor or told or "hdl64e_kitti", on_bad)
+        own = stored_sensor(first) if sensor is None and first.suffix.lower() == ".npz" else None
+        super().__init__(root, ids, sensor or own or "hdl64e_kitti", on_bad)
         self._given = None if sensor is None else load_sensor(sensor)
         self._fields, self._reflectance_max = fields, reflectance_max
 
@@ -104,20 +104,20 @@ def _columns(path: Path) -> dict[str, NDArray[Any]]:
 
 
 ARRAYS: dict[str, Callable[[Path], dict[str, NDArray[Any]]]] = {".npy": _columns, ".pcd": read_pcd, ".ply": read_ply}
-"""Readers of a scan's arrays by suffix."""
+"""{suffix: reader of a scan's arrays}."""
 
 
 def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]:
-    """The folder that names are relative to, and the scans' paths in order.
+    """The folder to which names are relative, and the paths of the scans in order.
 
     Raises:
-        FileError: where there is no such path.
-        ConfigError: where files of several kinds are there, or a file of none.
-        DataError: where there is none.
+        FileError: if the path does not exist.
+        ConfigError: if there are files of several kinds, or the file is of an unknown kind.
+        DataError: if there is no file.
     """
     if root.is_file():
         if root.suffix.lower() not in suffixes:
-            raise ConfigError(f"{root} is no scan", f"a file with one of {', '.join(suffixes)}")
+            raise ConfigError(f"{root} is not a scan", f"a file with one of {', '.join(suffixes)}")
         return root.parent, [root]
     if not root.is_dir():
         raise FileError(f"{root} does not exist", "a file or a folder with scans")
@@ -132,8 +132,7 @@ def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]
 
 
 class KITTIWriter(FileWriter):
-    """Writes ``NAME.bin`` as KITTI's and ``NAME.label`` as SemanticKITTI's beside it, always: a scan or a class without
-    a label is 0 there."""
+    """Writes ``NAME.bin`` as in KITTI, and always ``NAME.label`` as in SemanticKITTI; unlabelled points are 0."""
 
     suffix = ".bin"
 
@@ -143,7 +142,7 @@ class KITTIWriter(FileWriter):
 
 
 class NPZWriter(FileWriter):
-    """Writes the package's own ``NAME.npz``, with all that is known of the scan but its image."""
+    """Writes the package's own ``NAME.npz``, with all fields of the scan except its image."""
 
     suffix = ".npz"
 
@@ -152,7 +151,7 @@ class NPZWriter(FileWriter):
 
 
 class PCDWriter(FileWriter):
-    """Writes ``NAME.pcd`` with the scan's points and fields; boxes and pose have no place there."""
+    """Writes ``NAME.pcd`` with the scan's points and fields, without boxes and pose."""
 
     suffix = ".pcd"
 
@@ -161,7 +160,7 @@ class PCDWriter(FileWriter):
 
 
 class PLYWriter(FileWriter):
-    """Writes ``NAME.ply`` with the scan's points and fields; boxes and pose have no place there."""
+    """Writes ``NAME.ply`` with the scan's points and fields, without boxes and pose."""
 
     suffix = ".ply"
 

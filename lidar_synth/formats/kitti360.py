@@ -1,4 +1,4 @@
-"""KITTI-360: drives of a HDL-64E with poses, calibration, boxes and, where somebody made them, labels per scan.
+"""KITTI-360: drives of an HDL-64E with poses, calibration, boxes and optional labels per scan.
 
 Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
 
@@ -12,10 +12,10 @@ Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
 
 The dataset publishes labels of accumulated clouds only. Labels per scan are recovered from them by nearest neighbours
 (github.com/JulesSanchez/recoverKITTI360label writes DRIVE/labels/FFFFFFFFFF.bin: int16 per point, KITTI-360's
-semantic id, -1 = none found). The reader takes, under data_3d_semantics_scan, files named ``.label`` or ``.bin`` and
-tells the two encodings apart by their size: two bytes per point are that tool's, four are SemanticKITTI's packing
-(KITTI-360's semantic id in the lower 16 bits, instance above), which the writer writes. Only the frames of annotated
-windows can have labels; others are read without.
+semantic id, -1 = none found). Under data_3d_semantics_scan, the reader accepts files named ``.label`` or ``.bin`` and
+distinguishes the two encodings by their size: two bytes per point are the encoding of that tool, four are
+SemanticKITTI's packing (KITTI-360's semantic id in the lower 16 bits, instance above), which the writer uses. Only
+frames of annotated windows can have labels; all others are read without labels.
 
 The pose of a ``Scan`` is velodyne to world: pose calib_cam_to_pose[image_00] calib_cam_to_velo^-1.
 """
@@ -45,14 +45,14 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 SPLITS = KITTI360_SPLITS
-"""Drives of each split, by the work that introduced it; None = all that are there. They leak into each other: what
-R2Flow tests on, LiDM trains on."""
+"""Drives of each split, named after the work that introduced it; None = all existing drives. The splits overlap: LiDM
+trains on drives on which R2Flow tests."""
 
 
 class KITTI360(ScanFiles):
     """KITTI-360's drives: <root>/data_3d_raw/DRIVE/velodyne_points/data/*.bin with poses, boxes, calibration, images.
 
-    A scan has labels if there is a file with its labels, and boxes if the drive has them and the scan's pose is known.
+    A scan has labels if its label file exists, and boxes if the drive has boxes and the scan a pose.
 
     Args:
         root: the folder that holds ``data_3d_raw``.
@@ -84,12 +84,17 @@ class KITTI360(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
-        wanted = choose("KITTI-360 split", split, SPLITS, "Works split the drives differently, so say whose split.")
-        there = sorted(p.parent.parent.name for p in (root / "data_3d_raw").glob("*/velodyne_points/data"))
-        drives = [d for d in there if wanted is None or d in wanted]
+        wanted = choose(
+            "KITTI-360 split",
+            split,
+            SPLITS,
+            "Published works split the drives differently: give the full name of a split.",
+        )
+        existing = sorted(p.parent.parent.name for p in (root / "data_3d_raw").glob("*/velodyne_points/data"))
+        drives = [d for d in existing if wanted is None or d in wanted]
         if not drives:
             raise DataError(
-                f"{root} has no drive of split {split!r} (it has {', '.join(there) or 'none at all'})",
+                f"{root} has no drive of split {split!r} (it has {', '.join(existing) or 'none at all'})",
                 "data_3d_raw/2013_05_28_drive_NNNN_sync/velodyne_points/data/*.bin",
             )
         ids = [f"{d}/{path.stem}" for d in drives for path in list_files(scans_folder(root, d), ".bin")]
@@ -130,13 +135,13 @@ class KITTI360Writer(Writer):
     """Writes KITTI-360's layout: scans, poses, calibration, boxes, images and labels per scan.
 
     Drive and frame of an id ``DRIVE/FFFFFFFFFF`` are kept, and those of SemanticKITTI's sequences (sequence 03 is
-    drive 0003); other scans go into ``drive``, numbered by index. Boxes are written for each frame with their
-    timestamp, as the dataset does for what moves. A scan with boxes and no pose gets the identity for its pose: its
-    world is its sensor's frame.
+    drive 0003); all other scans go into ``drive``, numbered by index. Boxes are written for each frame with their
+    timestamp, as the dataset does for moving objects. A scan with boxes but without a pose gets the identity as its
+    pose, so that its world frame is its sensor frame.
 
     Args:
         root: output folder.
-        drive: where scans without a drive of their own go.
+        drive: folder of scans without a drive of their own.
         calibration: see ``Writer``.
     """
 
@@ -149,7 +154,7 @@ class KITTI360Writer(Writer):
     ) -> None:
         super().__init__(root, calibration=calibration)
         if not drive or "/" in drive:
-            raise ConfigError(f"drive {drive!r}", "a folder's name, 2013_05_28_drive_0000_sync for instance")
+            raise ConfigError(f"drive {drive!r}", "a folder's name, such as 2013_05_28_drive_0000_sync")
         self.drive = drive
 
     def _place(self, index: int, name: str | None) -> str:
@@ -186,7 +191,7 @@ class KITTI360Writer(Writer):
 
 
 def _with_global_instances(labels: NDArray[np.uint32], scan: Scan) -> NDArray[np.uint32]:
-    """KITTI-360 numbers instances as id * 1000 + n, in labels as for its boxes; numbers below 1000 become such."""
+    """Convert instance numbers below 1000 to KITTI-360's id * 1000 + n, which labels and boxes use."""
     if labels is scan.raw_label:
         return labels
     ids, instances = labels & 0xFFFF, labels >> 16
@@ -207,7 +212,7 @@ def _facts(scan: Scan) -> dict[str, Any]:
 
 
 def scans_folder(root: Path, drive: str) -> Path:
-    """Where a drive keeps its scans."""
+    """The folder of a drive's scans."""
     return root / "data_3d_raw" / drive / "velodyne_points" / "data"
 
 
@@ -217,11 +222,11 @@ def image_path(root: Path, drive: str, frame: str) -> Path:
 
 
 def read_scan_labels(root: Path, drive: str, frame: str, points: Path, count: int) -> dict[str, Any]:
-    """``label``, ``raw_label`` and ``instance`` of a scan; empty where nobody has made its labels.
+    """``label``, ``raw_label`` and ``instance`` of a scan; empty if it has no label file.
 
     Raises:
-        FileError: where its label file cannot be read.
-        DataError: on another number of labels than points, or an id that KITTI-360 does not define.
+        FileError: if its label file cannot be read.
+        DataError: if the numbers of labels and points differ; on an id that KITTI-360 does not define.
     """
     folder = root / "data_3d_semantics_scan" / drive / "labels"
     path = next((p for p in (folder / f"{frame}.label", folder / f"{frame}.bin") if p.is_file()), None)

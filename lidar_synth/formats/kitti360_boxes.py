@@ -1,15 +1,14 @@
 """KITTI-360's boxes: one XML per drive, in the world frame.
 
 Each object (https://www.cvlibs.net/datasets/kitti-360/documentation.php, data_3d_bboxes) is a unit cube, ``vertices``,
-that ``transform`` turns, stretches and moves into the world: its columns are the box's axes, as long as the box. What
-moves has one object per frame, whose ``timestamp`` is the frame. What stands still has one with timestamp -1, and
-``start_frame`` and ``end_frame`` bound the *window* of the drive, some 200 m, in which it was annotated; the file does
-not say from which frames it can be seen.
+that ``transform`` rotates, scales and moves into the world frame: its columns are the axes of the box, scaled by its
+size. A moving object has one entry per frame, whose ``timestamp`` is the frame. A static object has one entry with
+timestamp -1; ``start_frame`` and ``end_frame`` bound the *window* of the drive, about 200 m, in which it was
+annotated. The file does not contain the frames in which it is visible.
 
-The reader therefore lists an object that stands still in every frame whose sensor is within range of it, if its window
-is at most ``MARGIN`` frames away (so that the next window's cars do not appear only when it begins, and those that
-parked there at another time do not appear at all). A ``Boxes`` knows no tilt, so a box that leans against the sensor
-keeps its yaw only.
+The reader therefore lists a static object in every frame whose sensor is within range of it, if its window is at most
+``MARGIN`` frames away. Cars of the next window thus appear before it begins, and cars that parked at the same place at
+another time do not appear. ``Boxes`` has no tilt, so a box that is tilted relative to the sensor keeps only its yaw.
 
 ``semanticId`` is not the id of the label images, but an older numbering (``OBJECTS``); drive 0004 has labels only.
 """
@@ -28,7 +27,7 @@ from lidar_synth.formats.points import FARTHEST
 from lidar_synth.geometry.scan import Boxes
 
 MARGIN = 100
-"""Frames (about 80 m) that the window of an object may be away for it to be listed."""
+"""Maximum distance in frames (about 80 m) from an object's window at which the object is listed."""
 
 OBJECTS = {
     13: ("car", 26, "Car"), 14: ("truck", 27, "Truck"), 15: ("trailer", 30, "Misc"), 16: ("caravan", 29, "Misc"),
@@ -36,15 +35,15 @@ OBJECTS = {
     20: ("rider", 25, "Cyclist"), 33: ("train", 31, "Tram"), 34: ("bus", 28, "Misc"),
     36: ("unknownVehicle", 43, "Misc"),
 }  # fmt: skip
-"""{semanticId: (label, id in the label images, KITTI's name)} of what a detector knows; others are left out. Lossy: a
-rider's box is without the bicycle, which has its own."""
+"""{semanticId: (label, id in the label images, KITTI's name)} of the classes for detectors; all others are skipped.
+Lossy: a rider's box does not include the bicycle, which has its own box."""
 
 BY_LABEL = {label: semantic for semantic, (label, _, _) in OBJECTS.items()}
 
 BY_NAME = {
     "Car": 13, "Van": 13, "Truck": 14, "Pedestrian": 19, "Person_sitting": 19, "Cyclist": 20, "Tram": 33, "Misc": 36,
 }  # fmt: skip
-"""semanticId to write for KITTI's names. Lossy: vans are cars there, and sitting people are people."""
+"""{KITTI's name: semanticId to write}. Lossy: vans become cars, and sitting persons pedestrians."""
 
 MAX_INSTANCES = 1000
 """A ``Boxes``' instance is id * 1000 + instanceId, as in the dataset's label images and tools."""
@@ -65,7 +64,7 @@ class WorldBoxes:
         transforms: (M, 4, 4) float64 from the unit cube to the world.
         names: (M,) KITTI's names.
         instances: (M,) int32.
-        windows: (M, 2) int64 first and last frame in which an object may be listed; what moves has its frame twice.
+        windows: (M, 2) int64 first and last frame in which an object may be listed; the same for a moving object.
     """
 
     transforms: NDArray[np.float64]
@@ -77,9 +76,9 @@ class WorldBoxes:
         """The boxes around one scan, in its sensor frame.
 
         Args:
-            frame: its number.
+            frame: number of the frame.
             pose: (4, 4) sensor to world.
-            range_max: metres; objects whose centre is farther are left out.
+            range_max: maximum distance of an object's centre, metres.
         """
         now = (self.windows[:, 0] <= frame) & (frame <= self.windows[:, 1])
         now &= np.linalg.norm(self.transforms[:, :3, 3] - pose[:3, 3], axis=1) <= range_max
@@ -94,11 +93,11 @@ class WorldBoxes:
 
 
 def read_boxes(path: Path) -> WorldBoxes:
-    """The objects of a drive's XML that a detector knows.
+    """Read the objects of a drive's XML file whose classes are in ``OBJECTS``.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is not KITTI-360's, or an object's vertices are no box.
+        FileError: if it cannot be read.
+        DataError: if it is not a file of KITTI-360, or an object's vertices do not form a box.
     """
     transforms, names, instances, windows = [], [], [], []
     try:
@@ -129,7 +128,7 @@ def read_boxes(path: Path) -> WorldBoxes:
     if not sound.all():
         wrong = found.transforms[~sound][0].tolist()
         raise DataError(
-            f"{path}: {np.count_nonzero(~sound)} objects are no boxes, such as {wrong}", "finite sizes above 0"
+            f"{path}: {np.count_nonzero(~sound)} objects are not boxes, such as {wrong}", "finite sizes above 0"
         )
     return found
 
@@ -139,7 +138,7 @@ def _matrix(node: ElementTree.Element, tag: str, shape: tuple[int, ...]) -> NDAr
 
 
 def _unit_cube(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) from the cube of side 1 around the origin to the box of the vertices: as a rule that cube itself."""
+    """(4, 4) transform from the unit cube around the origin to the box of the vertices, usually the identity."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     matrix = np.diag([*(high - low), 1.0])
     matrix[:3, 3] = (low + high) / 2
@@ -147,15 +146,15 @@ def _unit_cube(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64]]]) -> None:
-    """Write the boxes of frames, or add them to those of other frames that stand in the file already.
+    """Write the boxes of frames, or add them to those of other frames in an existing file.
 
     Args:
         path: the drive's XML.
         frames: {frame: (boxes in the sensor frame, (4, 4) sensor to world)}.
 
     Raises:
-        FileError: where it cannot be read or written.
-        DataError: where what stands there already is no XML.
+        FileError: if it cannot be read or written.
+        DataError: if the existing file is not XML.
     """
     root = ElementTree.Element("opencv_storage")
     if path.is_file():
@@ -164,7 +163,9 @@ def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64
         except OSError as error:
             raise unreadable(path, error) from error
         except ElementTree.ParseError as error:
-            raise DataError(f"{path}: {error}", "KITTI-360's data_3d_bboxes", "Remove it to write it anew.") from error
+            raise DataError(
+                f"{path}: {error}", "KITTI-360's data_3d_bboxes", "Remove it to write a new one."
+            ) from error
     kept = [node for node in root if int(node.findtext("timestamp") or -1) not in frames]
     objects = [node for frame, (boxes, pose) in sorted(frames.items()) for node in _objects(frame, boxes, pose)]
     root[:] = [*kept, *objects]

@@ -1,4 +1,4 @@
-"""KITTI-360's calibration and poses: where camera 0 and the IMU sit beside the velodyne, and where that drove.
+"""KITTI-360's calibration (camera 0 and IMU relative to the velodyne) and poses.
 
 Files (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
 
@@ -19,21 +19,21 @@ from lidar_synth.files.disk import numbers, read_matrix, read_named_matrices, wr
 from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneous, ideal_camera, read_image_size
 
 CAMERA = ideal_camera(552.554261, (1408, 376))
-"""What ``calibration`` describes where no camera is known: image_00's size and focal length, at the sensor."""
+"""The camera that is written if none is known: image_00's size and focal length, at the sensor."""
 
 IMU_FROM_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
-"""The IMU has x forward, y right, z down; where nothing else is known it stands in the sensor."""
+"""The IMU has x forward, y right, z down; without calibration it is assumed to be at the sensor."""
 
 
 SIZES = {"P_rect_00": 12, "R_rect_00": 9, "S_rect_00": 2, "image_00": 12, "cam_to_velo": 12}
-"""Values of each matrix of the calibration."""
+"""Number of values of each matrix of the calibration."""
 
 
 def read_calibration(root: Path) -> Calibration | None:
-    """Camera 0, rectified; None where the dataset's ``calibration`` is not there.
+    """Camera 0, rectified; None if the files of ``calibration`` are missing.
 
     Raises:
-        DataError: where a file of it is there, but not what it has to hold.
+        DataError: if a file does not hold the required matrices.
     """
     folder = root / "calibration"
     paths = [folder / name for name in ("perspective.txt", "calib_cam_to_velo.txt", "calib_cam_to_pose.txt")]
@@ -55,7 +55,7 @@ def read_calibration(root: Path) -> Calibration | None:
 
 
 def write_calibration(root: Path, camera: Calibration) -> None:
-    """The inverse of ``read_calibration``: KITTI-360's own matrices as they were, another camera unrectified."""
+    """The inverse of ``read_calibration``: KITTI-360's own matrices unchanged; other cameras as unrectified."""
     matrices = camera.matrices
     if not {"P_rect_00", "R_rect_00", "S_rect_00", "image_00", "cam_to_velo"} <= set(matrices):
         matrices = {
@@ -68,7 +68,7 @@ def write_calibration(root: Path, camera: Calibration) -> None:
     folder = root / "calibration"
     write_file(folder / "calib_cam_to_velo.txt", f"{numbers(matrices['cam_to_velo'].ravel())}\n".encode())
     write_named_matrices(folder / "calib_cam_to_pose.txt", {"image_00": matrices["image_00"]})
-    # Last, because its presence says that the calibration is whole.
+    # Last, because its presence marks the calibration as complete.
     write_named_matrices(folder / "perspective.txt", {n: matrices[n] for n in ("S_rect_00", "R_rect_00", "P_rect_00")})
 
 
@@ -81,11 +81,10 @@ def imu_from_sensor(camera: Calibration | None) -> NDArray[np.float64]:
 
 
 def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, NDArray[np.float64]]:
-    """{frame: (4, 4) velodyne to world}; empty without ``poses.txt`` or calibration. Not every frame has one.
+    """{frame: (4, 4) velodyne to world}; empty without ``poses.txt`` or calibration. Not every frame has a pose.
 
     Raises:
-        DataError: on a line without 13 numbers, a frame that is no number of one or stands there twice, or a pose that
-            is not rigid.
+        DataError: on a line without 13 numbers, an invalid or repeated frame number, or a pose that is not rigid.
     """
     path = root / "data_poses" / drive / "poses.txt"
     if camera is None or not path.is_file():
@@ -94,17 +93,17 @@ def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, 
     matrices = np.tile(np.eye(4), (len(lines), 1, 1))
     matrices[:, :3] = lines[:, 1:].reshape(-1, 3, 4)
     frames = lines[:, 0]
-    whole = (frames >= 0) & (frames < 1e10) & (frames == np.rint(frames))
-    if not whole.all() or len(np.unique(frames)) < len(frames):
-        raise DataError(f"{path} has frames that are no numbers of one, or some twice", "each frame once, from 0 on")
+    valid = (frames >= 0) & (frames < 1e10) & (frames == np.rint(frames))
+    if not valid.all() or len(np.unique(frames)) < len(frames):
+        raise DataError(f"{path} has invalid or repeated frame numbers", "each frame once, integers from 0 on")
     check_rigid(matrices, str(path))
     return dict(zip(frames.astype(int).tolist(), matrices @ imu_from_sensor(camera), strict=True))
 
 
 def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -> None:
-    """The inverse of ``read_poses``, for the calibration that stands in ``root``; nothing where there are none.
+    """The inverse of ``read_poses``, with the calibration in ``root``; writes nothing if there are no poses.
 
-    ``cam0_to_world.txt``, which the dataset has too, is written beside it.
+    ``cam0_to_world.txt``, which the dataset also has, is written beside ``poses.txt``.
     """
     camera = read_calibration(root)
     if not poses or camera is None:

@@ -1,9 +1,9 @@
 """KITTI's ``label_2`` files: boxes in the rectified camera frame, one object per line of text.
 
 A line (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme) is ``name truncation occlusion alpha
-left top right bottom h w l x y z rotation_y``, with x, y, z the middle of the box's *floor*. A ``Boxes`` holds the
-centre of gravity in the sensor frame and the yaw about its z; the camera leans about a degree against it, so that the
-ends of a long box move by some centimetres, and back.
+left top right bottom h w l x y z rotation_y``, with x, y, z the centre of the box's *floor*. A ``Boxes`` holds the
+centre of gravity in the sensor frame and the yaw about its z axis. The camera is tilted by about one degree relative
+to the sensor, so that the ends of a long box move by some centimetres; conversion back is exact.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ def read_label_2(path: Path, camera: Calibration) -> Boxes:
     """The boxes of a label file in the sensor frame.
 
     Raises:
-        FileError: where it cannot be read.
+        FileError: if it cannot be read.
         DataError: on a line without 15 fields (16 with a score), or a value that no label has.
     """
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
@@ -49,7 +49,7 @@ def read_label_2(path: Path, camera: Calibration) -> Boxes:
 
 
 def _check_values(values: NDArray[np.float64], ignored: NDArray[np.bool_], path: Path) -> None:
-    """Refuse values that no label has: what is not finite or far beyond any sensor, and sizes and occlusions."""
+    """Refuse impossible values: not finite, far beyond any sensor's range, or wrong sizes and occlusions."""
     within = np.abs(values) <= FARTHEST  # NaN is not
     sizes = (values[:, 7:10] > 0).all(axis=1) | ignored
     sound = within.all(axis=1) & np.isin(values[:, 1], (-1, 0, 1, 2, 3)) & sizes
@@ -67,10 +67,10 @@ def boxes_from_camera(
     """(M, 7) boxes in the sensor frame; the inverse of ``boxes_to_camera``.
 
     Args:
-        floor: (M, 3) middle of the box's floor in the rectified camera frame, metres.
+        floor: (M, 3) centre of the box's floor in the rectified camera frame, metres.
         size: (M, 3) height, width, length, metres.
-        rotation_y: (M,) turn about the camera's y axis, radians.
-        camera: where the camera stands.
+        rotation_y: (M,) rotation about the camera's y axis, radians.
+        camera: the calibration.
     """
     height, width, length = size.T
     centre = floor - np.stack([0 * height, height / 2, 0 * height], -1)
@@ -94,13 +94,13 @@ def boxes_to_camera(
 
 
 def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
-    """The inverse of ``read_label_2`` to KITTI's two decimals; see ``KITTIObjectWriter`` for what is listed.
+    """The inverse of ``read_label_2`` with KITTI's two decimals; ``KITTIObjectWriter`` defines which boxes are listed.
 
-    An alpha that is not known is worked out: rotation_y less the direction in which the *sensor* sees the box. (The
-    devkit speaks of the camera; KITTI's own files agree with the sensor, to the rounding.)
+    An unknown alpha is computed: rotation_y minus the direction of the box from the *sensor*. (The devkit says the
+    camera, but KITTI's own files agree with the sensor, up to rounding.)
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     image_box, truncation = _in_image(boxes, camera)
     floor, size, rotation_y = boxes_to_camera(boxes.values, camera)
@@ -117,7 +117,7 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
 
 
 def _in_image(boxes: Boxes, camera: Calibration) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(M, 4) image boxes and (M,) truncations, worked out from the corners where a box brings none."""
+    """(M, 4) image boxes and (M,) truncations; unknown ones are computed from the corners."""
     image_box, truncation = boxes.image_box.astype(np.float64), boxes.truncation.astype(np.float64)
     unknown = np.flatnonzero((boxes.image_box < 0).any(axis=1))
     if camera.image_size is None:

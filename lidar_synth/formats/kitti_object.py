@@ -3,7 +3,7 @@
 Layout (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme)::
 
     training/velodyne/FFFFFF.bin         float32 x, y, z, reflectance; sensor frame
-    training/velodyne_reduced/           the same, only what camera 2 sees
+    training/velodyne_reduced/           the same, only points in the view of camera 2
     training/label_2/FFFFFF.txt          one object per line, rectified camera frame
     training/calib/FFFFFF.txt            P0..P3, R0_rect, Tr_velo_to_cam, Tr_imu_to_velo
     training/image_2/FFFFFF.png          left colour camera
@@ -44,10 +44,10 @@ SPLITS: dict[str, tuple[Part, ...]] = {
     "test": ("testing",),
     "all": ("training", "testing"),
 }
-"""The folders of each split; ``ImageSets`` says which of their frames."""
+"""{split: folders}; ``ImageSets`` lists the frames."""
 
 OBJECT_CAMERA = ideal_camera(721.5377, (1242, 375))
-"""What ``calib`` describes where no camera is known: the size and focal length of KITTI's, at the sensor."""
+"""The camera that is written if none is known: KITTI's image size and focal length, at the sensor."""
 
 
 class KITTIObject(ScanFiles):
@@ -91,13 +91,13 @@ class KITTIObject(ScanFiles):
         if split != "all" and image_set.is_file():
             frames = read_text(image_set).split()
             if bad := [frame for frame in frames if not re.fullmatch(r"\w[\w.-]*", frame)]:
-                raise DataError(f"{image_set} lists {bad[0][:100]!r}", "names of frames, 000123 for instance")
+                raise DataError(f"{image_set} lists {bad[0][:100]!r}", "names of frames, such as 000123")
             ids = [f"{parts[0]}/{frame}" for frame in frames]
         elif split in ("train", "val"):
             raise ConfigError(
                 f"split {split!r}, but there is no {image_set}",
                 "the list of its frames",
-                "Put KITTI's ImageSets there, or take split='trainval', all of training.",
+                "Copy KITTI's ImageSets there, or use split='trainval', all of training.",
             )
         else:
             folders = [(p, root / p / self._velodyne) for p in parts if (root / p / self._velodyne).is_dir()]
@@ -132,12 +132,12 @@ class KITTIObject(ScanFiles):
 class KITTIObjectWriter(Writer):
     """Writes the object set's folders: velodyne, label_2, calib, image_2 and, at the end, ImageSets.
 
-    ``label_2`` lists what the camera sees, as KITTI's does: boxes whose ``image_box`` is known, and others whose
-    corners fall into the image (``image_box`` and truncation are worked out then); boxes elsewhere around the sensor
-    are left out. A scan whose boxes are not known is refused for ``training``. Trainers take the image's size from
-    ``image_2``, so a scan without an image gets a black one.
+    As in KITTI, ``label_2`` lists only boxes in the camera's view: those with a known ``image_box``, and those whose
+    corners are in the image, for which ``image_box`` and truncation are computed. A scan without known boxes is
+    refused for ``training``. Trainers read the image size from ``image_2``, so a scan without an image gets a black
+    one.
 
-    An id ``training/FFFFFF`` or ``testing/FFFFFF`` is kept; other scans go into ``part``, numbered by index.
+    An id ``training/FFFFFF`` or ``testing/FFFFFF`` is kept; all other scans go into ``part``, numbered by index.
 
     Args:
         root: output folder.
@@ -159,7 +159,7 @@ class KITTIObjectWriter(Writer):
         if folder.name == "training" and scan.boxes is None:
             raise DataError(
                 f"scan {scan.id!r} has no boxes",
-                "a scan whose boxes are known: an empty label_2 would say that there is no object",
+                "a scan whose boxes are known: an empty label_2 would mean that there is no object",
                 "Write it as semantic_kitti, or without label_2: KITTIObjectWriter(root, part='testing').",
             )
         camera = camera or OBJECT_CAMERA
@@ -184,8 +184,8 @@ def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> C
     """Camera 2 of a ``calib`` file.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where P2, R0_rect or Tr_velo_to_cam is missing, or is none.
+        FileError: if it cannot be read.
+        DataError: if P2, R0_rect or Tr_velo_to_cam is missing or invalid.
     """
     matrices = read_named_matrices(path)
     sizes = {name: matrices.get(name, np.zeros(0)).size for name in ("P2", "R0_rect", "Tr_velo_to_cam")}
@@ -197,7 +197,7 @@ def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> C
 
 
 def write_calibration(path: Path, camera: Calibration) -> None:
-    """The inverse of ``read_calibration``: KITTI's own matrices as they were, another camera as all four."""
+    """The inverse of ``read_calibration``: KITTI's own matrices unchanged; another camera is written as all four."""
     own = {"P0", "P1", "P2", "P3", "R0_rect", "Tr_velo_to_cam"} <= set(camera.matrices)
     lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | {
         "R0_rect": np.eye(3),

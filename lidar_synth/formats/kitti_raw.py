@@ -1,4 +1,4 @@
-"""KITTI raw: whole drives, with boxes where somebody annotated tracklets.
+"""KITTI raw: complete drives, with boxes if tracklets were annotated.
 
 Layout (https://www.cvlibs.net/datasets/kitti/raw_data.php)::
 
@@ -7,7 +7,7 @@ Layout (https://www.cvlibs.net/datasets/kitti/raw_data.php)::
     DATE/DATE_drive_NNNN_sync/image_02/data/FFFFFFFFFF.png            left colour camera
     DATE/calib_velo_to_cam.txt, DATE/calib_cam_to_cam.txt
 
-A tracklet is one object: its size, and from ``first_frame`` on one pose per frame, with x, y, z the middle of the
+A tracklet is one object: its size, and from ``first_frame`` on one pose per frame, with x, y, z the centre of the
 box's *floor* and rz the yaw. The package reads this layout and does not write it.
 """
 
@@ -26,14 +26,13 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 DRIVES = "*_drive_*/velodyne_points/data"
-"""Where a drive keeps its scans, seen from the folder of its date."""
+"""Pattern of the folders with scans, relative to the folder of a date."""
 
 
 class KITTIRaw(ScanFiles):
     """KITTI's raw drives: <root>/[DATE/]DATE_drive_NNNN_sync/velodyne_points/data/*.bin, tracklet_labels.xml.
 
-    If the drive has tracklets, a scan has the boxes of its frame, of which there may be none; otherwise ``boxes`` is
-    None.
+    If the drive has tracklets, a scan has the boxes of its frame, possibly zero; otherwise ``boxes`` is None.
 
     Args:
         root: the folder that holds the dates, the folder of one date, or the folder of one drive.
@@ -92,10 +91,10 @@ class KITTIRaw(ScanFiles):
 
 
 def read_calibration(folder: Path, image_size: tuple[int, int] | None = None) -> Calibration | None:
-    """Camera 2 of a day's calibration; None where its two files are not there.
+    """Camera 2 of a day's calibration; None if its two files are missing.
 
     Raises:
-        DataError: where a matrix is missing in them, or is none.
+        DataError: if a matrix is missing or invalid.
     """
     paths = folder / "calib_velo_to_cam.txt", folder / "calib_cam_to_cam.txt"
     if not all(path.is_file() for path in paths):
@@ -113,11 +112,11 @@ def read_calibration(folder: Path, image_size: tuple[int, int] | None = None) ->
 def read_tracklets(path: Path) -> dict[int, Boxes]:
     """{frame: boxes} of a drive, in the sensor frame; a box's instance is the tracklet's number in the file.
 
-    Truncation is known (0) only where the tracklet says that the object is wholly in the image.
+    Truncation is known (0) only if the tracklet marks the object as completely in the image.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is not a tracklet file.
+        FileError: if it cannot be read.
+        DataError: if it is not a tracklet file.
     """
     rows: dict[int, list[tuple[tuple[float, ...], str, int, int, int]]] = defaultdict(list)
     try:

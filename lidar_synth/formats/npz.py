@@ -1,4 +1,4 @@
-"""The package's own ``.npz`` files: a scan's points, or a range image, with all that is known about it. Lossless.
+"""The package's own ``.npz`` files: a scan's points, or a range image, with all other fields. Lossless.
 
 Arrays of both (numpy's format, never pickled)::
 
@@ -28,7 +28,7 @@ from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Boxes, Rang
 from lidar_synth.geometry.sensor import Sensor
 
 FACTS = ("sensor", "id", "domain", "pose")
-"""Names in a file that are no channels of a range image; so are those that begin with ``BOX``."""
+"""Names in a file that are not channels of a range image, like those that begin with ``BOX``."""
 
 BOX = "box_"
 
@@ -36,37 +36,37 @@ TYPES = {
     "points": "f4", "reflectance": "f4", "label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2",
     "confidence": "f4",
 }  # fmt: skip
-"""numpy's types of a scan's fields."""
+"""numpy types of a scan's fields."""
 
 
-def told_sensor(path: Path) -> Sensor | None:
-    """The sensor that an ``.npz`` file of ours tells, without a look at the rest; None where it tells none."""
+def stored_sensor(path: Path) -> Sensor | None:
+    """The sensor that is stored in an ``.npz`` file, without reading its other arrays; None if there is none."""
     try:
         return _sensor(read_arrays(path, only=["sensor"]))
     except (LidarSynthError, KeyError):
-        return None  # whoever reads the scan will say what is wrong with it
+        return None  # reading the scan will raise the error
 
 
 def write_scan(path: Path, scan: Scan) -> None:
-    """A scan as ``.npz``; ``decode_scan`` is the inverse.
+    """Write a scan as ``.npz``; ``decode_scan`` is the inverse.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     arrays = {"points": np.ascontiguousarray(scan.points), **scan.fields(), **_facts(scan)}
     write_arrays(path, arrays)
 
 
 def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | None = None) -> Scan:
-    """The scan of an ``.npz``'s arrays.
+    """Make a scan from the arrays of an ``.npz`` file.
 
     Args:
-        arrays: as ``read_arrays`` gives them.
-        where: what to name in the error, usually the path.
-        sensor: for a file that does not tell its own.
+        arrays: the result of ``read_arrays``.
+        where: name of the file in the error.
+        sensor: used if the file has no sensor.
 
     Raises:
-        DataError: where points, reflectance or the sensor is missing or has another shape or type.
+        DataError: if points, reflectance or the sensor is missing, or has a wrong shape or type.
     """
     try:
         facts = _known(arrays, sensor)
@@ -78,11 +78,10 @@ def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | No
 
 
 def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -> None:
-    """A range image as compressed ``.npz``, with what is known of the scan that it shows; ``decode_range_image`` is
-    the inverse.
+    """Write a range image as compressed ``.npz``, with the facts of its scan; ``decode_range_image`` is the inverse.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     facts = {"sensor": np.array(json.dumps(image.sensor.to_dict()))} if scan is None else _facts(scan, image.sensor)
     arrays = {"range": image.range, **image.channels, **facts}
@@ -92,10 +91,10 @@ def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -
 def decode_range_image(
     arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | None = None
 ) -> tuple[RangeImage, dict[str, Any]]:
-    """The range image of an ``.npz``'s arrays, and the fields of a ``Scan`` that belong to no cell.
+    """Make a range image from the arrays of an ``.npz`` file; also return the scan's facts that are not per cell.
 
     Raises:
-        DataError: where range or sensor is missing, or a shape is not the sensor's.
+        DataError: if range or sensor is missing, or a shape does not match the sensor.
     """
     try:
         facts = _known(arrays, sensor)
@@ -107,19 +106,19 @@ def decode_range_image(
 
 
 def range_image(distance: NDArray[Any], sensor: Sensor, channels: dict[str, NDArray[Any]], where: str) -> RangeImage:
-    """A range image whose cells all hold what they may.
+    """Make a range image, after checking the values of all cells.
 
     Raises:
-        DataError: on text, NaN, infinite or negative ranges, which would be cells without a return in silence; on a
-            shape that is not the sensor's; on labels that are no train ids, and shares outside of [0, 1]. Cells without
-            a return may hold anything: they become what ``RangeImage`` says.
+        DataError: on text, NaN, infinite or negative ranges, which would silently become cells without a return; on a
+            shape that does not match the sensor; on labels that are not train ids, and on reflectance or confidence
+            outside [0, 1]. Values of cells without a return are ignored, and set as ``RangeImage`` defines.
     """
     check_numbers(distance, f"{where}: range")
     with np.errstate(over="ignore"):
         image = RangeImage(distance.astype(np.float32, copy=False), sensor, channels)
     bad = ~(np.isfinite(image.range) & (image.range >= 0))
     if bad.any():
-        raise DataError(f"{where}: {bad.sum()} cells whose range is negative or no number", "metres, 0 = no return")
+        raise DataError(f"{where}: {bad.sum()} cells whose range is negative or not finite", "metres, 0 = no return")
     for name in [n for n in image.channels if n in POINT_FIELDS]:
         values = image.channels[name].copy()
         values[~image.mask] = IGNORE if name == "label" else 0
@@ -132,7 +131,7 @@ def range_image(distance: NDArray[Any], sensor: Sensor, channels: dict[str, NDAr
 
 
 def check_numbers(array: NDArray[Any], where: str) -> None:
-    """Refuse text in the place of numbers.
+    """Refuse text instead of numbers.
 
     Raises:
         DataError: on text.
@@ -148,7 +147,7 @@ def _check_types(arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _sensor(arrays: Mapping[str, NDArray[Any]]) -> Sensor:
-    """The sensor that arrays tell; raises KeyError where they tell none."""
+    """The sensor stored in the arrays; raises KeyError if there is none."""
     return Sensor.from_dict(parse_json(str(arrays["sensor"]), "its sensor", "the keys of sensors.yaml"))
 
 
@@ -167,14 +166,14 @@ def _facts(scan: Scan, sensor: Sensor | None = None) -> dict[str, Any]:
 
 
 def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, Any]:
-    """The inverse of ``_facts``; a file's own sensor goes before the given one, and has to be the same."""
+    """The inverse of ``_facts``; a file's own sensor takes precedence, and its shape must match the given one."""
     known: dict[str, Any] = {"sensor": sensor}
     if "sensor" in arrays:
         known["sensor"] = _sensor(arrays)
         if sensor is not None and sensor.shape != known["sensor"].shape:
             raise ValueError(f"it was made for sensor {known['sensor'].name!r}, not for {sensor.name!r}")
     if known["sensor"] is None:
-        raise KeyError("it does not tell its sensor: pass one")
+        raise KeyError("it has no sensor: pass one")
     for name, kinds in (("id", "U"), ("domain", "iu")):
         if name in arrays:
             if arrays[name].shape or arrays[name].dtype.kind not in kinds:
@@ -194,10 +193,10 @@ def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, 
 
 
 def check_pose(values: Any) -> NDArray[np.float64]:
-    """A pose, (4, 4) float64.
+    """Check a pose, and return it as (4, 4) float64.
 
     Raises:
-        ValueError: on another shape, or values that are no finite numbers.
+        ValueError: on another shape, or values that are not finite numbers.
     """
     pose = np.asarray(values)
     if pose.shape != (4, 4) or pose.dtype.kind not in "iuf" or not np.isfinite(pose).all():

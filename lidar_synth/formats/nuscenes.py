@@ -1,4 +1,4 @@
-"""nuScenes: sweeps of its 32-beam LiDAR, with lidarseg's labels where they are there.
+"""nuScenes: sweeps of its 32-beam LiDAR, with lidarseg's labels if they exist.
 
 Layout (https://www.nuscenes.org/nuscenes#data-format, https://www.nuscenes.org/nuscenes#lidarseg)::
 
@@ -6,10 +6,10 @@ Layout (https://www.nuscenes.org/nuscenes#data-format, https://www.nuscenes.org/
     lidarseg/VERSION/TOKEN_lidarseg.bin  uint8 class per point
     VERSION/lidarseg.json                which labels belong to which sweep
 
-nuScenes has x right and y forward; both are turned into the package's x forward, y left. Intensity is divided by 255
-and rings are counted from the top. Points nearer than one metre are the recording car and, in full sweeps, firings
-without a return (they stand at the origin): they are dropped, with their labels, as nuScenes' own tools and its users
-do. The package reads this layout and does not write it.
+nuScenes has x right and y forward; both are converted to the package's x forward, y left. Intensity is divided by 255
+and rings are counted from the top. Points nearer than one metre belong to the recording car or, in full sweeps, to
+firings without a return, which are stored at the origin: they are dropped with their labels, as in nuScenes' own
+tools. The package reads this layout and does not write it.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ SUFFIX = ".pcd.bin"
 INTENSITY_MAX = 255.0
 RINGS = 32
 NEAREST = 1.0
-"""Metres: what is nearer is the car that carries the sensor, or no return at all."""
+"""Minimum range, metres: nearer points belong to the recording car, or are firings without a return."""
 
 
 class NuScenes(ScanFiles):
@@ -72,8 +72,8 @@ class NuScenes(ScanFiles):
         rings = points[:, 4]
         if not ((rings >= 0) & (rings < RINGS) & (rings == np.floor(rings))).all():
             raise DataError(
-                f"{path}: the fifth field of its points is no ring ({rings.min():g} to {rings.max():g})",
-                f"whole numbers 0..{RINGS - 1}",
+                f"{path}: the fifth field of its points is not a ring ({rings.min():g} to {rings.max():g})",
+                f"integers 0..{RINGS - 1}",
                 f"It may hold four floats per point (KITTI), or be damaged. {SKIP_HINT}",
             )
         labels: dict[str, Any] = {}
@@ -91,22 +91,22 @@ class NuScenes(ScanFiles):
             id=self.ids[index],
             **labels,
         )
-        kept = ~(np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2)  # NaN is somebody else's to drop
+        kept = ~(np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2)  # keeps NaN, which on_bad handles
         if not kept.any():
             raise DataError(f"{path}: all {len(scan)} points are nearer than {NEAREST:g} m", "a sweep", SKIP_HINT)
         return scan[kept]
 
 
 def ahead(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N, 3) from nuScenes' x right, y forward to x forward, y left; exact."""
+    """Convert (N, 3) points exactly from nuScenes' x right, y forward to x forward, y left."""
     return np.column_stack([points[:, 1], -points[:, 0], points[:, 2]])
 
 
 def lidarseg_files(root: Path) -> Mapping[str, Path]:
-    """{name of a sweep: its label file} by the tables of every version under a dataset's root.
+    """{name of a sweep: its label file} from the tables of all versions under a dataset's root.
 
     Raises:
-        DataError: where a table is no JSON, lacks a field or names a file outside of the root.
+        DataError: if a table is not JSON, lacks a field, or names a file outside of the root.
     """
     files = {}
     for table in sorted(root.glob("*/lidarseg.json")):

@@ -1,7 +1,7 @@
 """PCD files, version 0.7 (https://pointclouds.org/documentation/tutorials/pcd_file_format.html). Lossless for a scan.
 
-Read as ``ascii``, ``binary`` and ``binary_compressed``, written as ``binary``. What a header says is compared with the
-file before any value is read: a header that lies would otherwise drop points, or read what is no part of the file.
+The package reads ``ascii``, ``binary`` and ``binary_compressed`` files and writes ``binary``. The header is compared
+with the file before any value is read: a false header could otherwise drop points, or read beyond the data.
 """
 
 import re
@@ -18,22 +18,22 @@ from lidar_synth.formats.cloud import Field, check_fields, check_size, from_reco
 from lidar_synth.geometry.scan import Scan
 
 LONGEST_HEADER = 1 << 16
-"""Bytes."""
+"""Maximum length of a header in bytes."""
 
 MOST_EXPANSION = 89
-"""LZF makes at most 264 bytes of 3."""
+"""Maximum factor of decompression: LZF expands 3 bytes to at most 264."""
 
 _PER_FIELD = ("FIELDS", "SIZE", "TYPE", "COUNT")
 
 _SIZES = {"F": "48", "I": "1248", "U": "1248"}
-"""Bytes that a value of each type may have."""
+"""{type: possible sizes of a value in bytes}."""
 
 
 def write_pcd(path: Path, scan: Scan) -> None:
-    """A scan as binary ``.pcd``; ``read_pcd`` is the inverse.
+    """Write a scan as binary ``.pcd``; ``read_pcd`` is the inverse.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     records = to_records(scan)
     types = [records.dtype[name] for name in records.dtype.names or ()]
@@ -54,11 +54,11 @@ def write_pcd(path: Path, scan: Scan) -> None:
 
 
 def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a ``.pcd``, as a ``Scan`` names them.
+    """Read the arrays of a ``.pcd`` file, named as in ``Scan``.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where its header is none or does not fit the file, or it holds no points.
+        FileError: if it cannot be read.
+        DataError: if its header is invalid or does not match the file, or it holds no points.
     """
     content, where = read_file(path), str(path)
     end = re.search(rb"^DATA[ \t]+(\w+)[ \t\r]*\n", content[:LONGEST_HEADER], re.M)
@@ -78,7 +78,7 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _header(text: str, where: str) -> tuple[list[Field], int]:
-    """Fields and number of points; every line is there once, and all agree."""
+    """Parse the fields and the number of points, after checking that all lines exist once and agree."""
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     header = {row[0]: row[1:] for row in rows}
     fault = f"{where}: its header cannot be read"
@@ -93,7 +93,7 @@ def _header(text: str, where: str) -> tuple[list[Field], int]:
     single = [header[key] for key in ("WIDTH", "HEIGHT", "POINTS")]
     numbers = sum(single, [*header["SIZE"], *header["COUNT"]])
     if any(len(row) != 1 for row in single) or any(not re.fullmatch("[0-9]{1,12}", number) for number in numbers):
-        raise DataError(f"{fault}: sizes that are none", "whole numbers, one each of WIDTH, HEIGHT, POINTS", SKIP_HINT)
+        raise DataError(f"{fault}: invalid sizes", "integers, one each for WIDTH, HEIGHT and POINTS", SKIP_HINT)
     width, height, points = (int(number) for [number] in single)
     if width * height != points:
         raise DataError(f"{where}: WIDTH {width}, HEIGHT {height} and POINTS {points}", "WIDTH x HEIGHT = POINTS")
@@ -107,23 +107,25 @@ def _header(text: str, where: str) -> tuple[list[Field], int]:
 
 
 def _from_columns(body: bytes, fields: list[Field], count: int) -> dict[str, NDArray[Any]]:
-    """{name: (N, count)} fields of which each has all its values together, as compression has it."""
-    found, offset = {}, 0
+    """{name: values} of fields that are stored one after another, as in compressed files."""
+    arrays, offset = {}, 0
     for field in fields:
-        found[field.name] = np.frombuffer(body, field.type, count * field.count, offset)
+        arrays[field.name] = np.frombuffer(body, field.type, count * field.count, offset)
         offset += count * field.width
-    return found
+    return arrays
 
 
 def _decompressed(body: bytes, size: int, where: str) -> bytes:
     """The ``size`` bytes of a compressed body: two lengths, then LZF."""
     packed, plain = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
     if plain != size or size > MOST_EXPANSION * packed:
-        raise DataError(f"{where} says {packed} bytes hold {plain}", f"{size}, by its header", SKIP_HINT)
+        raise DataError(
+            f"{where} declares {plain} bytes in {packed} compressed ones", f"{size}, by its header", SKIP_HINT
+        )
     check_size(body, 8 + packed, where)
     target = np.empty(size, np.uint8)
     if lzf(np.frombuffer(body, np.uint8, packed, 8), target) != size:
-        raise DataError(f"{where}: its compressed points are damaged", "what LZF compressed", SKIP_HINT)
+        raise DataError(f"{where}: its compressed points are damaged", "LZF data", SKIP_HINT)
     return target.tobytes()
 
 
@@ -132,20 +134,20 @@ def lzf(source, target):  # type: ignore[no-untyped-def]  # (N,) and (M,) uint8,
     """Decompress LZF (http://oldhome.schmorp.de/marc/liblzf.html) into ``target``.
 
     Returns:
-        The bytes written, or -1 where the source is damaged or ``target`` too short.
+        The number of bytes written, or -1 if the source is damaged or ``target`` too short.
     """
     read = written = 0
     while read < len(source):
         control = int(source[read])
         read += 1
-        if control < 32:  # the next bytes as they are
+        if control < 32:  # literal bytes follow
             length = control + 1
             if read + length > len(source) or written + length > len(target):
                 return -1
             for i in range(length):
                 target[written + i] = source[read + i]
             read += length
-        else:  # bytes that were written before
+        else:  # a reference to bytes that were written before
             length = (control >> 5) + 2
             if read + 1 + (length == 9) > len(source):
                 return -1

@@ -1,6 +1,6 @@
 """PLY files (http://paulbourke.net/dataformats/ply): their vertices as points. Lossless for a scan.
 
-Read as ``ascii`` and in both byte orders, written as ``binary_little_endian``. As with PCD, what the header says is
+The package reads ``ascii`` and both binary byte orders and writes ``binary_little_endian``. As with PCD, the header is
 compared with the file before any value is read.
 """
 
@@ -26,7 +26,7 @@ from lidar_synth.formats.cloud import (
 from lidar_synth.geometry.scan import Scan
 
 LONGEST_HEADER = 1 << 16
-"""Bytes."""
+"""Maximum length of a header in bytes."""
 
 TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -39,7 +39,7 @@ ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass
 class Element:
-    """One kind of things in the file: ``count`` times ``fields``; ``lists`` where one of them has no fixed length."""
+    """One element of the file: ``count`` records of ``fields``; ``lists`` if a field has no fixed length."""
 
     name: str
     count: int
@@ -48,15 +48,15 @@ class Element:
 
     @property
     def size(self) -> int:
-        """Bytes of all of them."""
+        """Total size of its records in bytes."""
         return self.count * sum(f.width for f in self.fields)
 
 
 def write_ply(path: Path, scan: Scan) -> None:
-    """A scan as binary ``.ply``; ``read_ply`` is the inverse.
+    """Write a scan as binary ``.ply``; ``read_ply`` is the inverse.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     records = to_records(scan)
     names = {kind: name for name, kind in reversed(TYPES.items())}
@@ -66,11 +66,11 @@ def write_ply(path: Path, scan: Scan) -> None:
 
 
 def read_ply(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a ``.ply``'s vertices, as a ``Scan`` names them.
+    """Read the vertices of a ``.ply`` file as arrays, named as in ``Scan``.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where its header is none or does not fit the file, or it holds no points.
+        FileError: if it cannot be read.
+        DataError: if its header is invalid or does not match the file, or it holds no points.
     """
     content, where = read_file(path), str(path)
     end = re.search(rb"^end_header\r?\n", content[:LONGEST_HEADER], re.M)
@@ -88,14 +88,14 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
             raise cut(where, len(lines), wanted, "lines")
         start = sum(e.count for e in elements[:position])
         return to_arrays(from_text("\n".join(lines[start : start + vertex.count]), vertex.fields, vertex.count, where))
-    size = sum(e.size for e in elements)  # of lists, what they have at least
+    size = sum(e.size for e in elements)  # a lower bound if there are lists
     check_size(body, size, where, more=any(e.lists for e in elements))
     start = sum(e.size for e in elements[:position])
     return to_arrays(from_records(body[start : start + vertex.size], vertex.fields, vertex.count))
 
 
 def _header(text: str, where: str) -> tuple[str, list[Element]]:
-    """Encoding and elements, in order; one of them is ``vertex``."""
+    """Parse the encoding and the elements in order; exactly one of them is ``vertex``."""
     encodings, elements = [], []
     for line in text.splitlines()[1:]:
         match line.split():

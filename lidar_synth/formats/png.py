@@ -1,4 +1,4 @@
-"""Range images as PNG files: to look at, and to exchange with what reads pictures.
+"""Range images as PNG files, for viewing and for exchange with other programs.
 
 Layout::
 
@@ -7,8 +7,8 @@ Layout::
     label/NAME.png          8 bit palette in SemanticKITTI's colours: train id, 255 = ignore; only with labels
 
 ``range`` carries a text chunk ``lidar_synth``: JSON with ``scale``, ``sensor`` (the keys of sensors.yaml), ``id`` and
-``domain``. What is lost: range is rounded to half a step, 0.61 mm at a range of 80 m, reflectance to 8e-6; instances,
-the file's own labels, confidence, boxes and pose have no place. Labels are exact.
+``domain``. The format is lossy: rounding errors are at most half a step, 0.61 mm for a maximum range of 80 m, and 8e-6
+for reflectance; instances, the dataset's own labels, confidence, boxes and pose are not stored. Labels are exact.
 """
 
 import json
@@ -37,20 +37,20 @@ STEPS = 65535
 TEXT = "lidar_synth"
 
 CHANNELS = ("range", "reflectance", "label")
-"""The folders."""
+"""Names of the folders."""
 
 
 class RangePNG(ScanFiles):
-    """Range images as PNG: <root>/range/*.png with reflectance and label beside it, or one file of range.
+    """Range images as PNG: <root>/range/*.png with the folders reflectance and label, or one file of range.
 
     Args:
-        root: the folder that holds ``range``, or one PNG in it.
-        sensor: whose grid the images are on; the files tell it.
+        root: the folder that holds ``range``, or one PNG in ``range``.
+        sensor: the sensor of the grid; by default the one stored in the files.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        FileError: where there is no such folder.
-        DataError: where it holds none.
+        FileError: if the folder does not exist.
+        DataError: if it holds no image.
     """
 
     def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
@@ -64,7 +64,7 @@ class RangePNG(ScanFiles):
         """The range image at ``index``.
 
         Raises:
-            DataError, FileError: where it cannot be read.
+            DataError, FileError: if it cannot be read.
         """
         return self._decode(index)[0]
 
@@ -96,7 +96,7 @@ class RangePNG(ScanFiles):
 
 
 def _steps(path: Path, values: NDArray[Any] | None = None) -> NDArray[Any]:
-    """The values of a 16-bit grey picture."""
+    """The values of a 16-bit grey image."""
     values = read_png(path)[0] if values is None else values
     if values.dtype.kind not in "iu" or values.ndim != 2 or (values.size and values.max() > STEPS):
         raise DataError(f"{path} holds {values.dtype} of shape {values.shape}", "a picture of 16-bit grey", SKIP_HINT)
@@ -107,7 +107,7 @@ class PNGWriter(Writer):
     """Writes the scan, projected onto its sensor's grid, as ``range``, ``reflectance`` and ``label`` PNG files."""
 
     def _place(self, index: int, name: str | None) -> str:
-        # One flat folder per channel, so that others find the pictures of a channel side by side.
+        # One flat folder per channel, which other programs can read as a list of images.
         return f"range/{(name or f'{index:06d}').replace('/', '_')}.png"
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
@@ -123,16 +123,16 @@ class PNGWriter(Writer):
 
 
 def channel_path(root: Path, channel: str, name: str) -> Path:
-    """Where a channel of an image stands."""
+    """The path of a channel of an image."""
     return root / channel / f"{name}.png"
 
 
 def read_png(path: Path) -> tuple[NDArray[Any], dict[str, str]]:
-    """The values of a PNG, (H, W), and its text chunks.
+    """Read the values of a PNG, (H, W), and its text chunks.
 
     Raises:
-        FileError: where it cannot be read.
-        DataError: where it is no picture.
+        FileError: if it cannot be read.
+        DataError: if it is not an image.
     """
     picture = read_picture(path, "a PNG file")
     return np.array(picture), dict(getattr(picture, "text", {}))
@@ -142,13 +142,13 @@ def write_png(path: Path, values: NDArray[Any], text: str = "", palette: bool = 
     """The inverse of ``read_png``.
 
     Args:
-        path: where to.
+        path: the output file.
         values: (H, W) uint16, or uint8 with a palette.
-        text: the text chunk ``lidar_synth``.
-        palette: colour train ids as SemanticKITTI does.
+        text: content of the text chunk ``lidar_synth``.
+        palette: whether to add a palette with SemanticKITTI's colours of train ids.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     from PIL import Image, PngImagePlugin
 

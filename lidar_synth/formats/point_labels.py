@@ -1,7 +1,7 @@
-"""Labels of points on disk: one unsigned 32-bit value per point, class below and instance above.
+"""Labels of points on disk: one unsigned 32-bit value per point.
 
-The layout is SemanticKITTI's (http://www.semantic-kitti.org/dataset.html): the lower 16 bits are the dataset's
-class id, the upper 16 the instance. Other datasets of the package use the same packing with their own class ids.
+The encoding is that of SemanticKITTI (http://www.semantic-kitti.org/dataset.html): the lower 16 bits are the dataset's
+class id, the upper 16 bits the instance. KITTI-360's labels use the same packing with that dataset's class ids.
 """
 
 from pathlib import Path
@@ -21,13 +21,13 @@ def read_labels(path: Path, points: Path, count: int, taxonomy: Taxonomy) -> dic
 
     Args:
         path: the ``.label`` file.
-        points: the file of the points, named in errors.
-        count: points in the scan.
-        taxonomy: whose class ids the file holds.
+        points: the file of the points, for error messages.
+        count: number of points in the scan.
+        taxonomy: the taxonomy of the file's class ids.
 
     Raises:
-        FileError: where the file cannot be read.
-        DataError: on another number of labels than points, or a class id that the dataset does not define.
+        FileError: if the file cannot be read.
+        DataError: if the numbers of labels and points differ; on a class id that the dataset does not define.
     """
     raw = read_values(path, "<u4")
     if len(raw) != count:
@@ -36,17 +36,16 @@ def read_labels(path: Path, points: Path, count: int, taxonomy: Taxonomy) -> dic
 
 
 def mismatch(path: Path, labels: int, points: Path, count: int) -> DataError:
-    """The error for a label file of another length than its scan."""
+    """The error for a label file whose length differs from its scan's."""
     return DataError(
         f"{path} has {labels} labels, {points} has {count} points",
         "one label per point",
-        "One of the two belongs to another scan or has been cut: copy both again, or leave them out with "
-        "on_bad='skip'.",
+        "One of the two belongs to another scan or is truncated: copy both again, or skip the scan with on_bad='skip'.",
     )
 
 
 def decode_labels(raw: NDArray[np.uint32], taxonomy: Taxonomy, where: str) -> dict[str, Any]:
-    """The same from the values themselves; the inverse of ``encode_labels``.
+    """Decode the values of a label file to ``label``, ``raw_label`` and ``instance``; the inverse of ``encode_labels``.
 
     Raises:
         DataError: on a class id that the dataset does not define.
@@ -61,9 +60,9 @@ def decode_labels(raw: NDArray[np.uint32], taxonomy: Taxonomy, where: str) -> di
 def encode_labels(scan: Scan, taxonomy: Taxonomy) -> NDArray[np.uint32]:
     """(N,) values to write for a scan's labels.
 
-    ``raw_label`` goes out as it is, bit for bit, where it means ``label`` in this taxonomy. Where it does not (another
-    dataset's ids, or a label that was changed since) or is missing: the taxonomy's static class of ``label``, with
-    ``instance`` above. A scan without labels gets 0, unlabelled, for every point.
+    ``raw_label`` is written unchanged, bit for bit, if it decodes to ``label`` in this taxonomy. Otherwise (ids of
+    another dataset, a label that was changed since, or no ``raw_label``), the values are the taxonomy's static class of
+    ``label`` and ``instance`` in the upper bits. A scan without labels gets 0 = unlabelled for every point.
 
     Raises:
         DataError: on a train id or an instance that the file cannot hold.
@@ -85,10 +84,10 @@ def encode_labels(scan: Scan, taxonomy: Taxonomy) -> NDArray[np.uint32]:
 
 
 def write_labels(path: Path, values: NDArray[np.uint32]) -> None:
-    """A label file of what ``encode_labels`` gave.
+    """Write the values of ``encode_labels`` to a label file.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     write_file(path, values.astype("<u4").tobytes())
 

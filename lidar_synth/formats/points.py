@@ -1,6 +1,6 @@
-"""Points on disk as KITTI stores them, and what every format checks of points.
+"""KITTI's ``.bin`` files of points, and checks of points for all formats.
 
-A ``.bin`` has no header, so its size and its values are the only signs that it holds what its name says.
+A ``.bin`` file has no header, so only its size and its values show whether it holds points.
 """
 
 from collections.abc import Iterator
@@ -18,25 +18,25 @@ from lidar_synth.formats.calibration import check_rigid
 from lidar_synth.geometry.scan import Scan
 
 FARTHEST = 1e5
-"""Metres: a coordinate beyond this is not a LiDAR's."""
+"""Maximum coordinate, metres; no LiDAR measures farther."""
 
 _bad_points_kept = ContextVar("bad points kept", default=False)
 
 
 def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> NDArray[np.float32]:
-    """The points of a raw ``.bin``: little-endian float32, ``fields`` per point, no header.
+    """Read the points of a raw ``.bin`` file: little-endian float32, ``fields`` per point, no header.
 
     Args:
         path: the file.
         fields: floats per point; the first three are x, y, z in metres, the fourth is reflectance.
-        reflectance_max: the upper end of the fourth field's interval; the lower is 0.
+        reflectance_max: maximum of the fourth field; the minimum is 0.
 
     Returns:
         (N, fields) float32, checked by ``check_points``.
 
     Raises:
-        FileError: where the file cannot be read.
-        DataError: on an empty or cut file, and on values that are no points.
+        FileError: if the file cannot be read.
+        DataError: on an empty or truncated file, and on values that cannot be points.
     """
     try:
         values = np.fromfile(path, "<f4")
@@ -54,7 +54,7 @@ def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> ND
         raise DataError(
             f"{path} is {size} bytes long",
             f"a multiple of {4 * fields}: {fields} float32 for each point",
-            f"{hint}It may have been cut. {SKIP_HINT}",
+            f"{hint}It may be truncated. {SKIP_HINT}",
         )
     points = values.reshape(-1, fields)
     check_points(points, points[:, 3], str(path), reflectance_max)
@@ -62,10 +62,10 @@ def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> ND
 
 
 def write_points(path: Path, scan: Scan) -> None:
-    """The points of a scan as KITTI's ``.bin``, four floats each; the inverse of ``read_points``.
+    """Write the points of a scan as KITTI's ``.bin``, four floats each; the inverse of ``read_points``.
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     write_file(path, np.column_stack([scan.points, scan.reflectance]).astype("<f4").tobytes())
 
@@ -73,23 +73,23 @@ def write_points(path: Path, scan: Scan) -> None:
 def check_points(
     points: NDArray[np.float32], reflectance: NDArray[np.float32], where: str, reflectance_max: float = 1.0
 ) -> None:
-    """Refuse values that no scan holds.
+    """Refuse impossible values of points.
 
     Args:
         points: (N, F) float32, the first three x, y, z in metres.
         reflectance: (N,) float32.
-        where: what to name in the error, usually the path.
-        reflectance_max: the upper end of the reflectance's interval; the lower is 0.
+        where: name of the points in the error, usually the path.
+        reflectance_max: maximum of the reflectance; the minimum is 0.
 
     Raises:
-        DataError: on no points, NaN, infinity, coordinates beyond ``FARTHEST`` or reflectance outside.
+        DataError: on no points, NaN, infinity, coordinates beyond ``FARTHEST``, or reflectance out of its interval.
     """
     if _bad_points_kept.get():
         good = finite(points, reflectance)
         points, reflectance = points[good], reflectance[good]
     if len(points) == 0:
         raise DataError(f"{where} holds no points", "at least one point", SKIP_HINT)
-    # One pass over the memory tells that all is well; which value is at fault is looked for only if it is not.
+    # One pass over the memory detects bad values; they are searched only if there are any.
     flat = points.reshape(-1)
     with np.errstate(over="ignore", invalid="ignore"):
         suspicious = not float(np.dot(flat, flat)) < FARTHEST**2
@@ -108,28 +108,28 @@ def check_points(
 
 
 def finite(points: NDArray[np.float32], reflectance: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(N,) which points are finite, with their reflectance."""
-    kept: NDArray[np.bool_] = np.isfinite(points).all(axis=1) & np.isfinite(reflectance)
-    return kept
+    """(N,) True for points whose coordinates and reflectance are finite."""
+    good: NDArray[np.bool_] = np.isfinite(points).all(axis=1) & np.isfinite(reflectance)
+    return good
 
 
 def without_bad_points(scan: Scan) -> Scan:
-    """The scan without its points that are NaN or infinite; their labels and all else that is known of them go too.
+    """Drop the points of a scan that are NaN or infinite, with their labels and other fields.
 
     Raises:
-        DataError: where none is left.
+        DataError: if no point is left.
     """
     good = finite(scan.points, scan.reflectance)
     if good.all():
         return scan
     if not good.any():
-        raise DataError(f"scan {scan.id!r}: all {len(scan)} points are NaN or infinite", "some that are not", SKIP_HINT)
+        raise DataError(f"scan {scan.id!r}: all {len(scan)} points are NaN or infinite", "finite points", SKIP_HINT)
     return scan[good]
 
 
 @contextmanager
 def bad_points_kept() -> Iterator[None]:
-    """Inside, readers hand out points that are NaN or infinite, for those who drop them."""
+    """Let readers return points that are NaN or infinite within this context, for callers that drop them."""
     before = _bad_points_kept.set(True)
     try:
         yield
@@ -138,10 +138,10 @@ def bad_points_kept() -> Iterator[None]:
 
 
 def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
-    """``check_points`` for a scan whose arrays stood apart in its file, and what else it holds.
+    """Check the points of a scan, and its labels, confidence and pose.
 
     Raises:
-        DataError: as ``check_points``; on labels that are no train ids, a confidence outside of [0, 1], and a pose that
+        DataError: as ``check_points``; on labels that are not train ids, a confidence outside [0, 1], and a pose that
             is not rigid.
     """
     check_points(scan.points, scan.reflectance, where, reflectance_max)
@@ -159,7 +159,7 @@ def _find_bad_value(points: NDArray[np.float32], reflectance: NDArray[np.float32
         raise DataError(
             f"{where}: {len(bad)} of {len(points)} points are NaN or infinite, the first is point {bad[0]}",
             "finite float32 values",
-            f"{SKIP_HINT} on_bad='drop-points' (convert --on-bad drop-points) leaves out such points only.",
+            f"{SKIP_HINT} on_bad='drop-points' (convert --on-bad drop-points) drops only these points.",
         )
     farthest = np.abs(points[:, :3]).max()
     if farthest > FARTHEST:

@@ -1,12 +1,12 @@
-"""Sets of range images: the package's own ``.npz``, and arrays that others' code projected.
+"""Sets of range images: the package's own ``.npz``, and arrays that other code projected.
 
 - ``.npz`` with ``range`` and ``sensor``: the package's own, see npz.py. Lossless for a scan that fits the grid.
 - ``.npy`` of shape (H, W), range in metres, or (2, H, W), range and reflectance; 0 = no return.
-- ``.npz`` with ``image``, or ``.npy``, of shape (H, W, 6): x, y, z, reflectance, range, class per cell, as several
-  segmentation codes keep them. ``CONVENTIONS`` says in which frame and with which classes.
+- ``.npz`` with ``image``, or ``.npy``, of shape (H, W, 6): x, y, z, reflectance, range, class per cell, as used by
+  several segmentation codes. ``CONVENTIONS`` defines their frames and classes.
 
-As a source of scans a set gives one point per return: through the cells' centres, or where the file holds x, y, z
-those. ``image`` gives the range image itself.
+As a source of scans, a set has one point per return: on the ray through the cell's centre, or at x, y, z if the file
+holds them. ``image`` returns the range image itself.
 """
 
 from dataclasses import dataclass
@@ -34,13 +34,13 @@ SUFFIXES = (".npz", ".npy")
 
 @dataclass(frozen=True)
 class Convention:
-    """What the six values of a cell mean in somebody's (H, W, 6) arrays.
+    """The meaning of the six values of a cell in (H, W, 6) arrays.
 
     Args:
-        sensor: the preset whose grid they are on.
-        reflectance_max: the upper end of their reflectance.
-        learning_classes: the class is SemanticKITTI's 0..19 (0 = unlabelled); otherwise it is left out.
-        turned: x right and y forward, with the first column to the left.
+        sensor: the preset of the grid.
+        reflectance_max: maximum of the reflectance.
+        learning_classes: whether the class is one of SemanticKITTI's 0..19 (0 = unlabelled); otherwise it is ignored.
+        turned: whether x is right and y forward, with the first column to the left.
     """
 
     sensor: str
@@ -60,15 +60,15 @@ class RangeImages(ScanFiles):
 
     Args:
         root: the folder or the file.
-        sensor: whose grid the images are on; the package's own files tell it.
-        convention: ``kitti`` or ``nuscenes``: what the values of an (H, W, 6) array mean; by default that of the
+        sensor: the sensor of the grid; the package's own files store it.
+        convention: ``kitti`` or ``nuscenes``, the meaning of the values of an (H, W, 6) array; by default that of the
             sensor, or else ``kitti``.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        FileError: where there is no such path.
-        ConfigError: on an unknown convention, or where files of several kinds are there.
-        DataError: where there is none.
+        FileError: if the path does not exist.
+        ConfigError: on an unknown convention, or files of several kinds.
+        DataError: if there is no file.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class RangeImages(ScanFiles):
         """The range image at ``index``.
 
         Raises:
-            DataError, FileError: where it cannot be read.
+            DataError, FileError: if it cannot be read.
         """
         return self._decode(index)[0]
 
@@ -113,7 +113,7 @@ class RangeImages(ScanFiles):
         return self._base / f"{self.ids[index]}{self._suffix}"
 
     def _decode(self, index: int) -> tuple[RangeImage, dict[str, Any], NDArray[np.float32] | None]:
-        """The image, what else its file tells of the scan, and (H, W, 3) points where it holds them."""
+        """The image, further facts of the scan, and (H, W, 3) points if the file holds them."""
         path = self._path(index)
         arrays = read_arrays(path)
         if "range" in arrays:
@@ -139,7 +139,7 @@ def decode_stack(
     """The range image of an (H, W, 6) array, no further facts, and the (H, W, 3) points of its cells.
 
     Raises:
-        DataError: where x, y, z and range do not agree, or a value is none of the convention's.
+        DataError: if x, y, z and range do not agree, or a value contradicts the convention.
     """
     if not stack.size:
         raise DataError(f"{where} holds an array of shape {stack.shape}", f"{(*sensor.shape, 6)} for {sensor.name!r}")
@@ -171,7 +171,7 @@ def decode_stack(
 
 
 class RangeWriter(FileWriter):
-    """Writes the package's own ``NAME.npz``: the scan projected onto its sensor's grid, with every field it has."""
+    """Writes the package's own ``NAME.npz``: the scan projected onto its sensor's grid, with all its fields."""
 
     suffix = ".npz"
 

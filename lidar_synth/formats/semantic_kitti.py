@@ -45,13 +45,13 @@ SPLITS: dict[str, tuple[str, ...] | None] = {
     "test": tuple(f"{i:02d}" for i in range(11, 22)),
     "all": None,
 }
-"""Sequences of each split, as the benchmark has them; None = all that are there."""
+"""Sequences of each split of the benchmark; None = all existing sequences."""
 
 KITTI_CAMERA = ideal_camera(718.856, (1241, 376))
-"""What ``calib.txt`` describes where no camera is known: the odometry camera's picture, at the sensor."""
+"""The camera that is written if none is known: the odometry camera's image size and focal length, at the sensor."""
 
 SIDE_FILES = ("calib.txt", "poses.txt", "times.txt")
-"""What a sequence has beside its scans."""
+"""Files of a sequence besides its scans."""
 
 
 class SemanticKITTI(ScanFiles):
@@ -89,11 +89,11 @@ class SemanticKITTI(ScanFiles):
     ) -> None:
         root = Path(root)
         wanted = choose("SemanticKITTI split", split, SPLITS)
-        there = sorted(p.parent.name for p in (root / "sequences").glob("*/velodyne"))
-        sequences = [s for s in there if wanted is None or s in wanted]
+        existing = sorted(p.parent.name for p in (root / "sequences").glob("*/velodyne"))
+        sequences = [s for s in existing if wanted is None or s in wanted]
         if not sequences:
             raise DataError(
-                f"{root} has no sequence of split {split!r} (it has {', '.join(there) or 'none at all'})",
+                f"{root} has no sequence of split {split!r} (it has {', '.join(existing) or 'none at all'})",
                 "sequences/NN/velodyne/*.bin",
             )
         ids = [f"{s}/{p.stem}" for s in sequences for p in list_files(root / "sequences" / s / "velodyne", ".bin")]
@@ -126,16 +126,16 @@ class SemanticKITTI(ScanFiles):
 
 
 class SemanticKITTIWriter(Writer):
-    """Writes SemanticKITTI's folders; labels always, unlabelled points and ignored classes as 0.
+    """Writes SemanticKITTI's folders, always with labels; unlabelled points and ignored classes are 0.
 
     Sequence and frame of an id ``NN/FFFFFF`` are kept, and those of KITTI-360's drives (drive 0003 is sequence 03);
-    other scans go into ``sequence``, numbered by index. ``poses.txt`` has one line for every frame up to the last;
-    a frame whose pose is not known has ``nan`` there. ``times.txt`` is not written, because a scan knows no time.
-    ``carry`` copies the three files of sequences of SemanticKITTI's, as far as they are there.
+    all other scans go into ``sequence``, numbered by index. ``poses.txt`` has one line for every frame up to the last,
+    with ``nan`` for unknown poses. ``times.txt`` is not written, because a scan has no time. ``carry`` copies the
+    existing ones of these three files from sequences of SemanticKITTI.
 
     Args:
         root: output folder.
-        sequence: where scans without a sequence of their own go.
+        sequence: sequence of scans without one of their own.
         calibration: see ``Writer``.
     """
 
@@ -163,11 +163,11 @@ class SemanticKITTIWriter(Writer):
 
     def carry(self, source: ScanFiles) -> list[str]:
         if not isinstance(source, SemanticKITTI):
-            return ["times.txt: when the scans were taken is not known"]
+            return ["times.txt: the times of the scans are unknown"]
         missing = []
         for sequence in sorted({name.split("/")[0] for name in source.ids}):
             if not all(self._keeps(i, n) for i, n in enumerate(source.ids) if n.startswith(f"{sequence}/")):
-                missing.append(f"the calibration, poses and times of sequence {sequence}: its scans get other numbers")
+                missing.append(f"calibration, poses and times of sequence {sequence}: its scans are renumbered")
                 continue
             self._carried.add(sequence)
             for name in SIDE_FILES:
@@ -179,7 +179,7 @@ class SemanticKITTIWriter(Writer):
         return missing
 
     def _keeps(self, index: int, name: str) -> bool:
-        """Whether a scan of SemanticKITTI's keeps its sequence and its frame."""
+        """Whether a scan of SemanticKITTI keeps its sequence and its frame."""
         path, (sequence, frame) = self.path(index, name), name.split("/")
         return path.parents[1].name == sequence and frame.isdigit() and int(path.stem) == int(frame)
 
@@ -207,7 +207,7 @@ def read_calibration(folder: Path) -> Calibration | None:
 
 
 def write_calibration(folder: Path, camera: Calibration) -> None:
-    """The inverse of ``read_calibration``: SemanticKITTI's own matrices as they were, others as all four cameras."""
+    """The inverse of ``read_calibration``: SemanticKITTI's own matrices unchanged; another camera as all four."""
     own = {"Tr", "P0", "P1", "P2", "P3"} <= set(camera.matrices)
     lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | {"Tr": camera.camera_from_sensor[:3]}
     write_named_matrices(folder / "calib.txt", camera.matrices if own else lines)
@@ -232,7 +232,7 @@ def read_poses(folder: Path, camera: Calibration | None) -> dict[int, NDArray[np
 
 
 def write_poses(folder: Path, camera: Calibration, poses: dict[int, NDArray[np.float64]], frames: int) -> None:
-    """The inverse of ``read_poses``; nothing where no pose is known."""
+    """The inverse of ``read_poses``; writes nothing if no pose is known."""
     if not poses:
         return
     lines = np.full((frames, 12), np.nan)

@@ -1,4 +1,4 @@
-"""What all readers have in common: names of scans, reading by index, and what happens to a bad scan."""
+"""``ScanFiles``, the base class of all readers: names of scans, reading by index, and the handling of bad scans."""
 
 import warnings
 from abc import ABC, abstractmethod
@@ -15,32 +15,32 @@ from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 OnBad = Literal["error", "skip", "drop-points"]
-"""What a source does with a scan that cannot be read: raise, or count and name it and go on; or with one that has
-points which are NaN or infinite: leave those out and count them."""
+"""The handling of bad scans: raise an error on a scan that cannot be read, skip it with a warning, or drop points that
+are NaN or infinite and count them."""
 
 Choice = TypeVar("Choice")
 
 
 class ScanFiles(ABC):
-    """An indexable source of scans on disk; a dataset says how one scan is read.
+    """An indexable source of scans on disk; subclasses read one scan of their dataset.
 
     Args:
-        root: where the files are.
+        root: the folder of the files.
         ids: the scans' names, unique in the source, in order.
         sensor: a preset's name, a YAML file or a ``Sensor``.
-        on_bad: ``"error"`` raises on a scan that cannot be read. With ``"skip"`` ``source[i]`` is the next good
-            scan (from the end on, the first), iterating leaves the bad ones out, and ``skipped`` names them. With
-            ``"drop-points"`` a scan loses its points that are NaN or infinite, with their labels, and ``dropped``
-            counts them; it raises on everything else.
+        on_bad: ``"error"`` raises on a scan that cannot be read. With ``"skip"``, ``source[i]`` is the next readable
+            scan (after the last, the first one), iteration skips bad scans, and ``skipped`` lists them. With
+            ``"drop-points"``, points that are NaN or infinite are dropped with their labels, and ``dropped`` counts
+            them; any other fault raises.
 
     Attributes:
-        skipped: {id: reason} of the scans that could not be read so far, in this process.
-        dropped: {id: number} of the points that were left out so far, in this process.
-        domain: ``SYNTHETIC`` where the folder says that all of its scans are; else scans tell it themselves.
+        skipped: {id: reason} of the scans that this process could not read.
+        dropped: {id: number of points} that this process has dropped.
+        domain: ``SYNTHETIC`` if the folder is marked as synthetic; otherwise each scan has its own domain.
 
     Raises:
-        ConfigError: on another ``on_bad``.
-        DataError: where there is no scan.
+        ConfigError: on an unknown ``on_bad``.
+        DataError: if there is no scan.
     """
 
     def __init__(self, root: Path, ids: Sequence[str], sensor: str | Path | Sensor, on_bad: OnBad = "error") -> None:
@@ -58,21 +58,21 @@ class ScanFiles(ABC):
 
     @abstractmethod
     def read(self, index: int) -> Scan:
-        """The scan at ``index``, 0 <= index < len.
+        """Read the scan at ``index``, 0 <= index < len.
 
         Raises:
-            DataError, FileError: where it cannot be read.
+            DataError, FileError: if it cannot be read.
         """
 
     def load(self, index: int, drop_points: bool | None = None) -> Scan:
-        """What ``read`` reads, without bad points if they are to be dropped, of the domain that the folder tells.
+        """Read a scan, drop its bad points if required, and set the domain of the folder.
 
         Args:
             index: 0 <= index < len.
-            drop_points: by default whether ``on_bad`` says so.
+            drop_points: whether to drop bad points; by default whether ``on_bad`` is ``"drop-points"``.
 
         Raises:
-            DataError, FileError: as ``read``; where no point is left.
+            DataError, FileError: as ``read``; also if all points are dropped.
         """
         if drop_points if drop_points is not None else self.on_bad == "drop-points":
             with bad_points_kept():
@@ -85,7 +85,7 @@ class ScanFiles(ABC):
         return scan if self.domain != SYNTHETIC or scan.domain == SYNTHETIC else replace(scan, domain=SYNTHETIC)
 
     def calibration(self, index: int) -> Calibration | None:
-        """The camera beside the sensor when scan ``index`` was taken; None where the dataset tells none."""
+        """The camera calibration of scan ``index``; None if the dataset has none."""
         return None
 
     def __len__(self) -> int:
@@ -102,7 +102,7 @@ class ScanFiles(ABC):
                 return scan
         reason = next(iter(self.skipped.values()))
         raise DataError(
-            f"none of the {len(self)} scans of {self.root} can be read ({reason})", "at least one good scan"
+            f"none of the {len(self)} scans of {self.root} can be read ({reason})", "at least one readable scan"
         )
 
     def __iter__(self) -> Iterator[Scan]:
@@ -119,7 +119,7 @@ class ScanFiles(ABC):
             return self.load(index)
         except (DataError, FileError) as error:
             self.skipped[name] = str(error)
-            # A warning is seen from loader workers too, whose copy of ``skipped`` stays with them.
+            # Loader workers have their own copy of ``skipped``, but their warnings reach the user.
             warnings.warn(f"skipped scan {name}: {error}", stacklevel=3)
             return None
 

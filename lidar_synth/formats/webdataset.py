@@ -1,16 +1,17 @@
-"""WebDataset: scans in tar files that are read from front to back (https://github.com/webdataset/webdataset).
+"""WebDataset: scans in tar files for sequential reading (https://github.com/webdataset/webdataset).
 
-The members of a scan stand behind one another and begin with its key, which is its id (a dot or % in it as %2E, %25)::
+The members of a scan are stored consecutively; their names begin with its key, the scan's id with dots and % encoded
+as %2E and %25::
 
     scans-000000.tar          the first 1000 scans, and so on
-      KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml); where they are known
-                              also pose (4 x 4, sensor to world) and names of the boxes
+      KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml); if known also pose
+                              (4 x 4, sensor to world) and names of the boxes
       KEY.points.npy          (N, 4) float32: x, y, z in metres, reflectance in [0, 1]
-      KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always there, so that samples have the same keys
-      KEY.confidence.npy      and what else is known per point: raw_label, instance, ring
+      KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always written, so that samples have the same keys
+      KEY.confidence.npy      and other known fields per point: raw_label, instance, ring
       KEY.boxes.npy           (M, 7) float32, if there are boxes: x, y, z, l, w, h, yaw
 
-WebDataset's own ``decode()`` makes arrays and a dictionary of them. The same scans give the same bytes.
+WebDataset's own ``decode()`` converts them to arrays and a dictionary. The same scans give the same bytes.
 """
 
 import json
@@ -41,7 +42,7 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor
 SUFFIX = ".tar"
 
 Members = dict[str, tuple[int, int]]
-"""Where the members of a scan stand in their tar: {what follows the key: (offset, bytes)}."""
+"""The members of a scan in their tar file: {name after the key: (offset, size in bytes)}."""
 
 
 class WebDataset(ScanFiles):
@@ -49,12 +50,12 @@ class WebDataset(ScanFiles):
 
     Args:
         root: the folder or the file.
-        sensor: whose scans are expected; the files tell it.
-        on_bad: see ``ScanFiles``; a tar file whose headers are damaged is an error in any case.
+        sensor: the expected sensor; by default the one stored in the files.
+        on_bad: see ``ScanFiles``; a tar file whose headers are damaged always raises an error.
 
     Raises:
-        FileError: where there is no such path.
-        DataError: where there is no scan, or a file is no tar.
+        FileError: if the path does not exist.
+        DataError: if there is no scan, or a file is not a tar file.
     """
 
     def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
@@ -70,14 +71,14 @@ class WebDataset(ScanFiles):
 
 
 class WebDatasetWriter(Writer):
-    """Writes WebDataset's .tar files. Each scan is written by itself; ``finish`` puts them together, in order.
+    """Writes WebDataset's .tar files. Each scan is written to a file of its own; ``finish`` merges them in order.
 
-    Scans that come later, because they could not be read before, go behind the others of their file.
+    Scans that a later run adds, because they could not be read before, are appended to their file.
 
     Args:
         root: output folder.
-        shard_size: scans in a file.
-        calibration: see ``Writer``; it has no place here, nor have images.
+        shard_size: number of scans in a file.
+        calibration: not used; the format stores neither calibration nor images.
 
     Raises:
         ConfigError: on fewer than one scan in a file.
@@ -111,20 +112,20 @@ class WebDatasetWriter(Writer):
         for path in sorted((self.root / NOTES).rglob(f"*{SUFFIX}")):
             parts[int(path.relative_to(self.root / NOTES).parts[0]) // self.shard_size].append(path)
         for number, paths in parts.items():
-            whole = self.root / f"scans-{number:06d}{SUFFIX}"
-            sources = [whole, *paths] if whole.is_file() else paths
-            write_file(whole, lambda file, sources=sources: _write_tar(file, _members(sources)))  # type: ignore[misc]
+            shard = self.root / f"scans-{number:06d}{SUFFIX}"
+            sources = [shard, *paths] if shard.is_file() else paths
+            write_file(shard, lambda file, sources=sources: _write_tar(file, _members(sources)))  # type: ignore[misc]
         clear_notes(self.root)
         self._there = None
 
 
 def _key(index: int, name: str | None) -> str:
-    """Without a dot: to WebDataset, what follows the first one is the kind of the member."""
+    """The key of a scan, without dots: WebDataset separates key and extension at the first dot."""
     return f"{index:06d}" if name is None else name.replace("%", "%25").replace(".", "%2E")
 
 
 def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of the members; ``_decode`` is the inverse."""
+    """Names and contents of a scan's members; ``_decode`` is the inverse."""
     facts: dict[str, Any] = {"id": scan.id, "domain": scan.domain, "sensor": scan.sensor.to_dict()}
     facts |= {} if scan.pose is None else {"pose": scan.pose.tolist()}
     facts |= {} if scan.boxes is None else {"names": list(scan.boxes.names)}
@@ -167,7 +168,7 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
 
 def _texts(names: Any) -> tuple[str, ...]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise TypeError("names that are no texts")
+        raise TypeError("names that are not text")
     return tuple(names)
 
 
@@ -177,12 +178,12 @@ def _content(file: BinaryIO, offset: int, size: int) -> bytes:
 
 
 def _scans(path: Path) -> Iterator[tuple[str, Members]]:
-    """Key and members of each scan in a tar file, by its headers.
+    """Key and members of each scan in a tar file, from its headers.
 
     Raises:
-        FileError, DataError: where it cannot be read, or is no tar.
+        FileError, DataError: if it cannot be read, or is not a tar file.
     """
-    found: dict[str, Members] = {}
+    scans: dict[str, Members] = {}
     with _open(path) as tar:
         for member in tar:
             folder, slash, name = member.name.removeprefix("./").rpartition("/")
@@ -190,16 +191,16 @@ def _scans(path: Path) -> Iterator[tuple[str, Members]]:
             if member.isdir():
                 continue
             if not member.isreg() or member.issparse():
-                raise DataError(f"{path}: {shorten(member.name, 100)!r} is no plain file", "a file of a WebDataset")
-            members = found.setdefault(f"{folder}{slash}{stem}", {})
+                raise DataError(f"{path}: {shorten(member.name, 100)!r} is not a plain file", "a file of a WebDataset")
+            members = scans.setdefault(f"{folder}{slash}{stem}", {})
             if kind in members:
                 raise DataError(f"{path} holds {shorten(member.name, 100)!r} twice", "each member once", SKIP_HINT)
             members[kind] = (member.offset_data, member.size)
-    yield from found.items()
+    yield from scans.items()
 
 
 def _members(paths: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
-    """What some tar files hold, each name once: a run that was stopped may have left a scan in two of them."""
+    """The members of several tar files, each name once: an interrupted run may leave a scan in two files."""
     done = set()
     for path in paths:
         with _open(path) as tar:
@@ -211,7 +212,7 @@ def _members(paths: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
 
 
 class _Bounded(BufferedReader):
-    """A file that takes no more memory than it has bytes, whatever size its headers ask for."""
+    """A file that never allocates more memory than its own size, whatever size its headers declare."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         length = os.fstat(self.fileno()).st_size
@@ -219,8 +220,8 @@ class _Bounded(BufferedReader):
 
 
 class _Member(tarfile.TarInfo):
-    """A member of a size that a file can have: older versions of tarfile never come to the end of a negative one
-    (CVE-2025-8194), and no version seeks beyond 2^63."""
+    """A tar member with a checked size: older versions of tarfile loop for ever on a negative size (CVE-2025-8194), and
+    no version can seek beyond 2^63."""
 
     def _block(self, count: int) -> int:
         if not 0 <= count < 1 << 62:
@@ -230,7 +231,7 @@ class _Member(tarfile.TarInfo):
 
 @contextmanager
 def _open(path: Path) -> Iterator[tarfile.TarFile]:
-    """A tar file to read, and its errors in words that help."""
+    """Open a tar file for reading, and convert its errors to those of this package."""
     try:
         with (
             path.open("rb", 0) as raw,
@@ -239,13 +240,15 @@ def _open(path: Path) -> Iterator[tarfile.TarFile]:
         ):
             yield tar
     except (tarfile.TarError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} is cut, damaged or no tar file ({error})", "a file of a WebDataset") from error
+        raise DataError(
+            f"{path} is truncated, damaged or not a tar file ({error})", "a file of a WebDataset"
+        ) from error
     except OSError as error:
         raise unreadable(path, error) from error
 
 
 def _write_tar(file: BinaryIO, members: Iterable[tuple[str, bytes]]) -> None:
-    """Nothing in it depends on who writes it, or when."""
+    """Write a tar file whose bytes depend only on its members, not on user or time."""
     with tarfile.open(fileobj=file, mode="w") as tar:
         for name, content in members:
             info = tarfile.TarInfo(name)

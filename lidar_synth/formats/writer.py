@@ -1,9 +1,8 @@
-"""What all writers have in common: where a scan goes, whether it is already there, and the files of a whole folder.
+"""``Writer``, the base class of all writers: paths of scans, complete scans, and files of the whole folder.
 
-A writer is opened on an output folder. ``write`` puts one scan there, its own files only, the one that says that
-it is whole last; so scans can be written in any order, by several processes, and an interrupted run goes on where
-it stopped. What belongs to a whole folder (poses, boxes, lists of frames) is noted beside each scan and gathered
-by ``finish``, which one process calls at the end.
+``write`` writes the files of one scan, and last the file that marks it as complete. Scans can therefore be written in
+any order and by several processes, and an interrupted run can be resumed. Data for files of the whole folder (poses,
+boxes, lists of frames) are noted beside each scan and gathered by ``finish``, which one process calls at the end.
 """
 
 import json
@@ -24,19 +23,19 @@ from lidar_synth.geometry.scan import Scan
 
 Image = NDArray[np.uint8]
 Picture = Image | Path
-"""An image by its values, (H, W, 3) RGB, or by its file."""
+"""An image as an array, (H, W, 3) RGB, or as the path of a file."""
 
 NOTES = ".lidar_synth"
-"""Folder of the notes that ``finish`` gathers; it is gone afterwards."""
+"""Folder of the notes that ``finish`` gathers and then removes."""
 
 
 class Writer(ABC):
     """Writes scans into one output folder.
 
     Args:
-        root: the folder; it is made.
-        calibration: the camera beside the sensor, for the layouts that hold one; without it they describe an ideal
-            camera that stands in the sensor and looks ahead.
+        root: the folder; it is created.
+        calibration: the camera, for layouts with a calibration; by default an ideal camera at the sensor that faces
+            forward.
     """
 
     def __init__(self, root: str | Path, *, calibration: Calibration | None = None) -> None:
@@ -46,19 +45,20 @@ class Writer(ABC):
 
     @property
     def _base(self) -> Path:
-        """The folder in which ``_place`` is; under ``root``."""
+        """The folder, under ``root``, to which ``_place`` is relative."""
         return self.root
 
     def path(self, index: int, name: str | None = None) -> Path:
-        """The file whose presence says that a scan is whole; always in ``root``, wherever the name comes from.
+        """The file whose presence marks a scan as complete; always under ``root``.
 
         Args:
-            index: the scan's number in the source.
-            name: its id there; a layout keeps what it can of it (frame number, drive) and otherwise counts.
+            index: the scan's index in the source.
+            name: its id in the source; a layout keeps its parts as far as it can (frame number, drive) and otherwise
+                uses the index.
 
         Raises:
-            DataError: on a name that cannot be a file's under ``root``.
-            FileError: where a link in ``root`` leads out of it.
+            DataError: on a name that cannot be a path under ``root``.
+            FileError: if a link in ``root`` leads out of it.
         """
         if not self._without_links:
             refuse_links(self.root)
@@ -67,7 +67,7 @@ class Writer(ABC):
 
     @abstractmethod
     def _place(self, index: int, name: str | None) -> str:
-        """What ``path`` is, relative to ``_base``; parts with / between them."""
+        """The path of a scan relative to ``_base``, with / as separator."""
 
     def write(
         self,
@@ -78,17 +78,17 @@ class Writer(ABC):
         image: Image | None = None,
         calibration: Calibration | None = None,
     ) -> None:
-        """Write one scan; it is whole when this returns.
+        """Write one scan completely.
 
         Args:
-            scan: what to write.
+            scan: the scan.
             index, name: as for ``path``.
-            image: (H, W, 3) uint8 RGB taken with the scan; without it ``scan.image_path`` is copied.
-            calibration: the camera of this scan, where it is not the writer's.
+            image: (H, W, 3) uint8 RGB image of the scan; by default ``scan.image_path`` is copied.
+            calibration: the camera of this scan; by default the writer's.
 
         Raises:
-            FileError: where the folder cannot be written or the disk is full.
-            DataError: on a scan that the layout cannot hold.
+            FileError: if the folder cannot be written or the disk is full.
+            DataError: on a scan that the layout cannot represent.
         """
         picture = scan.image_path if image is None else image
         self._put(scan, self.path(index, name), picture, calibration or self.calibration)
@@ -98,22 +98,22 @@ class Writer(ABC):
         """Write the files of a scan, ``path`` last."""
 
     def complete(self, index: int, name: str | None = None) -> bool:
-        """Whether the scan is already there, whole."""
+        """Whether the scan has already been written completely."""
         return self.path(index, name).is_file()
 
     def carry(self, source: ScanFiles) -> list[str]:
-        """Take over what a source knows beside its scans, before they are written.
+        """Copy a source's files that belong to no single scan, before its scans are written.
 
         Returns:
-            What the layout has a place for and the source does not tell, in words; it is left out.
+            Descriptions of the files that the layout supports but the source does not have; they are left out.
 
         Raises:
-            FileError: where it cannot be read or written.
+            FileError: if it cannot be read or written.
         """
         return []
 
     def finish(self) -> None:  # noqa: B027 - a layout of single files has nothing to gather
-        """Write what belongs to the whole folder. Calling it again changes nothing."""
+        """Write the files of the whole folder. Calling it again changes nothing."""
 
 
 class FileWriter(Writer):
@@ -126,10 +126,10 @@ class FileWriter(Writer):
 
 
 def write_image(path: Path, picture: Picture) -> None:
-    """A PNG from (H, W, 3) uint8 values, or from another image file (a PNG is copied as it is).
+    """Write a PNG from (H, W, 3) uint8 values or from another image file; a PNG is copied unchanged.
 
     Raises:
-        FileError: where it cannot be read or written.
+        FileError: if it cannot be read or written.
     """
     if isinstance(picture, Path) and picture.suffix.lower() == path.suffix:
         write_file(path, read_file(picture))
@@ -141,49 +141,49 @@ def write_image(path: Path, picture: Picture) -> None:
 
 
 def claim(path: Path, settings: dict[str, Any]) -> None:
-    """Say in a file what an output folder is being filled with; refuse a folder that holds something else.
+    """Record the settings of an output folder in a file, and refuse a folder with other settings.
 
-    Without it, a rerun with other settings would keep the old scans and pass them off as new ones.
+    Otherwise a rerun with other settings would keep old scans and present them as new ones.
 
     Args:
         path: the file, in the output folder.
-        settings: plain values that decide what is written.
+        settings: plain values that determine what is written.
 
     Raises:
-        ConfigError: where the folder was filled with other settings.
-        DataError: where the file is damaged.
-        FileError: where it cannot be read or written.
+        ConfigError: if the folder was filled with other settings.
+        DataError: if the file is damaged.
+        FileError: if it cannot be read or written.
     """
     wanted = json.loads(json.dumps(settings))
     if not path.is_file():
-        # another one may be as quick
+        # Another process may create it at the same time.
         write_file(path, json.dumps(wanted, indent=1).encode(), overwrite=False)
-    there = parse_json(read_text(path), f"{path}, which is damaged,", "what this package wrote into an output folder")
-    if not isinstance(there, dict):
-        raise DataError(f"{path} is damaged (it holds {type(there).__name__})", hint="Choose another output folder.")
-    other = {name: there[name] for name, value in wanted.items() if there.get(name, value) != value}
+    existing = parse_json(read_text(path), f"{path}, which is damaged,", "the settings that this package wrote")
+    if not isinstance(existing, dict):
+        raise DataError(f"{path} is damaged (it holds {type(existing).__name__})", hint="Choose another output folder.")
+    other = {name: existing[name] for name, value in wanted.items() if existing.get(name, value) != value}
     if other:
         raise ConfigError(
             f"{path.parent} was filled with {other}",
             f"{ {name: wanted[name] for name in other} }",
-            "Type the same options to go on with it, or choose another folder.",
+            "Use the same options to resume, or choose another folder.",
         )
 
 
 def write_note(folder: Path, frame: int, facts: dict[str, Any]) -> None:
-    """Keep what a whole-folder file will need of one frame (plain values; floats stay exact).
+    """Note the facts of one frame for files of the whole folder (plain values; floats stay exact).
 
     Raises:
-        FileError: where it cannot be written.
+        FileError: if it cannot be written.
     """
     write_file(folder / NOTES / f"{frame:010d}.json", json.dumps(facts).encode())
 
 
 def read_notes(folder: Path) -> dict[int, dict[str, Any]]:
-    """{frame: facts} of the notes in a folder, by frame.
+    """{frame: facts} of the notes in a folder.
 
     Raises:
-        DataError: on a note that was damaged since.
+        DataError: on a damaged note.
     """
     notes = {}
     for path in list_files(folder / NOTES, ".json") if (folder / NOTES).is_dir() else []:
@@ -195,5 +195,5 @@ def read_notes(folder: Path) -> dict[int, dict[str, Any]]:
 
 
 def clear_notes(folder: Path) -> None:
-    """Remove the notes of a folder, once they stand where they belong."""
+    """Remove the notes of a folder after they were gathered."""
     shutil.rmtree(folder / NOTES, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Where the labels of a synthetic scan come from: policies by name, and what they set into scans."""
+"""Label policies of synthetic scans by name, and objects that are pasted into scans."""
 
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.exchange import swap_bands, swap_sector, thinned

@@ -1,9 +1,9 @@
 """Augmentations of a scan: points, labels and boxes together.
 
-An augmentation is ``(scan, rng) -> scan``: a pure function of its two arguments, which never changes the scan that it
-is given. ``functools.partial`` sets its options, and ``compose`` makes one augmentation of several.
+An augmentation is ``(scan, rng) -> scan``: a pure function of its two arguments, which never changes its input.
+``functools.partial`` sets its options, and ``compose`` makes one augmentation of several.
 
-``yaw``, the flips and ``scale`` move points and boxes alike; afterwards the scan has neither pose nor camera image.
+``yaw``, the flips and ``scale`` move points and boxes together, and remove the scan's pose and camera image.
 
 Example:
     >>> import numpy as np
@@ -100,7 +100,7 @@ def jitter(scan: Scan, rng: np.random.Generator, spread: float = 0.01, reflectan
 
 
 def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan:
-    """Drop whole rings, at most ``share`` of the sensor's beams.
+    """Drop entire rings, at most ``share`` of the sensor's beams.
 
     The ring of a point is ``scan.ring``, or its row in the sensor's range image if that is not set.
     """
@@ -108,7 +108,7 @@ def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan
     most = round(checked_share("share", share) * rows)
     dropped = rng.choice(rows, rng.integers(most + 1), replace=False)
     row = locate(scan.points, scan.sensor).cell // columns if scan.ring is None else scan.ring
-    return _left(scan, ~np.isin(row, dropped))
+    return _subset(scan, ~np.isin(row, dropped))
 
 
 def range_drop(scan: Scan, rng: np.random.Generator, share: float = 0.3, power: float = 2.0) -> Scan:
@@ -123,7 +123,7 @@ def range_drop(scan: Scan, rng: np.random.Generator, share: float = 0.3, power: 
     if not power >= 0:
         raise ConfigError(f"power={power}", "0 or more")
     far = np.minimum(np.linalg.norm(scan.points, axis=1) / scan.sensor.range_max, 1)
-    return _left(scan, rng.random(len(scan)) >= checked_share("share", share) * far**power)
+    return _subset(scan, rng.random(len(scan)) >= checked_share("share", share) * far**power)
 
 
 def rotated(scan: Scan, angle: float) -> Scan:
@@ -161,7 +161,7 @@ def _placed(scan: Scan, points: NDArray[np.float32], boxes: Boxes | None) -> Sca
     return replace(scan, points=points, boxes=boxes, pose=None, image_path=None)
 
 
-def _left(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
+def _subset(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
     """Keep some of the points, and drop the boxes that lose all of their points."""
     if scan.boxes is None:
         return scan[keep]

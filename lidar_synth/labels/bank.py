@@ -1,11 +1,11 @@
-"""A bank of objects: the contents of the boxes of many scans, as a plain ``.npz``.
+"""A bank of objects: the contents of the boxes of many scans, in one ``.npz`` file.
 
-Arrays of the file (numpy's format, never pickled), M objects of P points in all::
+Arrays of the file (numpy's format, never pickled), for M objects with P points in total::
 
     format                       "lidar-synth-objects/1"
-    sensor                       JSON, the keys of sensors.yaml: who saw them
-    scan                         (M,) text, id of the scan that an object comes from
-    number                       (M,) int32, its box's place in that scan
+    sensor                       JSON, the keys of sensors.yaml: the sensor that recorded the objects
+    scan                         (M,) text, id of the scan that contains the object
+    number                       (M,) int32, index of its box in that scan
     ground                       (M,) float32, metres: height of the ground under it, in that scan's frame
     box_values, box_names ...    the fields of ``Boxes``, in that scan's frame
     start                        (M + 1,) int64, object i has the points start[i] to start[i + 1]
@@ -34,12 +34,12 @@ from lidar_synth.labels.objects import Object, objects_of
 FORMAT = "lidar-synth-objects/1"
 
 MOST_BYTES = 1 << 32
-"""Of a bank in memory: a hundred thousand objects of 2,500 points."""
+"""Maximum size of a bank in memory: a hundred thousand objects of 2,500 points each."""
 
 
 @dataclass(frozen=True, repr=False)
 class ObjectBank:
-    """Objects cut out of many scans; the module describes the arrays.
+    """Objects cut out of many scans; the module's docstring describes the arrays.
 
     Raises:
         DataError: on shapes that do not match each other.
@@ -68,7 +68,10 @@ class ObjectBank:
         count, total = len(self.boxes), len(self.points)
         rising = len(self.start) == count + 1 and self.start[0] == 0 and self.start[-1] == total
         if not (rising and (np.diff(self.start) > 0).all()) or self.points.shape != (total, 3):
-            raise DataError(f"{count} objects, {total} points, starts {self.start.shape}", "starts of all objects")
+            raise DataError(
+                f"{count} objects, {total} points, starts {self.start.shape}",
+                "starts of all objects and the end of the last, in increasing order",
+            )
         for name, size in {
             "scan": count,
             "number": count,
@@ -91,31 +94,31 @@ class ObjectBank:
         Raises:
             DataError: if there is no object in any of the scans, or the scans have several sensors.
         """
-        found: list[tuple[int, Object]] = []
+        objects: list[tuple[int, Object]] = []
         chosen = range(len(source)) if scans is None else list(scans)
         for index in tqdm(chosen, "collecting objects", unit="scan", leave=False, disable=None):
             scan = source[index]
             if scan.boxes is not None:
-                found += objects_of(scan, least).items()
-        if not found:
+                objects += objects_of(scan, least).items()
+        if not objects:
             raise DataError(
                 f"no box with {least} points in {len(chosen)} scans", "scans with boxes, such as KITTI's or the town's"
             )
-        if len(sensors := {o.scan.sensor for _, o in found}) > 1:
+        if len(sensors := {o.scan.sensor for _, o in objects}) > 1:
             raise DataError(f"objects of the sensors {sorted(s.name for s in sensors)}", "one sensor")
-        return cls._of(found)
+        return cls._of(objects)
 
     @classmethod
-    def _of(cls, found: list[tuple[int, Object]]) -> "ObjectBank":
-        parts = [o.scan for _, o in found]
+    def _of(cls, objects: list[tuple[int, Object]]) -> "ObjectBank":
+        parts = [o.scan for _, o in objects]
         return cls(
             sensor=parts[0].sensor,
             boxes=joined([p.boxes for p in parts if p.boxes is not None]),
             scan=np.array([p.id for p in parts], np.str_),
-            number=np.array([n for n, _ in found], np.int32),
-            ground=np.array([o.ground for _, o in found], np.float32),
+            number=np.array([n for n, _ in objects], np.int32),
+            ground=np.array([o.ground for _, o in objects], np.float32),
             start=np.cumsum([0, *map(len, parts)], dtype=np.int64),
-            points=np.concatenate([o.scan.points - o.box[:3] for _, o in found]),
+            points=np.concatenate([o.scan.points - o.box[:3] for _, o in objects]),
             reflectance=np.concatenate([p.reflectance for p in parts]),
             label=np.concatenate([p.fields()["label"] for p in parts]),
         )

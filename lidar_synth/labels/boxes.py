@@ -1,4 +1,4 @@
-"""Boxes in motion: a box's own frame, boxes that move, meet, overlap."""
+"""Geometry of boxes: a box's own frame, movement, enlargement and overlap."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -12,21 +12,23 @@ _CORNERS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
 
 
 def box_frame(points: NDArray[np.float32], box: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N, 3) points along, across and above the centre of one box (7,), metres."""
+    """Transform points into the frame of one box (7,): (N, 3) metres along, across and above its centre."""
     offset = points - box[:3]
     c, s = np.cos(box[6]), np.sin(box[6])
     return np.stack([offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s, offset[:, 2]], 1)
 
 
 def grown(box: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(7,) the box about the same centre, large enough for the points (N, 3) with a millimetre to spare, so that it
-    still holds them when both are moved in float32."""
-    held = 2 * (np.abs(box_frame(points, box)).max(0, initial=0) + 1e-3)
-    return np.concatenate([box[:3], np.maximum(box[3:6], held), box[6:]], dtype=np.float32)
+    """Enlarge a box (7,) about its centre so that it contains points (N, 3).
+
+    A margin of one millimetre ensures that it still contains them when both are moved in float32.
+    """
+    needed = 2 * (np.abs(box_frame(points, box)).max(0, initial=0) + 1e-3)
+    return np.concatenate([box[:3], np.maximum(box[3:6], needed), box[6:]], dtype=np.float32)
 
 
 def moved(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
-    """Boxes elsewhere: their place in the camera's image is not known any more; yaws are brought into [-pi, pi)."""
+    """The boxes with new values (M, 7): without their boxes in the camera image, and with yaw in [-pi, pi)."""
     values = values.astype(np.float32)
     values[:, 6] = (values[:, 6] + np.pi) % (2 * np.pi) - np.pi
     return Boxes(values, boxes.names, occlusion=boxes.occlusion.copy(), instance=boxes.instance.copy())
@@ -49,16 +51,16 @@ def turned_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float
 
 
 def joined(several: Sequence[Boxes]) -> Boxes:
-    """All boxes in one, in this order."""
+    """Concatenate boxes, in this order."""
     names = tuple(name for boxes in several for name in boxes.names)
     arrays = {f.name: np.concatenate([getattr(b, f.name) for b in several]) for f in fields(Boxes) if f.name != "names"}
     return Boxes(names=names, **arrays)
 
 
 def overlapping(box: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(M,) which of the others (M, 7) stand on some of the same ground as a box (7,).
+    """(M,) True for each of the others (M, 7) whose footprint overlaps that of a box (7,).
 
-    Two rectangles are apart where a side of one of them separates their corners.
+    Separating axis theorem: two rectangles are disjoint if a side of one of them separates their corners.
     """
     far: NDArray[np.bool_] = (
         np.hypot(*(others[:, :2] - box[:2]).T) > (np.hypot(*others[:, 3:5].T) + np.hypot(*box[3:5])) / 2
@@ -75,7 +77,7 @@ def overlapping(box: NDArray[np.float32], others: NDArray[np.float32]) -> NDArra
 
 
 def _footprints(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(M, 4, 2) corners on the ground."""
+    """(M, 4, 2) corners in the ground plane."""
     local = _CORNERS * values[:, None, 3:5]
     c, s = np.cos(values[:, 6:]), np.sin(values[:, 6:])
     x, y = local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c
@@ -88,5 +90,5 @@ def widened(values: NDArray[np.float32], margin: float) -> NDArray[np.float32]:
 
 
 def unseen(boxes: Boxes) -> Boxes:
-    """Boxes moved up or down where they stand: the camera sees them at another height, under the same angle."""
+    """The boxes without their place in the camera image, which is unknown after they were raised or lowered."""
     return replace(boxes, image_box=np.full((len(boxes), 4), -1, np.float32), dont_care=np.zeros((0, 4), np.float32))

@@ -1,8 +1,8 @@
-"""Parts of the turn exchanged between two scans of one grid: sectors of azimuth, bands of elevation.
+"""Parts exchanged between two scans of one grid: sectors of azimuth, and bands of elevation.
 
-Sectors after PolarMix (Xiao et al., "PolarMix: A General Data Augmentation Technique for LiDAR Point Clouds", NeurIPS
-2022), bands after LaserMix (Kong et al., "LaserMix for Semi-Supervised LiDAR Semantic Segmentation", CVPR 2023); here
-both end at the edges of cells, so that no cell shows two scans.
+Sectors follow PolarMix (Xiao et al., "PolarMix: A General Data Augmentation Technique for LiDAR Point Clouds", NeurIPS
+2022), bands LaserMix (Kong et al., "LaserMix for Semi-Supervised LiDAR Semantic Segmentation", CVPR 2023). Here both
+end at the edges of cells, so that no cell contains returns of two scans.
 """
 
 from dataclasses import replace
@@ -21,10 +21,10 @@ from lidar_synth.labels.view import refuse_coarser
 
 
 def thinned(scan: Scan, sensor: Sensor) -> Scan:
-    """The scan as another sensor would have it: the nearest return in each of its cells.
+    """Thin a scan to the grid of another sensor: the nearest return in each of its cells.
 
     Raises:
-        DataError: where the scan's own sensor is coarser.
+        DataError: if the scan's own sensor is coarser.
     """
     refuse_coarser(scan.sensor, sensor)
     point = locate(scan.points, sensor).point
@@ -32,32 +32,33 @@ def thinned(scan: Scan, sensor: Sensor) -> Scan:
 
 
 def swap_sector(scan: Scan, other: Scan, start: int, width: int) -> Scan:
-    """A scan in which some columns are another's.
+    """Replace a sector of columns of a scan by those of another scan.
 
-    Boxes that an edge cuts through leave, with what stands in them; the others hold the returns of their own scan only,
-    and all returns of their instance: they grow by some centimetres where noise or a tilt takes one outside.
+    Boxes that an edge of the sector cuts are removed with their objects. The other boxes contain only returns of their
+    own scan, and all returns of their instance: a box is enlarged by some centimetres if noise or tilt puts a return
+    outside.
 
     Args:
-        scan: keeps the remaining columns.
-        other: thinned to the grid of ``scan``.
+        scan: the scan that keeps the remaining columns.
+        other: the scan of the sector, thinned to the grid of ``scan``.
         start: first column of the sector.
-        width: columns of the sector, 0..W; they wrap.
+        width: number of columns of the sector, 0..W; they wrap around.
     """
     scan, other = holding(scan), holding(other)
     columns = scan.sensor.columns
     cell, cell_other = (locate(s.points, scan.sensor).cell for s in (scan, other))
-    first = _whole(scan, (cell >= 0) & ((cell - start) % columns >= width))
-    second = _whole(other, (cell_other >= 0) & ((cell_other - start) % columns < width))
-    return merged(*_apart(first, second))
+    first = _without_cut_objects(scan, (cell >= 0) & ((cell - start) % columns >= width))
+    second = _without_cut_objects(other, (cell_other >= 0) & ((cell_other - start) % columns < width))
+    return merged(*_separated(first, second))
 
 
 def swap_bands(scan: Scan, other: Scan, bands: int, odd: bool) -> Scan:
-    """A scan in which every other band of rows is another's; without boxes, for few objects fit into a band.
+    """Replace every other band of rows by those of another scan, and drop all boxes, as few objects fit into a band.
 
     Args:
-        scan: keeps the bands 0, 2, ... from the top, or 1, 3, ... if ``odd``.
-        other: thinned to the grid of ``scan``.
-        bands: how many, 2..H, as equal as whole rows can be.
+        scan: the scan that keeps the bands 0, 2, ... from the top, or 1, 3, ... if ``odd``.
+        other: the scan of the other bands, thinned to the grid of ``scan``.
+        bands: number of bands, 2..H; their numbers of rows differ by one at most.
         odd: see ``scan``.
     """
     rows, columns = scan.sensor.shape
@@ -69,8 +70,8 @@ def swap_bands(scan: Scan, other: Scan, bands: int, odd: bool) -> Scan:
     return merged(parts[0], parts[1:])
 
 
-def _whole(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
-    """The points that are kept, without the objects that lose some or all of theirs."""
+def _without_cut_objects(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
+    """Some of the scan's points, without the objects that would lose any of theirs."""
     if scan.boxes is None or not len(scan.boxes):
         return scan[keep]
     inside = standing(scan, scan.boxes)
@@ -79,16 +80,16 @@ def _whole(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
 
 
 def _without(
-    scan: Scan, gone: NDArray[np.bool_], inside: NDArray[np.bool_], keep: NDArray[np.bool_] | bool = True
+    scan: Scan, removed: NDArray[np.bool_], inside: NDArray[np.bool_], keep: NDArray[np.bool_] | bool = True
 ) -> Scan:
-    """The scan without some of its M boxes and what stands (M, N) in them."""
+    """The scan without some of its M boxes and the points (M, N) that belong to them."""
     assert scan.boxes is not None
-    left = ~inside[gone].any(0)
-    return replace(scan[left & keep], boxes=scan.boxes[~gone])
+    remaining = ~inside[removed].any(0)
+    return replace(scan[remaining & keep], boxes=scan.boxes[~removed])
 
 
-def _apart(first: Scan, second: Scan) -> tuple[Scan, list[Scan]]:
-    """Both scans with boxes that share neither ground nor returns: the first one's objects go before."""
+def _separated(first: Scan, second: Scan) -> tuple[Scan, list[Scan]]:
+    """Both scans with boxes that share neither ground nor returns; objects of the first scan take precedence."""
     a, b = first.boxes, second.boxes
     if a is not None and b is not None and len(a) and len(b):
         clash = np.array([overlapping(box, a.values).any() for box in b.values])
@@ -97,7 +98,7 @@ def _apart(first: Scan, second: Scan) -> tuple[Scan, list[Scan]]:
 
 
 def _outside(scan: Scan, boxes: Boxes | None) -> Scan:
-    """The points that do not stand in boxes of somebody else."""
+    """The points that do not belong to the boxes of another scan."""
     if boxes is None or not len(boxes):
         return scan
     return scan[~standing(replace(scan, instance=None), boxes).any(0)]

@@ -1,4 +1,4 @@
-"""The ground under an object: a plane through the ground returns in and around its box, and what stands on it."""
+"""The ground under an object, a plane fitted to the ground returns in and around its box, and the returns above it."""
 
 from typing import NamedTuple
 
@@ -11,20 +11,20 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import box_frame
 
 GROUND = np.isin(np.arange(256), [TRAIN_ID[n] for n in ("road", "parking", "sidewalk", "other-ground", "terrain")])
-"""(256,) which labels are ground."""
+"""(256,) True for labels of ground."""
 
 LEAST = 5
-"""Returns that a plane needs."""
+"""Minimum number of returns of a plane."""
 ROUGH = 0.15
-"""Metres by which a return may miss the plane: half a kerb and the unevenness of a lawn."""
+"""Maximum distance of a ground return from the plane, metres: half a kerb, or the unevenness of a lawn."""
 STEEP = 0.2
-"""Rise per metre of the steepest ground that an upright box can stand on."""
+"""Maximum slope of the ground under an upright box, rise per metre."""
 FLOOR = 0.25
-"""Metres above the ground up to which a return is ground: it is in nobody's way and hides nobody."""
+"""Height above the ground, metres, below which a return counts as ground and neither blocks nor hides an object."""
 CLEARANCE = 0.2
-"""Metres that an object keeps from what stands beside it."""
-_STACK = 0.3  # metres above the lowest return up to which returns are ground where no label tells
-_SIDES = 16  # directions in which ground has to lie for it to enclose a box
+"""Minimum distance between an object and its surroundings, metres."""
+_STACK = 0.3  # height above the lowest return, metres, below which returns count as ground if there are no labels
+_SIDES = 16  # number of directions in which ground must lie to enclose a box
 _NO_LABELS = np.empty(0, np.uint8)
 
 
@@ -32,10 +32,11 @@ class Ground(NamedTuple):
     """A plane in the frame of a box.
 
     Args:
-        height: of the plane at the box's centre, above the sensor's origin, metres.
-        along, across: its rise per metre.
-        encloses: its returns lie on all sides of the centre: the box is neither in nor behind a wall.
-        free: nothing stands in the box or beside it.
+        height: height of the plane at the box's centre, above the sensor's origin, metres.
+        along, across: rise per metre along and across the box.
+        encloses: whether ground returns lie on all sides of the centre, so that the box is neither in nor behind a
+            wall.
+        free: whether there are no other returns in or beside the box.
     """
 
     height: float
@@ -45,24 +46,24 @@ class Ground(NamedTuple):
     free: bool
 
     def above(self, points: NDArray[np.float32], box: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(N,) metres over the plane of points (N, 3)."""
+        """(N,) height of points (N, 3) above the plane, metres."""
         local = box_frame(points, box).astype(np.float64)
         heights: NDArray[np.float64] = local @ (-self.along, -self.across, 1.0) + (float(box[2]) - self.height)
         return heights
 
 
 def ground_under(scan: Scan, box: NDArray[np.float32]) -> Ground | None:
-    """The ground under a box, by the labels if there are any around it, else by the lowest returns.
+    """The ground under a box, found by the labels around it, or by the lowest returns if there are no labels.
 
     Args:
         scan: N points.
-        box: (7,); its height above the sensor does not matter.
+        box: (7,); its z coordinate is ignored.
 
     Returns:
-        None where there is no ground, or none that is even and level enough to stand on.
+        None if there is no ground, or if it is too rough or too steep.
     """
     sensor = scan.sensor
-    # A little more than the gap between two rings there, for a sensor as high as on a car's roof.
+    # A little more than the gap between two rings at this distance, for a sensor on a car's roof.
     gap = 1.5 * np.radians(sensor.up - sensor.down) / sensor.shape[0] * (box[0] ** 2 + box[1] ** 2) / 1.7
     labels = _NO_LABELS if scan.label is None else scan.label
     known, along, across, height, sides, free = _survey(scan.points, labels, GROUND, box, min(max(gap, 1.0), 5.0))
@@ -72,7 +73,7 @@ def ground_under(scan: Scan, box: NDArray[np.float32]) -> Ground | None:
 
 
 def standing(scan: Scan, boxes: Boxes) -> NDArray[np.bool_]:
-    """(M, N) which points of a scan belong to each box: those in it that are not ground, and those of its instance."""
+    """(M, N) True for points that belong to a box: those inside that are not ground, and those of its instance."""
     inside = boxes.contain(scan.points)
     low = scan.points[:, 2] < (boxes.values[:, 2] - boxes.values[:, 5] / 2 + FLOOR)[:, None]
     if scan.label is not None:
@@ -84,8 +85,8 @@ def standing(scan: Scan, boxes: Boxes) -> NDArray[np.bool_]:
 
 @numba.njit(cache=True)
 def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-def]
-    """Whether there is ground, the plane (rise along and across, height at the centre), in how many directions its
-    returns lie, and whether nothing stands in the box."""
+    """Fit the ground: (whether there is any, rise along, rise across, height at the centre, number of directions with
+    ground returns, whether the box is free)."""
     near, local = _around(points, box, reach)
     ground, labelled = np.zeros(len(near), np.bool_), False
     for k in range(len(near) if len(labels) else 0):
@@ -97,7 +98,7 @@ def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-d
             ground[k] = local[k, 2] < lowest + _STACK
     total = ground.sum()
     along, across, height = _plane(local, ground, box)
-    # Without labels the first plane lies a little too high, for it includes the feet of what stands there.
+    # Without labels the first plane lies slightly too high, because it includes the lowest returns of objects.
     upper = ROUGH if labelled else ROUGH / 2
     for k in range(len(near)):
         ground[k] &= -ROUGH < local[k, 2] - height - along * local[k, 0] - across * local[k, 1] < upper
@@ -113,8 +114,8 @@ def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-d
 
 @numba.njit(cache=True)
 def _around(points, box, reach):  # type: ignore[no-untyped-def]
-    """Indices of the points whose distance from the box is at most the reach, and where they are: (n, 3) float64
-    along and across the box, and above the sensor."""
+    """Indices (n,) of the points within reach of the box, and their coordinates (n, 3) float64: along and across the
+    box, and above the sensor."""
     c, s = np.cos(box[6]), np.sin(box[6])
     half = np.sqrt(box[3] ** 2 + box[4] ** 2) / 2 + reach
     near, local = np.empty(len(points), np.int64), np.empty((len(points), 3), np.float64)
@@ -132,7 +133,7 @@ def _around(points, box, reach):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def _third_lowest(local):  # type: ignore[no-untyped-def]
-    """Height below which there are two points at most: two stray returns may lie under the ground."""
+    """The third lowest height, because up to two stray returns may lie below the ground."""
     first, second, third = np.inf, np.inf, np.inf
     for k in range(len(local)):
         z = local[k, 2]
@@ -147,7 +148,7 @@ def _third_lowest(local):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def _sides(local, ground):  # type: ignore[no-untyped-def]
-    """In how many of the directions from the centre some ground lies."""
+    """Number of directions from the centre in which there is ground."""
     count = 0
     for side in range(_SIDES):
         x, y = np.cos(2 * np.pi * side / _SIDES), np.sin(2 * np.pi * side / _SIDES)
@@ -160,7 +161,7 @@ def _sides(local, ground):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def _plane(local, ground, box):  # type: ignore[no-untyped-def]
-    """Least squares in which near returns count most; few returns give a level plane rather than a steep one."""
+    """Weighted least squares: near returns weigh more, and regularisation makes a plane of few returns level."""
     weight = np.zeros(len(local))
     total, x, y, z = 1e-9, 0.0, 0.0, 0.0
     for k in range(len(local)):

@@ -1,4 +1,4 @@
-"""Points of several scans in one, with all that is known about each."""
+"""Merging of several scans into one, with all fields of their points."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,11 +13,11 @@ from lidar_synth.labels.boxes import joined
 
 
 def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
-    """A scan with the points, labels and boxes of others behind its own.
+    """Append the points, labels and boxes of other scans to a scan.
 
-    Its ``domain`` is ``SYNTHETIC``, whatever it holds; sensor, id, pose and image are those of the first scan. Labels,
-    confidence (1 for a label of which nobody doubts) and instances are always there; the others' instances get new
-    numbers. Rings are there if the first scan has them, boxes if any scan has.
+    The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of the first scan.
+    Labels, confidence (1 for labels of scans without confidence) and instances are always set; instances of the other
+    scans are renumbered. Rings are set if the first scan has them, boxes if any scan has them.
     """
     parts = [_complete(scan)]
     used = _last_instance(parts[0])
@@ -41,9 +41,9 @@ def _complete(scan: Scan) -> Scan:
 
 
 def _numbers(scan: Scan) -> list[NDArray[np.int32]]:
-    """The instances of its points and boxes."""
-    known = [] if scan.instance is None else [scan.instance]
-    return known if scan.boxes is None else [*known, scan.boxes.instance]
+    """The instance numbers of points and boxes."""
+    of_points = [] if scan.instance is None else [scan.instance]
+    return of_points if scan.boxes is None else [*of_points, scan.boxes.instance]
 
 
 def _last_instance(scan: Scan) -> int:
@@ -51,7 +51,7 @@ def _last_instance(scan: Scan) -> int:
 
 
 def _renumbered(scan: Scan, used: int) -> Scan:
-    """The scan with the instances used + 1, used + 2, ... in place of its own; none (0 or less) stays none."""
+    """Renumber the scan's instances as used + 1, used + 2, ...; 0 and below, which mean none, are kept."""
     old = np.unique(np.concatenate(_numbers(scan)))
     old = old[old > 0]
 
@@ -66,7 +66,7 @@ def _renumbered(scan: Scan, used: int) -> Scan:
 
 
 def _rings(part: Scan, scan: Scan) -> NDArray[np.int16]:
-    """(N,) the lasers of a scan's sensor that point nearest to points whose ring is not known."""
+    """(N,) the rings of points whose ring is unknown: the lasers of the scan's sensor with the nearest elevation."""
     tilt = np.arcsin(part.points[:, 2] / np.linalg.norm(part.points, axis=1))
     lasers = scan.sensor.laser_elevations[::-1]
     above = np.searchsorted((lasers[1:] + lasers[:-1]) / 2, tilt)

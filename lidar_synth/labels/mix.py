@@ -1,8 +1,8 @@
-"""``mix``: labels that come with parts of real (or town) scans set into the synthetic one.
+"""``mix``: labelled parts of real (or town) scans are inserted into the synthetic scan.
 
-A mixed scan stays in the place, and keeps the id and the ``domain`` (``SYNTHETIC``), of the synthetic scan that it was
-made from; which of its points come from elsewhere, ``confidence`` 1 tells at most. What is left of the synthetic scan
-keeps the labels that its model gave it, or is ignored where it gave none.
+A mixed scan keeps the position, the id and the ``domain`` (``SYNTHETIC``) of its synthetic scan. Inserted points are
+not marked; they have confidence 1. The remaining synthetic points keep the labels of their model; if it gives none,
+they are ignored.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,20 +21,20 @@ from lidar_synth.labels.own import Ignored, Own, generated
 from lidar_synth.labels.pasting import paste
 
 TRIES = 5
-"""Objects tried for each that is wanted."""
+"""Number of candidates that are tried for each object to be placed."""
 
 
 @dataclass(frozen=True)
 class Objects:
-    """Objects of a bank with their boxes, for detectors.
+    """Pastes objects of a bank with their boxes, for training detectors.
 
     Args:
-        own: what becomes of the scan's own labels.
-        bank: where the objects are from.
-        groups: from which of them (indices) to draw, and how many to place.
-        least: points that must be seen of an object.
-        turn: degrees to either side by which an object may be turned about the sensor.
-        clear: take the returns of the scan's own objects away, which have no boxes.
+        own: the policy for the scan's own labels.
+        bank: the bank of objects.
+        groups: (indices of objects in the bank, number to place) pairs; objects are sampled from each group.
+        least: minimum number of visible points of an object.
+        turn: maximum angle, degrees to either side, by which an object is turned about the sensor.
+        clear: whether to remove the returns of the scan's own objects, which have no boxes.
     """
 
     own: Own | Ignored
@@ -61,13 +61,13 @@ class Objects:
 
 @dataclass(frozen=True)
 class Polar:
-    """PolarMix: a sector of a real scan, and its objects turned about the sensor.
+    """PolarMix: inserts a sector of a real scan, and its objects turned about the sensor.
 
     Args:
-        own: what becomes of the scan's own labels.
+        own: the policy for the scan's own labels.
         real: labelled scans.
-        width: degrees of the sector.
-        objects: how many to place; at most all that the real scan has.
+        width: width of the sector in degrees.
+        objects: number of objects to place; at most all that the real scan has.
     """
 
     own: Own | Ignored
@@ -79,23 +79,23 @@ class Polar:
         other, columns = _partner(self.real, scan, rng), scan.sensor.columns
         width = round(columns * self.width / 360)
         mixed = swap_sector(self.own(scan, rng), other, int(rng.integers(columns)), width)
-        known = other.boxes is not None
+        has_boxes = other.boxes is not None
         if self.objects:
-            found = list(objects_of(other).values()) if known else instances_of(other)
-            angles = rng.uniform(-np.pi, np.pi, len(found))
-            turned = (found[i].turned(a) for i, a in zip(rng.permutation(len(found)), angles, strict=True))
+            objects = list(objects_of(other).values()) if has_boxes else instances_of(other)
+            angles = rng.uniform(-np.pi, np.pi, len(objects))
+            turned = (objects[i].turned(a) for i, a in zip(rng.permutation(len(objects)), angles, strict=True))
             mixed = paste(mixed, turned, count=self.objects)
-        return mixed if known else replace(mixed, boxes=None)  # boxes around some objects would deny the others
+        return mixed if has_boxes else replace(mixed, boxes=None)  # with boxes, all other objects would be negatives
 
 
 @dataclass(frozen=True)
 class Laser:
-    """LaserMix: bands of elevation, by turns from the synthetic and from a real scan.
+    """LaserMix: bands of elevation, alternately from the synthetic and from a real scan.
 
     Args:
-        own: what becomes of the scan's own labels.
+        own: the policy for the scan's own labels.
         real: labelled scans.
-        bands: how many bands, one of these.
+        bands: numbers of bands, of which one is sampled for each scan.
     """
 
     own: Own | Ignored
@@ -108,7 +108,7 @@ class Laser:
 
 
 def _partner(real: Source, scan: Scan, rng: np.random.Generator) -> Scan:
-    """A real scan on the grid of a synthetic one."""
+    """A random real scan, thinned to the grid of a synthetic one."""
     other = real[int(rng.integers(len(real)))]
     if other.label is None:
         raise DataError(f"scan {other.id!r} has no labels", "real scans with labels, all of them")
@@ -125,27 +125,27 @@ def objects(
     clear: bool = False,
     threshold: float = 0.0,
 ) -> Objects:
-    """``mix`` with objects and their boxes.
+    """Make the policy ``mix`` that pastes objects and their boxes.
 
     Args:
-        real: the scans with boxes whose objects to take, if no bank is given; all of them are read.
-        fields: of the synthetic scans.
+        real: scans with boxes, from which objects are collected if no bank is given; all of them are read.
+        fields: the fields of the synthetic scans.
         objects: a bank of objects, or its file.
-        count: how many to place in a scan at most, in all or by the name of their boxes.
+        count: maximum number of objects to place in a scan, in total or as ``{name of the boxes: number}``.
         least, turn, clear: see ``Objects``.
-        threshold: of the synthetic scans' own labels, see ``generated``.
+        threshold: minimum confidence of the synthetic scans' own labels, see ``generated``.
 
     Raises:
-        ConfigError: where there are no boxes to take objects from, or none of a name; on other values.
+        ConfigError: if there are no boxes, or none of a given name; on other invalid values.
     """
-    wanted = count if isinstance(count, Mapping) else {"": count}
-    if min(wanted.values(), default=0) < 1 or least < 1 or not 0 <= turn <= 180:
+    limits = count if isinstance(count, Mapping) else {"": count}
+    if min(limits.values(), default=0) < 1 or least < 1 or not 0 <= turn <= 180:
         raise ConfigError(
             f"count={count}, least={least}, turn={turn}", "at least one object, one point, 0..180 degrees"
         )
     bank = objects if isinstance(objects, ObjectBank) else _bank(real, objects, least)
     names, groups = np.array(bank.boxes.names), []
-    for name, number in wanted.items():
+    for name, number in limits.items():
         indices = np.flatnonzero((bank.counts >= least) & ((names == name) | (name == "")))
         if not len(indices):
             raise ConfigError(f"count={count}, least={least}", f"names and points of {bank} ({sorted(set(names))})")
@@ -162,10 +162,10 @@ def polar(
     objects: int = 10,
     threshold: float = 0.0,
 ) -> Polar:
-    """``mix`` as PolarMix does it, see ``Polar``.
+    """Make the policy ``mix`` by PolarMix, see ``Polar``.
 
     Raises:
-        ConfigError: without real scans that have labels and, for objects, boxes or instances; on other values.
+        ConfigError: if the real scans have no labels, or neither boxes nor instances for objects; on invalid values.
     """
     if not 0 <= width <= 360 or objects < 0:
         raise ConfigError(f"width={width}, objects={objects}", "0..360 degrees, and a number of objects")
@@ -178,13 +178,13 @@ def polar(
 def laser(
     real: Source | None, fields: frozenset[str], bands: Sequence[int] = (3, 4, 5, 6), threshold: float = 0.0
 ) -> Laser:
-    """``mix`` as LaserMix does it, see ``Laser``.
+    """Make the policy ``mix`` by LaserMix, see ``Laser``.
 
     Raises:
-        ConfigError: without real scans that have labels; on fewer than two bands.
+        ConfigError: if the real scans have no labels; on fewer than two bands.
     """
     if not len(bands) or min(bands) < 2:
-        raise ConfigError(f"bands={bands}", "numbers of bands, 2 and up")
+        raise ConfigError(f"bands={bands}", "numbers of bands, 2 or more each")
     real, _ = _labelled(real, "laser")
     return Laser(_own(fields, threshold), real, tuple(bands))
 
@@ -194,13 +194,13 @@ def _own(fields: frozenset[str], threshold: float) -> Own | Ignored:
 
 
 def _labelled(real: Source | None, kind: str) -> tuple[Source, Scan]:
-    """The real scans and the first of them, which has to have labels."""
+    """Check that the real scans have labels, and return the scans and the first of them."""
     if real is None or not len(real) or (first := real[0]).label is None:
         given = "none" if real is None or not len(real) else "scans without labels"
         raise ConfigError(
             f"labels='mix', kind={kind!r}, with {given}",
             "real scans with labels, such as SemanticKITTI or a town",
-            "KITTI-360 and KITTI have none: use kind='objects' with boxes, or labels='generated'.",
+            "KITTI-360 and KITTI have no labels: use kind='objects' with boxes, or labels='generated'.",
         )
     return real, first
 
@@ -214,5 +214,5 @@ def _bank(real: Source | None, path: str | Path | None, least: int) -> ObjectBan
         raise ConfigError(
             f"labels='mix', kind='objects': {error}",
             "real scans with boxes, or objects=",
-            "A bank of objects is made by ObjectBank.from_scans(source).save(path); KITTI and the town have boxes.",
+            "ObjectBank.from_scans(source).save(path) makes a bank of objects; KITTI and the town have boxes.",
         ) from error

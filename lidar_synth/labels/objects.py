@@ -1,4 +1,4 @@
-"""Objects cut out of scans, to be set into others."""
+"""Objects cut out of scans, to be pasted into other scans."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -16,20 +16,20 @@ LABELS = {
     "Car": TRAIN_ID["car"], "Van": TRAIN_ID["car"], "Truck": TRAIN_ID["truck"], "Pedestrian": TRAIN_ID["person"],
     "Person_sitting": TRAIN_ID["person"], "Cyclist": TRAIN_ID["bicyclist"], "Tram": TRAIN_ID["other-vehicle"],
 }  # fmt: skip
-"""Train id of a box's points where the scan has no labels; another name's are ignored (KITTI's ``Misc``)."""
+"""Train id of a box's points if the scan has no labels; points of other names (KITTI's ``Misc``) are ignored."""
 
 THINGS = len(("car", "bicycle", "motorcycle", "truck", "other-vehicle", "person", "bicyclist", "motorcyclist"))
 """Train ids below this one have instances."""
 
 LOWEST = 0.1
-"""Metres over the ground from which on a return in a box is the object's, where nobody says which are."""
+"""Minimum height above the ground, metres, of an object's returns if the scan has neither labels nor instances."""
 
 NOISE = 0.15
-"""Metres by which returns of an instance may miss its box."""
+"""Maximum distance of an instance's returns from its box, metres."""
 
 
 class Object(NamedTuple):
-    """One object where it was seen.
+    """One object at its recorded position.
 
     Args:
         scan: its points with reflectance and label, and its one box.
@@ -41,63 +41,62 @@ class Object(NamedTuple):
 
     @property
     def box(self) -> NDArray[np.float32]:
-        """(7,) its box."""
+        """(7,) the object's box."""
         values: NDArray[np.float32] = self.scan.boxes.values[0]  # type: ignore[union-attr]
         return values
 
     def turned(self, angle: float) -> "Object":
-        """The object seen in another direction: turned about the sensor, counter-clockwise, radians."""
+        """The object turned about the sensor, counter-clockwise by an angle in radians."""
         assert self.scan.boxes is not None
         points = turned_points(self.scan.points, angle)
         return self._replace(scan=replace(self.scan, points=points, boxes=turned(self.scan.boxes, angle)))
 
 
 def objects_of(scan: Scan, least: int = 5) -> dict[int, Object]:
-    """The objects of a scan's boxes, by the number of the box.
+    """The objects in a scan's boxes, as ``{index of the box: object}``.
 
-    Where boxes and points have instances, an object is its instance, and a box that the sensor's noise or a tilt
-    sticks out of is grown by some centimetres, so that it holds all of its points. Elsewhere it is what stands in its
-    box above the ground.
+    If boxes and points have instances, an object's points are those of its instance; its box is enlarged by some
+    centimetres if noise or tilt puts points outside. Otherwise its points are those in the box above the ground.
 
     Args:
-        scan: with boxes.
-        least: points that an object needs.
+        scan: a scan with boxes.
+        least: minimum number of points of an object.
 
     Raises:
-        DataError: where the scan has no boxes.
+        DataError: if the scan has no boxes.
     """
     if scan.boxes is None:
         raise DataError(f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects")
-    found = {}
+    objects = {}
     for number in range(len(scan.boxes)):
         cut = _cut(scan, scan.boxes[[number]])
         if cut is not None and len(cut.scan) >= least:
-            found[number] = cut
-    return found
+            objects[number] = cut
+    return objects
 
 
 def instances_of(scan: Scan, least: int = 5) -> list[Object]:
-    """The objects of a scan that knows instances and no boxes; their boxes are no more than their extent.
+    """The objects of a scan with instances but without boxes; their boxes are the extents of their points.
 
     Raises:
-        DataError: where it has no instances or no labels.
+        DataError: if the scan has no instances or no labels.
     """
     if scan.instance is None or scan.label is None:
         raise DataError(f"scan {scan.id!r} has no instances", "labels and instances, as in SemanticKITTI")
     things = np.flatnonzero((scan.instance > 0) & (scan.label < THINGS))
     keys = scan.instance[things].astype(np.int64) * THINGS + scan.label[things]
     which = np.unique(keys, return_inverse=True)[1]
-    found = []
+    objects = []
     for part in np.split(things[np.argsort(which, kind="stable")], np.cumsum(np.bincount(which))[:-1]):
         if len(part) >= least:
             low, high = scan.points[part].min(0), scan.points[part].max(0)
             box = grown(np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32), scan.points[part])
-            found.append(_object(scan, part, Boxes(box, ("Misc",))))
-    return found
+            objects.append(_object(scan, part, Boxes(box, ("Misc",))))
+    return objects
 
 
 def holding(scan: Scan) -> Scan:
-    """The scan with boxes grown by some centimetres where returns of their instance would lie outside."""
+    """The scan with boxes enlarged by some centimetres, so that they contain all returns of their instance."""
     if scan.boxes is None or scan.instance is None:
         return scan
     values = scan.boxes.values.copy()
@@ -107,22 +106,22 @@ def holding(scan: Scan) -> Scan:
 
 
 def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
-    """(N,) the points of a box's instance that lie in it or miss it by no more than noise."""
+    """(N,) True for points of a box's instance that lie within it or within ``NOISE`` of it."""
     wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
     return np.asarray(Boxes(wide, box.names).contain(scan.points)[0] & (scan.instance == box.instance[0]))
 
 
 def _cut(scan: Scan, box: Boxes) -> Object | None:
-    """The object of one box; None where there is nothing in it."""
-    known = scan.instance is not None and box.instance[0] > 0
-    mine = np.flatnonzero(_instance(scan, box) if known else _standing(scan, box))
+    """The object in one box; None if it contains no points."""
+    has_instance = scan.instance is not None and box.instance[0] > 0
+    mine = np.flatnonzero(_instance(scan, box) if has_instance else _standing(scan, box))
     return (
         _object(scan, mine, replace(box, values=grown(box.values[0], scan.points[mine])[None])) if len(mine) else None
     )
 
 
 def _standing(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
-    """(N,) the points in a box that are not its ground."""
+    """(N,) True for the points in a box that are above the ground."""
     inside: NDArray[np.bool_] = box.contain(scan.points)[0]
     ground = ground_under(scan, box.values[0])
     if ground is not None:

@@ -1,7 +1,7 @@
-"""Policies that ask nobody else: the labels that a synthetic scan brings along, or none.
+"""Policies that need no other scans: they keep the labels of the synthetic scan, or remove them.
 
-They return a new ``Scan`` that shares the arrays which they leave alone. A file's own ``raw_label`` never outlives
-them: it would contradict what they decide.
+They return a new ``Scan`` that shares its unchanged arrays. They remove ``raw_label``, which would contradict the
+labels that they set.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from lidar_synth.geometry.scan import Scan, Source
 
 @dataclass(frozen=True)
 class Unlabelled:
-    """``none``: an unlabelled pool; labels, instances, confidence and boxes are taken away."""
+    """``none``: an unlabelled pool; labels, instances, confidence and boxes are removed."""
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         return replace(scan, label=None, raw_label=None, instance=None, confidence=None, boxes=None)
@@ -24,7 +24,7 @@ class Unlabelled:
 
 @dataclass(frozen=True)
 class Ignored:
-    """``ignore``: every label is 255, confidence 0; a loss skips the scan, the sample keeps its keys."""
+    """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan; the sample keeps its keys."""
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         label, confidence = np.full(len(scan), IGNORE, np.uint8), np.zeros(len(scan), np.float32)
@@ -33,11 +33,11 @@ class Ignored:
 
 @dataclass(frozen=True)
 class Own:
-    """``generated`` and ``condition``: the labels that arrive with the scan.
+    """``generated`` and ``condition``: the scan keeps its own labels.
 
     Args:
-        threshold: least confidence, 0 to 1; below it a label becomes ignore.
-        kept: the arriving confidence counts; otherwise it is 1 wherever there is a label.
+        threshold: minimum confidence, 0 to 1; labels below it become 255 = ignore.
+        kept: whether to keep the scan's confidence; otherwise it becomes 1 for every labelled point.
     """
 
     threshold: float = 0.0
@@ -52,13 +52,13 @@ class Own:
 def trusted(
     scan: Scan, label: NDArray[np.uint8], confidence: NDArray[np.float32] | None, threshold: float = 0.0
 ) -> Scan:
-    """The scan with these labels, those below a threshold ignored.
+    """Set the labels of a scan, and ignore those with a confidence below a threshold.
 
     Args:
         scan: N points.
         label: (N,) train ids, 255 = ignore.
-        confidence: (N,) in [0, 1]; None = 1 wherever there is a label.
-        threshold: least confidence that a label needs.
+        confidence: (N,) in [0, 1]; None = 1 for every labelled point.
+        threshold: minimum confidence of a label.
     """
     if confidence is None:
         confidence = (label != IGNORE).astype(np.float32)
@@ -68,20 +68,20 @@ def trusted(
 
 
 def unlabelled(real: Source | None, fields: frozenset[str]) -> Unlabelled:
-    """``none``, which every source can serve."""
+    """Make the policy ``none``, which works with any source."""
     return Unlabelled()
 
 
 def ignored(real: Source | None, fields: frozenset[str]) -> Ignored:
-    """``ignore``, which every source can serve."""
+    """Make the policy ``ignore``, which works with any source."""
     return Ignored()
 
 
 def generated(real: Source | None, fields: frozenset[str], threshold: float = 0.0) -> Own:
-    """``generated``: the labels that the model made with the scan.
+    """Make the policy ``generated``: the labels that the model generated with the scan.
 
     Raises:
-        ConfigError: where the scans carry no labels, or no confidence for a threshold.
+        ConfigError: if the scans have no labels, or no confidence for a threshold.
     """
     _require_label("generated", fields)
     if threshold and "confidence" not in fields:
@@ -90,20 +90,20 @@ def generated(real: Source | None, fields: frozenset[str], threshold: float = 0.
 
 
 def condition(real: Source | None, fields: frozenset[str]) -> Own:
-    """``condition``: the labels of the semantic map that conditioned the scan, which arrive with its returns.
+    """Make the policy ``condition``: the labels of the semantic map that conditioned the scan.
 
     Raises:
-        ConfigError: where the scans carry none.
+        ConfigError: if the scans have no labels.
     """
     _require_label("condition", fields)
     return Own(kept=False)
 
 
 def checked_share(name: str, value: float) -> float:
-    """``value``, a number from 0 to 1.
+    """Check that ``value`` is a number from 0 to 1, and return it.
 
     Raises:
-        ConfigError: on another.
+        ConfigError: on any other value.
     """
     if not 0 <= value <= 1:
         raise ConfigError(f"{name} {value!r}", "a number from 0 to 1")
@@ -113,7 +113,7 @@ def checked_share(name: str, value: float) -> float:
 def _require_label(policy: str, fields: frozenset[str]) -> None:
     if "label" not in fields:
         raise ConfigError(
-            f"labels={policy!r}, but the synthetic scans carry {sorted(fields) or 'nothing'} beside their points",
+            f"labels={policy!r}, but besides points the synthetic scans only have {sorted(fields) or 'no fields'}",
             "a model or bank with labels",
             "Use labels='none' for an unlabelled pool, 'ignore', 'pseudo' with a teacher, or 'mix' with real scans.",
         )

@@ -1,9 +1,9 @@
-"""Objects set into a scan, at their own range, as the sensor would have seen them there.
+"""Objects pasted into a scan at their recorded range, with occlusion as the sensor would see it.
 
-An object is raised or lowered to the ground under it, and refused where there is none, or where something stands. In
-the range image of the scan's sensor the nearer return of a cell then stays: what stands in front of an object hides
-it, and the object hides all that lies behind its outline, in the gaps between its returns too. So a box holds the
-returns of its object and, at its floor, of the ground, and there is nothing behind them.
+An object is raised or lowered to the ground at its place, and skipped if there is no ground or the place is occupied.
+In each cell of the range image the nearest return then wins: objects are hidden by what is in front of them, and hide
+everything behind their outline, including the gaps between their returns. A box therefore contains only the returns of
+its object and, at its floor, of the ground, and there are no returns in its shadow.
 """
 
 from collections.abc import Iterable
@@ -20,29 +20,29 @@ from lidar_synth.labels.objects import Object
 from lidar_synth.labels.view import View, VisibleReturns, refuse_coarser
 
 LIFT = 1.0
-"""Metres by which an object is raised or lowered at most: farther, the sensor would see another side of it."""
+"""Maximum height by which an object is raised or lowered, metres; beyond it the sensor would see another side."""
 OCCLUSION = ((0.80, 0), (0.45, 1), (0.0, 2))
-"""KITTI's occlusion by the least visible share: 0 visible, 1 partly, 2 largely."""
+"""(minimum visible share, KITTI's occlusion level): 0 fully visible, 1 partly occluded, 2 largely occluded."""
 
 
 def paste(scan: Scan, objects: Iterable[Object], *, count: int | None = None, least: int = 5) -> Scan:
-    """A scan with objects set into it.
+    """Paste objects into a scan.
 
     Args:
-        scan: N points; its labels tell ground from what stands on it; without any, the lowest returns are ground.
-        objects: candidates in order; those that find no place are passed over. Their returns are thinned to one per
-            cell of the scan's sensor.
-        count: how many to place at most; by default all that find a place.
-        least: returns that must be seen of an object. Of what was in the scan, too: a box that is left with fewer
-            leaves the scan, with its returns.
+        scan: N points; the ground is found by its labels, or by the lowest returns if it has none.
+        objects: candidates, in the order in which they are tried; those without a suitable place are skipped. Their
+            returns are thinned to one per cell of the scan's sensor.
+        count: maximum number of objects to place; by default all that fit.
+        least: minimum number of visible returns of an object. It also applies to the scan's own objects: a box that
+            falls below it by occlusion is removed, with its returns.
 
     Returns:
-        A new scan, which always has boxes. The pasted points follow those that are left, with their label, confidence
-        1 and a new instance; their boxes, from near to far, follow those that the scan had. Occlusion is what the
-        object had before or, if worse, what is hidden here; where the first is not known, a lower bound.
+        A new scan, which always has boxes. The pasted points are appended, with their label, confidence 1 and a new
+        instance; their boxes are appended from near to far. The occlusion of a pasted object is that of its recording
+        or, if greater, that in this scan. If the former is unknown, the result is a lower bound.
 
     Raises:
-        DataError: on objects that a coarser sensor saw.
+        DataError: on objects recorded by a coarser sensor.
     """
     placed: list[Object] = []
     for candidate in objects:
@@ -61,7 +61,7 @@ def paste(scan: Scan, objects: Iterable[Object], *, count: int | None = None, le
 
 
 def _fit(scan: Scan, candidate: Object, placed: list[Object]) -> Object | None:
-    """The object on the ground of the scan; None where it cannot stand."""
+    """The object placed on the ground of the scan; None if there is no suitable place."""
     box = candidate.box
     taken = [o.box for o in placed] + ([] if scan.boxes is None else list(scan.boxes.values))
     if taken and overlapping(widened(box, CLEARANCE), np.array(taken)).any():
@@ -73,7 +73,7 @@ def _fit(scan: Scan, candidate: Object, placed: list[Object]) -> Object | None:
 
 
 def _raised(candidate: Object, height: float) -> Object:
-    """The object on ground of another height."""
+    """The object raised or lowered to ground of a given height."""
     assert candidate.scan.boxes is not None
     lift = np.array([0, 0, height - candidate.ground], np.float32)
     values = candidate.scan.boxes.values.copy()
@@ -83,27 +83,28 @@ def _raised(candidate: Object, height: float) -> Object:
 
 
 def _as_seen(scan: Scan, part: VisibleReturns) -> Scan:
-    """An object's returns that are seen, as an instance, with its occlusion."""
+    """The visible returns of an object, as one instance, with its occlusion."""
     assert scan.boxes is not None
-    seen = scan[part.seen]
-    boxes = replace(_hidden(scan.boxes, np.array([part.share])), instance=np.ones(1, np.int32))
-    return replace(seen, instance=np.ones(len(seen), np.int32), boxes=boxes)
+    visible = scan[part.seen]
+    boxes = replace(_occluded(scan.boxes, np.array([part.share])), instance=np.ones(1, np.int32))
+    return replace(visible, instance=np.ones(len(visible), np.int32), boxes=boxes)
 
 
 def _own_boxes(scan: Scan, seen: NDArray[np.bool_], least: int) -> Scan:
-    """What is left of a scan of whose points (N,) these are seen, with its boxes as they are seen now."""
+    """The scan reduced to its visible points (N,), with the occlusion of its boxes updated."""
     if scan.boxes is None:
         return replace(scan[seen], boxes=Boxes(np.zeros((0, 7), np.float32), ()))
     inside = standing(scan, scan.boxes)
     before, after = inside.sum(1), (inside & seen).sum(1)
-    gone = (after < before) & (after < least)
-    left = seen & ~inside[gone].any(0)
-    return replace(scan[left], boxes=_hidden(scan.boxes, after / np.maximum(before, 1) + (before == 0))[~gone])
+    removed = (after < before) & (after < least)
+    remaining = seen & ~inside[removed].any(0)
+    share = after / np.maximum(before, 1) + (before == 0)
+    return replace(scan[remaining], boxes=_occluded(scan.boxes, share)[~removed])
 
 
-def _hidden(boxes: Boxes, share: NDArray[np.float64]) -> Boxes:
-    """Boxes of which shares (M,) of what was seen before are seen now."""
+def _occluded(boxes: Boxes, share: NDArray[np.float64]) -> Boxes:
+    """The boxes with occlusion levels updated by the shares (M,) of their returns that are still visible."""
     level = np.select([share >= least for least, _ in OCCLUSION], [level for _, level in OCCLUSION])
-    # That much of it is seen here says nothing of what was hidden before: unknown (-1 or 3) stays unknown.
+    # Good visibility here does not exclude earlier occlusion: unknown (-1 or 3) stays unknown.
     keep = (level == 0) | (boxes.occlusion >= level)
     return replace(boxes, occlusion=np.where(keep, boxes.occlusion, level).astype(np.int8))

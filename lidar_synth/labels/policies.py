@@ -13,17 +13,17 @@ from lidar_synth.labels.own import condition, generated, ignored, unlabelled
 from lidar_synth.labels.pseudo import pseudo
 
 LabelPolicy = Callable[[Scan, np.random.Generator], Scan]
-"""Sets the labels of a synthetic scan; it returns a new scan and never changes the one that it is given."""
+"""Sets the labels of a synthetic scan; it returns a new scan and never changes its input."""
 
 KINDS: dict[str, Callable[..., LabelPolicy]] = {"objects": objects, "polar": polar, "laser": laser}
-"""Kinds of ``mix``, built as policies are."""
+"""Builders of the kinds of ``mix``: ``(real, fields, **options) -> LabelPolicy``."""
 
 
 def mix(real: Source | None, fields: frozenset[str], kind: str = "objects", **options: Any) -> LabelPolicy:
-    """``mix``: parts of real scans, with their labels, set into the synthetic one.
+    """Make the policy ``mix``: labelled parts of real scans are inserted into the synthetic scan.
 
     Raises:
-        ConfigError: on an unknown kind or option, or one that the sources cannot serve.
+        ConfigError: on an unknown kind or option, or a kind that the sources cannot support.
     """
     if kind not in KINDS:
         raise ConfigError(f"labels='mix', kind={kind!r}", f"one of {', '.join(map(repr, KINDS))}")

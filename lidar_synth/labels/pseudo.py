@@ -1,4 +1,4 @@
-"""``pseudo``: labels by a teacher that looks at the finished scan."""
+"""``pseudo``: labels that a teacher predicts for the finished scan."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ Teacher = Callable[[Scan], Any]
 
 @dataclass(frozen=True)
 class Pseudo:
-    """A teacher's labels, ignored below a confidence.
+    """Labels predicted by a teacher; those below a minimum confidence are ignored.
 
     Args:
-        teacher: any callable; in DataLoader workers that are spawned it has to be picklable.
-        threshold: least confidence, 0 to 1.
+        teacher: any callable; it must be picklable if DataLoader workers are spawned.
+        threshold: minimum confidence, 0 to 1.
     """
 
     teacher: Teacher
@@ -58,7 +58,7 @@ class Pseudo:
 def pseudo(
     real: Source | None, fields: frozenset[str], teacher: Teacher | None = None, threshold: float = 0.9
 ) -> Pseudo:
-    """``pseudo``: what a teacher says, where it is sure.
+    """Make the policy ``pseudo``: a teacher's confident predictions.
 
     Raises:
         ConfigError: without a teacher, or on a threshold outside [0, 1].

@@ -1,4 +1,4 @@
-"""Who hides whom: what a sensor sees in each cell of its range image while objects are set in front of it."""
+"""Occlusion: the visible returns in each cell of a range image, as objects are added."""
 
 from dataclasses import dataclass
 
@@ -21,8 +21,8 @@ class VisibleReturns:
     Args:
         cell: (N,) row * W + column; -1 outside the sensor's range limits.
         range: (N,) metres.
-        seen: (N,) which of them are still seen.
-        total: how many would be if nothing else were there.
+        seen: (N,) True for returns that are still visible.
+        total: number of returns that would be visible without occlusion.
     """
 
     cell: NDArray[np.int32]
@@ -32,18 +32,18 @@ class VisibleReturns:
 
     @property
     def share(self) -> float:
-        """Of what would be seen, what is."""
+        """The share of returns that are still visible."""
         return float(self.seen.sum() / max(self.total, 1))
 
 
 class View:
-    """The range image of a scan into which objects come, best from near to far.
+    """The range image of a scan to which objects are added, preferably from near to far.
 
     Args:
         scan: N points.
 
     Attributes:
-        parts: what is seen of the scan and of each object that was added.
+        parts: the visible returns of the scan, and of each object that was added.
     """
 
     def __init__(self, scan: Scan) -> None:
@@ -54,17 +54,17 @@ class View:
         self._front = np.full(point.shape, np.inf, np.float32)
         self._height = np.zeros(point.shape, np.float32)
         height = scan.points[:, 2]
-        if scan.label is not None:  # what is known not to be ground hides also where it is low
+        if scan.label is not None:  # returns labelled as other classes than ground occlude at any height
             height = np.where(GROUND[scan.label] | (scan.label == IGNORE), height, np.float32(np.inf))
         self._front[~empty], self._height[~empty] = distance[point[~empty]], height[point[~empty]]
         _close_gaps(self._front, self._height)
 
     def add(self, placed: Object, least: int) -> bool:
-        """Sets an object into the view; False, and nothing changes, where fewer than ``least`` of it are seen."""
+        """Add an object to the view, or return False if fewer than ``least`` of its returns are visible."""
         cell, distance, shown = locate(placed.scan.points, self.sensor)
         nearest = shown[shown >= 0]
         row, column = np.divmod(cell[nearest], self.sensor.columns)
-        # A ground return at the height of the object's floor lies in front of what it stands on, not of the object.
+        # A return at the height of the object's floor belongs to the ground in front of it, and does not occlude it.
         stands = self._height[row, column] > placed.ground + FLOOR
         seen = ~(stands & (self._front[row, column] < distance[nearest]))
         if seen.sum() < least:
@@ -72,7 +72,7 @@ class View:
         outline = _outline(row, column, distance[nearest], self.sensor.columns)
         limit = np.full(self.sensor.shape, np.inf, np.float32)
         limit[outline[0], outline[1]] = outline[2]
-        limit[row[seen], column[seen]] = 0  # not even the ground just in front of it shares a cell with it
+        limit[row[seen], column[seen]] = 0  # no other return shares a cell with it, not even ground just in front
         for part in self.parts:
             part.seen &= (part.range <= limit.reshape(-1)[part.cell]) | (part.cell < 0)
         self._stand(*outline, top=placed.box[2] + placed.box[5] / 2)
@@ -90,10 +90,10 @@ class View:
 
 
 def refuse_coarser(given: Sensor, wanted: Sensor) -> None:
-    """What a sensor saw can be thinned to the grid of another, not filled up.
+    """Refuse returns of a sensor that is coarser than another: they can be thinned to its grid, but not densified.
 
     Raises:
-        DataError: where the given sensor has fewer rows per degree, or fewer columns, than the one that is wanted.
+        DataError: if the given sensor has fewer rows per degree, or fewer columns, than the wanted one.
     """
     rows = [s.shape[0] / (s.up - s.down) for s in (given, wanted)]
     if rows[0] < 0.9 * rows[1] or given.columns < 0.9 * wanted.columns:
@@ -104,7 +104,7 @@ def refuse_coarser(given: Sensor, wanted: Sensor) -> None:
 
 
 def _close_gaps(front: NDArray[np.float32], height: NDArray[np.float32]) -> None:
-    """Gives an empty cell (inf) between two returns, above and below or left and right, the farther of them."""
+    """Fill each empty cell (inf) between two returns, vertically or horizontally, with the farther one."""
     for axis in (0, 1):
         before, after = np.roll(front, 1, axis), np.roll(front, -1, axis)
         if axis == 0:
@@ -118,15 +118,15 @@ def _close_gaps(front: NDArray[np.float32], height: NDArray[np.float32]) -> None
 def _outline(
     row: NDArray[np.intp], column: NDArray[np.intp], depth: NDArray[np.float32], columns: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-    """All cells between an object's upper and lower returns, in the columns between its outermost ones.
+    """The cells of an object's outline: between its upper and lower returns, in all columns from its first to its last.
 
     Args:
-        row, column, depth: (n,) where its returns are, and their range.
-        columns: of a turn.
+        row, column, depth: (n,) cells and ranges of its returns.
+        columns: number of columns of the range image.
 
     Returns:
-        (m,) rows and columns, and the range of the object's nearest return in the column; in a column without one,
-        between those of the columns beside.
+        (m,) rows, columns, and ranges: that of the object's nearest return in the column, interpolated in columns
+        without returns.
     """
     middle = column[0]
     offset = (column - middle + columns // 2) % columns - columns // 2

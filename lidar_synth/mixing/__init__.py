@@ -1,4 +1,4 @@
-"""Real and synthetic scans in one torch dataset, at an exact ratio that nothing changes.
+"""Real and synthetic scans in one torch dataset, at an exact ratio.
 
 The plan of an epoch (plan.py) is a pure function of seed and epoch; datasets, batch sampler and stream follow it.
 """

@@ -1,4 +1,4 @@
-"""Batches of plain PyTorch items: points one after another with offsets, padded, or as range images."""
+"""Batches of plain PyTorch items: concatenated points with offsets, padded points, or range images."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,34 +17,34 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing.items import Item
 
 Form = Literal["offsets", "padded", "range"]
-"""How a batch holds its scans, see ``Collate``."""
+"""The layout of a batch, see ``Collate``."""
 
 Unlabelled = Literal["error", "allow"]
-"""What happens to a batch without one valid label: it is refused, or handed out."""
+"""Whether a batch without any valid label raises an error or is returned."""
 
 
 @dataclass(frozen=True)
 class Collate:
-    """Makes a batch of B items (a ``collate_fn``).
+    """A ``collate_fn`` that makes a batch of B items.
 
     Every batch has ``boxes`` (ΣM, 7) float32 with ``box_offsets`` (B + 1,) int64, ``names`` (B tuples), ``domain``
-    (B,) int64, ``id`` (B names), and by form:
+    (B,) int64 and ``id`` (B names). The other keys depend on the form:
 
-    - ``offsets``: ``points`` (ΣN, 4) float32, ``label`` (ΣN,) int64, ``confidence`` (ΣN,) float32 of all scans one
-      after another, ``offsets`` (B + 1,) int64: scan b is ``points[offsets[b]:offsets[b + 1]]``.
-    - ``padded``: ``points`` (B, N, 4), ``label`` (B, N), ``confidence`` (B, N), ``mask`` (B, N) bool where a point
-      is; elsewhere 0, label 255.
-    - ``range``: ``range`` (B, H, W) float32 metres, 0 = no return, ``reflectance``, ``label`` int64, ``confidence``
-      (B, H, W) of the nearest returns, ``mask`` (B, H, W) bool where there is one.
+    - ``offsets``: ``points`` (ΣN, 4) float32, ``label`` (ΣN,) int64, ``confidence`` (ΣN,) float32, the concatenation
+      of all scans; ``offsets`` (B + 1,) int64: scan b is ``points[offsets[b]:offsets[b + 1]]``.
+    - ``padded``: ``points`` (B, N, 4), ``label`` (B, N), ``confidence`` (B, N), and ``mask`` (B, N) bool, True for
+      points; padding is 0, with label 255.
+    - ``range``: ``range`` (B, H, W) float32 metres, 0 = no return; ``reflectance``, ``label`` int64, ``confidence``
+      (B, H, W) of the nearest returns; ``mask`` (B, H, W) bool, True for cells with a return.
 
     Args:
         form: one of these.
-        sensor: whose grid range images have.
-        unlabelled: what to do with a batch without one valid label and without a box. A mean over no label is NaN,
-            which one optimiser step spreads over all weights.
+        sensor: defines the grid of range images.
+        unlabelled: ``"error"`` refuses a batch that has neither a valid label nor a box, ``"allow"`` returns it. The
+            mean loss over no label is NaN, and one optimiser step with it makes all weights NaN.
 
     Raises:
-        ConfigError: on another form, or no sensor for range images.
+        ConfigError: on an unknown form, or no sensor for range images.
     """
 
     form: Form = "offsets"
@@ -56,13 +56,13 @@ class Collate:
             if getattr(self, name) not in get_args(kind):
                 raise ConfigError(f"{name}={getattr(self, name)!r} of batches", f"one of {get_args(kind)}")
         if self.form == "range" and self.sensor is None:
-            raise ConfigError("range images without a sensor", "a sensor, whose grid they have")
+            raise ConfigError("range images without a sensor", "a sensor, which defines their grid")
 
     def __call__(self, items: Sequence[Item]) -> dict[str, Any]:
-        """The batch.
+        """Make a batch of the items.
 
         Raises:
-            DataError: where no item has a valid label or a box.
+            DataError: if no item has a valid label or a box.
         """
         boxes = [item["boxes"] for item in items]
         batch = _FORMS[self.form](items, self.sensor) | {
@@ -74,8 +74,8 @@ class Collate:
         }
         if self.unlabelled == "error" and not len(batch["boxes"]) and not bool((batch["label"] != IGNORE).any()):
             raise DataError(
-                f"a batch without one valid label or box (scans {batch['id'][:4]})",
-                "at least one, or the loss is NaN",
+                f"a batch without any valid label or box (scans {batch['id'][:4]})",
+                "at least one, because the loss over no label is NaN",
                 "Use larger batches with balanced=True, so that each holds labelled scans; labels='generated' or "
                 "another policy that gives labels; labels='none' for an unlabelled pool; or unlabelled='allow' and "
                 "skip such batches in the training loop.",
@@ -131,5 +131,5 @@ def _columns(items: Sequence[Item]) -> tuple[list[Tensor], list[Tensor], list[Te
 
 
 def _offsets(parts: Sequence[Tensor]) -> Tensor:
-    """(B + 1,) int64, where each part begins and the last one ends."""
+    """(B + 1,) int64, the start of each part, and the end of the last."""
     return torch.tensor([0, *(len(part) for part in parts)]).cumsum(0)

@@ -1,7 +1,7 @@
-"""Whether synthetic samples have the form of a trainer's real ones: one of each is compared before training.
+"""Comparison of a synthetic sample with a real one of a trainer's dataset, before training.
 
-What a collate function makes of samples that differ is its own affair, and silent at times: torch's takes the keys of
-a batch's first sample and drops what the others have beside them.
+A collate function may silently accept samples of different forms: torch's takes the keys of a batch's first sample and
+drops all other keys of the others.
 """
 
 import logging
@@ -28,67 +28,67 @@ from lidar_synth.noise import keyed_rng
 log = logging.getLogger(__name__)
 
 DEPTH = 5
-"""Containers within containers that are looked into."""
+"""Maximum depth of nested containers that are compared."""
 
 PARTS = 64
-"""Parts of a sequence that are looked at."""
+"""Maximum number of elements of a sequence that are compared."""
 
 FEW = 64
-"""Different values that an array of labels holds at most."""
+"""Maximum number of different values in an array of labels."""
 
-LOOKED_AT = 8
-"""Real samples that may be asked for a value before it is called strange."""
+SEARCHED = 8
+"""Number of real samples that are searched for a value before it is reported."""
 
 LABELS = re.compile("label|seg|sem|class|target", re.IGNORECASE)
-"""Names of arrays of labels."""
+"""Matches the names of arrays of labels."""
 
 USUAL_IGNORE = (-100, -1, 254, 255, 65535)
-"""What stands for "ignore" in common trainers, where an array's name does not say that it holds labels."""
+"""Labels that mean "ignore" in common trainers, for arrays whose name does not match ``LABELS``."""
 
 
 def check_alike(
     real: Sequence[Any], synthetic: Sequence[Synthetic], finish: Callable[[int, Scan, np.random.Generator], Any]
 ) -> None:
-    """Compare a trainer's first sample with a synthetic one of each source.
+    """Compare a trainer's first sample with one synthetic sample of each source.
 
-    The state of Python's, numpy's and torch's global generators is kept. A bank or held scans give their first scan;
-    in place of a generator or a rolling bank, which would have to start, stands a made-up scan with the same fields.
-    Where either sample cannot be had, nothing is compared, and the log says so.
+    The state of Python's, numpy's and torch's global random generators is preserved. Banks and existing scans are
+    represented by their first scan; a generator or a rolling bank, which would have to start first, by a made-up scan
+    with the same fields. If either sample cannot be read, nothing is compared, and a warning is logged.
 
     Args:
-        real: the trainer's datasets; the first sample of the first one is taken.
+        real: the trainer's datasets; the first sample of the first one is used.
         synthetic: the sources.
         finish: ``(source, scan, rng) -> sample``, what the mixture does to a scan of a source.
 
     Raises:
-        ConfigError: where keys, types, dtypes, ranks or what stands for "ignore" differ.
+        ConfigError: if keys, types, dtypes, ranks or the value for "ignore" differ.
     """
     if not real or not synthetic:
         return
     dataset = real[0]
-    with _generators_kept():
+    with _preserved_generators():
         expected = _try("real", dataset.__getitem__, 0)
         for number, source in enumerate(synthetic):
-            given = _try("synthetic", lambda n, s: finish(n, _scan_of(s), keyed_rng(0)), number, source)
-            if expected is None or given is None:
+            sample = _try("synthetic", lambda n, s: finish(n, _scan_of(s), keyed_rng(0)), number, source)
+            if expected is None or sample is None:
                 continue
-            wrong = [*differences(expected, given), *_strange_values(dataset, expected, given)]
+            wrong = [*differences(expected, sample), *_unknown_values(dataset, expected, sample)]
             if wrong:
                 raise ConfigError(
                     f"synthetic samples unlike the real ones: {'; '.join(wrong[:4])}",
                     "the same keys, types, dtypes and ranks, and one value for ignored labels",
-                    "Change to_sample, or pass compare=False where the collate function wants them to differ.",
+                    "Change to_sample, or pass compare=False if the collate function expects them to differ.",
                 )
 
 
 def differences(real: Any, synthetic: Any, place: str = "sample", depth: int = DEPTH) -> Iterator[str]:
-    """What a synthetic sample has otherwise than a real one, in words; lengths may differ, and None is like anything.
+    """Describe how a synthetic sample differs from a real one; lengths may differ, and None matches anything.
 
     Args:
-        real, synthetic: what two datasets give: mappings, sequences, tensors, arrays, numbers, text, or objects, whose
-            attributes that hold arrays count.
-        place: where in the sample they stand.
-        depth: containers to look into.
+        real, synthetic: two samples: mappings, sequences, tensors, arrays, numbers, text, or objects, of which the
+            attributes that hold arrays are compared.
+        place: name of these values within the sample.
+        depth: levels of nested containers to compare.
     """
     if real is None or synthetic is None or depth == 0:
         return
@@ -116,7 +116,7 @@ def differences(real: Any, synthetic: Any, place: str = "sample", depth: int = D
 
 
 def _kind(value: Any) -> str:
-    """What has to be the same of two values, in words."""
+    """The type of a value in words, with dtype and rank for arrays; it must be the same for two values."""
     if isinstance(value, torch.Tensor):
         return f"a tensor of {str(value.dtype).removeprefix('torch.')}, rank {value.ndim}"
     if isinstance(value, np.ndarray) and value.dtype.kind not in "OSU":
@@ -136,28 +136,26 @@ def _is_array(value: Any) -> bool:
 
 def _parts(value: Any) -> dict[str, Any]:
     """The attributes of an object that may hold arrays."""
-    held = getattr(value, "__dict__", {})
-    return {
-        k: v for k, v in held.items() if _is_array(v) or isinstance(v, Mapping | list | tuple) or hasattr(v, "__dict__")
-    }
+    members = getattr(value, "__dict__", {}).items()
+    return {k: v for k, v in members if _is_array(v) or isinstance(v, Mapping | list | tuple) or hasattr(v, "__dict__")}
 
 
-def _strange_values(dataset: Any, real: Any, synthetic: Any) -> Iterator[str]:
-    """Values in a synthetic sample's labels that no real sample looked at has and that are no class."""
-    shown, given = dict(_labels(real)), dict(_labels(synthetic))
-    for place in [p for p in given if p in shown]:
-        known = shown[place]
-        strange = _no_classes(place, given[place], known)
-        for other in range(1, min(len(dataset), LOOKED_AT) if strange else 0):
+def _unknown_values(dataset: Any, real: Any, synthetic: Any) -> Iterator[str]:
+    """Describe label values of a synthetic sample that are no class and occur in none of the searched real samples."""
+    real_labels, labels = dict(_labels(real)), dict(_labels(synthetic))
+    for place in [p for p in labels if p in real_labels]:
+        known = real_labels[place]
+        unknown = _not_classes(place, labels[place], known)
+        for other in range(1, min(len(dataset), SEARCHED) if unknown else 0):
             known = known | dict(_labels(_try("real", dataset.__getitem__, other))).get(place, set())
-            strange = _no_classes(place, strange, known)
-        if strange:
-            values = ", ".join(map(str, sorted(strange)[:4]))
-            yield f"{place} holds {values}, and none of the real ones does ({min(known)} to {max(known)})"
+            unknown = _not_classes(place, unknown, known)
+        if unknown:
+            values = ", ".join(map(str, sorted(unknown)[:4]))
+            yield f"{place} holds {values}, which no real sample does ({min(known)} to {max(known)})"
 
 
-def _no_classes(place: str, values: set[int], known: set[int]) -> set[int]:
-    """Those of the values that stand for "ignore", or for nothing, where real labels have the known ones."""
+def _not_classes(place: str, values: set[int], known: set[int]) -> set[int]:
+    """The values that cannot be classes, given the known values of real labels: "ignore", or out of range."""
     if not LABELS.search(place) or "inst" in place.lower():
         return {v for v in values - known if v in USUAL_IGNORE}
     low, high = min(0, *known), max(len(NAMES) + 1, *known)
@@ -165,45 +163,45 @@ def _no_classes(place: str, values: set[int], known: set[int]) -> set[int]:
 
 
 def _labels(value: Any, place: str = "sample", depth: int = DEPTH) -> Iterator[tuple[str, set[int]]]:
-    """(place, values) of the arrays of integers that can be labels: few different ones."""
+    """(place, values) of the integer arrays with few different values, which may be labels."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray):
         if value.ndim and value.dtype.kind in "iu" and 0 < len(values := np.unique(value)) <= FEW:
             yield place, set(values.tolist())
     elif depth and isinstance(value, Mapping):
-        for key, held in value.items():
-            yield from _labels(held, f"{place}[{key!r}]", depth - 1)
+        for key, part in value.items():
+            yield from _labels(part, f"{place}[{key!r}]", depth - 1)
     elif depth and isinstance(value, list | tuple):
-        for i, held in enumerate(value[:PARTS]):
-            yield from _labels(held, f"{place}[{i}]", depth - 1)
+        for i, part in enumerate(value[:PARTS]):
+            yield from _labels(part, f"{place}[{i}]", depth - 1)
     elif depth:
-        for name, held in _parts(value).items():
-            yield from _labels(held, f"{place}.{name}", depth - 1)
+        for name, part in _parts(value).items():
+            yield from _labels(part, f"{place}.{name}", depth - 1)
 
 
 def _try(kind: str, fetch: Callable[..., Any], *which: Any) -> Any:
-    """A sample, or None where it cannot be had: training will meet the reason, and some datasets pass over it."""
+    """A sample, or None if it cannot be read: training will raise the same error, or the dataset may skip it."""
     try:
         return fetch(*which)
-    except Exception as error:  # a trainer's own code: anything may come
+    except Exception as error:  # a trainer's own code may raise anything
         log.warning("real and synthetic samples are not compared: no %s sample (%r)", kind, error)
         return None
 
 
 def _scan_of(source: Synthetic) -> Scan:
-    """A scan of a source, or one like it where making it takes long or counts."""
+    """The first scan of a source, or a made-up one if the source generates scans on demand."""
     if isinstance(source, Generated) or hasattr(source, "expect"):
         return made_up(source.sensor, source.fields)
     return source[0]
 
 
 def made_up(sensor: Sensor, fields: frozenset[str]) -> Scan:
-    """A scan of level ground with all labels on it, for what looks at a scan's form.
+    """A scan of level ground with random labels, for checks of a scan's form.
 
     Args:
-        sensor: whose grid.
-        fields: which of ``POINT_FIELDS`` it has.
+        sensor: defines the grid.
+        fields: the fields of ``POINT_FIELDS`` that the scan has.
     """
     rng, (rows, columns) = keyed_rng(0), sensor.shape
     down = np.sin(np.maximum(-sensor.row_elevations(), 0.02))[:, None]
@@ -226,9 +224,9 @@ def made_up(sensor: Sensor, fields: frozenset[str]) -> Scan:
 
 
 @contextmanager
-def _generators_kept() -> Iterator[None]:
-    """Leave the global generators of Python, numpy and torch as they were."""
-    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 - what a trainer draws from
+def _preserved_generators() -> Iterator[None]:
+    """Restore the global random generators of Python, numpy and torch afterwards."""
+    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 - the generator that trainers use
     devices = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []  # type: ignore[no-untyped-call]
     with torch.random.fork_rng(devices):
         try:

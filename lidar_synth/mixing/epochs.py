@@ -1,8 +1,8 @@
-"""Which epoch a sample belongs to: that in which iterating began, whatever ``set_epoch`` says meanwhile.
+"""The epoch of a sample: the one in which iteration began, even if ``set_epoch`` was called since.
 
-``MixedBatches`` gives positions that carry their epoch. Other samplers give plain integers, which belong to the epoch
-that the dataset is set to. DataLoader workers fetch ahead, so that an epoch that is set after ``iter(loader)`` would
-mix two epochs: some scans would come twice and others never. That raises.
+``MixedBatches`` yields positions that carry their epoch. Other samplers yield plain integers, which refer to the
+dataset's current epoch. DataLoader workers fetch ahead, so that ``set_epoch`` after ``iter(loader)`` would mix two
+epochs: some scans would come twice and others never. Such a call therefore raises an error.
 """
 
 import os
@@ -20,41 +20,41 @@ from torch.utils.data._utils.fetch import _MapDatasetFetcher
 from lidar_synth.errors import ConfigError
 
 REPEATED = (
-    "epoch {} begins once more: the same scans in the same order as before. Call set_epoch(epoch) before each pass."
+    "epoch {} begins again, with the same scans in the same order as before. Call set_epoch(epoch) before each pass."
 )
 
 SHARED_TWICE = (
-    "of {} samples that rank {} of {} was to train on, {} were fetched. Does another library share the batches among "
-    "processes once more? Then give batches(...) rank=0, world_size=1."
+    "of {} samples for rank {} of {}, only {} were fetched. Another library may divide the batches among the processes "
+    "a second time; if so, call batches(...) with rank=0, world_size=1."
 )
 
-_COUNTERS = 256  # each worker has one of its own, so that none of them has to wait
+_COUNTERS = 256  # one counter for each worker, so that none has to wait for another
 
 
 class Position(int):
-    """A position that knows its epoch; everywhere else a plain integer.
+    """An integer position with the attribute ``epoch``.
 
     Args:
         position: 0 <= position < length of the epoch.
-        epoch: it belongs to.
+        epoch: the epoch to which the position refers.
     """
 
     epoch: int
 
     def __new__(cls, position: int, epoch: int) -> "Position":
-        """An integer with an attribute."""
-        made = super().__new__(cls, position)
-        made.epoch = epoch
-        return made
+        """Create the integer and set its epoch."""
+        self = super().__new__(cls, position)
+        self.epoch = epoch
+        return self
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Position, (int(self), self.epoch)
 
 
 def shared_integers(*values: int) -> Tensor:
-    """(n,) int64 that DataLoader workers see change, forked, spawned and persistent ones alike.
+    """(n,) int64 in shared memory, so that all DataLoader workers see changes: forked, spawned and persistent ones.
 
-    A plain attribute would not do: persistent workers keep their copy of the dataset from when they started.
+    A plain attribute does not work, because persistent workers keep the copy of the dataset with which they started.
     """
     tensor = torch.tensor(values, dtype=torch.int64)
     tensor.share_memory_()  # type: ignore[no-untyped-call]
@@ -62,44 +62,44 @@ def shared_integers(*values: int) -> Tensor:
 
 
 class CurrentEpoch:
-    """The epoch that a dataset is set to, for all its processes, and those in which passes over it began."""
+    """The current epoch of a dataset in all its processes, and the epochs in which passes over it began."""
 
     def __init__(self) -> None:
-        self._shared = shared_integers(0, -1, 0)  # the epoch; that of the latest pass; whether a warning was given
-        self._fetched = shared_integers(*[0] * _COUNTERS)  # positions that were fetched, by worker
-        self._own = 0  # as this process set it, or as it was when this process started
+        self._shared = shared_integers(0, -1, 0)  # current epoch; epoch of the latest pass; 1 once it has warned
+        self._fetched = shared_integers(*[0] * _COUNTERS)  # number of positions fetched, by worker
+        self._own = 0  # the epoch that this process set, or the current epoch when this process started
         self._process = os.getpid()
-        self._passes: WeakKeyDictionary[Any, int] = WeakKeyDictionary()  # by what fetches: the epoch
+        self._passes: WeakKeyDictionary[Any, int] = WeakKeyDictionary()  # {fetcher: epoch of its pass}
 
     def __int__(self) -> int:
         return int(self._shared[0])
 
     @property
     def fetched(self) -> int:
-        """How many positions with an epoch were fetched so far, by all workers."""
+        """Number of positions with an epoch that all workers together have fetched."""
         return int(self._fetched.sum())
 
     @property
     def at_start(self) -> int:
-        """The epoch when this process started, where it has not set another: in a worker, when ``iter`` was called."""
+        """The epoch that this process set, or that was current when it started: for a worker, at ``iter(loader)``."""
         return self._own
 
     def set(self, epoch: int) -> None:
-        """For all processes."""
+        """Set the epoch for all processes."""
         self._shared[0], self._own = epoch, epoch
 
     def of(self, index: int) -> int:
-        """The epoch of an index that is fetched.
+        """The epoch of an index that is being fetched.
 
         Raises:
-            ConfigError: where another epoch was set since the pass of the DataLoader that fetches it began.
+            ConfigError: if another epoch was set since the DataLoader's pass began.
         """
         if isinstance(index, Position):
             worker = get_worker_info()
             self._fetched[worker.id % _COUNTERS if worker else 0] += 1
             return index.epoch
         epoch, fetcher = int(self), _running_fetcher()
-        if fetcher is None:  # nobody's pass
+        if fetcher is None:  # not within a DataLoader's pass
             return epoch
         forked = self._process != os.getpid()
         if forked:
@@ -112,7 +112,7 @@ class CurrentEpoch:
         return epoch
 
     def note_pass(self, epoch: int) -> None:
-        """A pass begins; where the one before was of the same epoch, warn once. The first worker speaks for all."""
+        """Note that a pass begins, and warn once if the pass before had the same epoch; only worker 0 does this."""
         worker = get_worker_info()
         if worker is not None and worker.id > 0:
             return
@@ -122,7 +122,7 @@ class CurrentEpoch:
         self._shared[1] = epoch
 
     def forget_pass(self) -> None:
-        """What begins next is no repetition: it goes on where a state says."""
+        """Forget the latest pass: the next one resumes from a state and is not a repetition."""
         self._shared[1] = -1
 
     def __getstate__(self) -> dict[str, Any]:
@@ -133,22 +133,22 @@ class CurrentEpoch:
 
 
 def check_pass(begun: int, epoch: int) -> None:
-    """Refuse an epoch that was set while a DataLoader was going through another.
+    """Refuse an epoch that was set while a DataLoader iterated over another one.
 
     Raises:
-        ConfigError: where they differ.
+        ConfigError: if they differ.
     """
     if begun != epoch:
         raise ConfigError(
-            f"set_epoch({epoch}) while a DataLoader was going through epoch {begun}",
+            f"set_epoch({epoch}) while a DataLoader was iterating over epoch {begun}",
             "set_epoch before iter(loader), as the workers fetch ahead",
-            "Call set_epoch before the loop over the loader. Where a trainer's hook comes later, give the DataLoader "
-            "batch_sampler=train.batches(batch_size): its batches keep the epoch in which iterating began.",
+            "Call set_epoch before the loop over the loader. If a trainer's hook runs later, pass the DataLoader "
+            "batch_sampler=train.batches(batch_size): its batches keep the epoch in which iteration began.",
         )
 
 
 def _running_fetcher() -> Any:
-    """What fetches for the DataLoader that asks right now: torch makes one for each pass, in each process."""
+    """The fetcher of the DataLoader on the call stack, or None: torch makes one for each pass in each process."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
         if frame.f_code is _MapDatasetFetcher.fetch.__code__:

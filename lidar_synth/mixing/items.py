@@ -1,4 +1,4 @@
-"""The plain PyTorch item: what a sample is where no trainer wants another shape."""
+"""The plain PyTorch item, the default form of a sample."""
 
 from typing import Any, TypedDict
 
@@ -12,14 +12,14 @@ from lidar_synth.geometry.scan import Scan
 
 
 class Item(TypedDict):
-    """One sample; the same keys in every one, and memory of its own.
+    """One sample. All items have the same keys, and their tensors share no memory with the scan.
 
     Keys:
         points: (N, 4) float32 x, y, z in metres, sensor frame, and reflectance in [0, 1].
-        label: (N,) int64 train ids 0..18, 255 = ignore, also where the scan has no labels.
-        confidence: (N,) float32 in [0, 1], trust in ``label``; without one of the scan's own, 1 where there is a label.
+        label: (N,) int64 train ids 0..18; 255 = ignore, or the scan has no labels.
+        confidence: (N,) float32 in [0, 1] of ``label``; if the scan has none, 1 for every labelled point.
         boxes: (M, 7) float32 x, y, z of the centre of gravity, l, w, h in metres, yaw in radians; M = 0 without boxes.
-        names: M class names as KITTI spells them.
+        names: M class names in KITTI's spelling.
         domain: 0 real, 1 synthetic.
         id: the scan's name.
     """
@@ -34,14 +34,14 @@ class Item(TypedDict):
 
 
 def to_item(scan: Scan, rng: np.random.Generator) -> Item:
-    """A scan as a plain PyTorch item; nothing is drawn.
+    """Convert a scan to a plain PyTorch item.
 
     Args:
         scan: N points.
         rng: not used; every ``to_sample(scan, rng)`` gets one.
 
     Raises:
-        DataError: on a label that is no train id.
+        DataError: on a label that is not a train id.
     """
     points = np.empty((len(scan), 4), np.float32)
     for column, values in enumerate((*scan.points.T, scan.reflectance)):  # numpy is slow at rows of three
@@ -55,8 +55,8 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
             raise DataError(f"scan {scan.id!r}: labels {np.unique(label[wrong])[:8].tolist()}",
                             f"train ids 0..{len(NAMES) - 1}, or {IGNORE} = ignore",
                             "Map the dataset's own ids when they are read (Taxonomy.decode).")  # fmt: skip
-    given = scan.confidence
-    confidence = (label != IGNORE).astype(np.float32) if given is None else np.array(given, np.float32)
+    own = scan.confidence
+    confidence = (label != IGNORE).astype(np.float32) if own is None else np.array(own, np.float32)
     boxes: Any = np.empty((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()
     return {
         "points": torch.from_numpy(points),

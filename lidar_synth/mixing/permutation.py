@@ -1,10 +1,9 @@
-"""A random order of any length whose entries are computed one by one, without the others.
+"""Random permutations of any length whose entries are computed independently, in constant memory.
 
-``permute`` is a Feistel network over the cells of a grid that holds barely more cells than there are entries (Black and
-Rogaway, "Ciphers with arbitrary finite domains", CT-RSA 2002): each round shifts a cell's row by a keyed hash of its
-column, or its column by a hash of its row, so that every round is a bijection. An entry that leaves the range goes
-through the network again until it is back ("cycle walking"), which is a bijection too. Memory does not depend on the
-length.
+``permute`` is a Feistel network over a grid with barely more cells than entries (Black and Rogaway, "Ciphers with
+arbitrary finite domains", CT-RSA 2002). Each round shifts a cell's row by a keyed hash of its column, or its column by
+a hash of its row, so that every round is a bijection. An entry that leaves the range passes through the network again
+until it is back in range ("cycle walking"), which keeps the map a bijection.
 """
 
 from functools import lru_cache
@@ -21,14 +20,15 @@ _ROUNDS = 10  # with fewer, the orders of a handful of entries are not equally f
 def permute(
     entries: NDArray[np.int64], size: int, seed: int, stream: int, number: int | NDArray[np.int64] = 0
 ) -> NDArray[np.int64]:
-    """Where the entries of 0 .. size - 1 stand in an order of them all.
+    """Apply a keyed permutation of 0 .. size - 1 to some of its entries.
 
     Args:
         entries: (N,), 0 <= entry < size.
-        size: length of the order, below 2^62.
+        size: length of the permutation, below 2^62.
         seed: 0 <= seed < 2^64.
-        stream: keeps orders of different use apart, 0 <= stream < 2^63.
-        number: of the order, such as an epoch; one, or (N,) for each entry its own. The orders are independent.
+        stream: separates permutations of different use, 0 <= stream < 2^63.
+        number: number of the permutation, such as an epoch; one for all entries, or (N,). Permutations of different
+            numbers are independent.
 
     Returns:
         (N,) 0 <= place < size; a bijection of the entries for each (size, seed, stream, number), the same on every
@@ -47,7 +47,7 @@ def permute(
 def _once(
     cells: NDArray[np.uint64], size: int, keys: NDArray[np.uint64], order: NDArray[np.uint64]
 ) -> NDArray[np.uint64]:
-    """All rounds of the network once, over a grid of at least ``size`` cells."""
+    """One pass through all rounds of the network, over a grid of at least ``size`` cells."""
     rows = isqrt(size - 1) + 1
     columns = -(-size // rows)
     row, column = cells // np.uint64(columns), cells % np.uint64(columns)
@@ -60,13 +60,13 @@ def _once(
 
 
 def _shifted(places: NDArray[np.uint64], size: int, keyed: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Each of 0 .. size - 1, size < 2^32, moved on by a hash of its keyed value, round about."""
+    """Each place, 0 .. size - 1 with size < 2^32, shifted cyclically by a hash of its keyed value."""
     moved: NDArray[np.uint64] = places + ((_mixed(keyed) >> np.uint64(32)) * np.uint64(size) >> np.uint64(32))
     return moved - (moved >= size) * np.uint64(size)
 
 
 def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """SplitMix64's finaliser: every bit of a value changes about half of the result's. Products wrap."""
+    """SplitMix64's finaliser: flipping one input bit flips about half of the output bits. Products wrap."""
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     mixed: NDArray[np.uint64] = values ^ (values >> np.uint64(31))
@@ -75,5 +75,5 @@ def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 @lru_cache(256)
 def _keys(seed: int, stream: int) -> NDArray[np.uint64]:
-    """A key for each round and one for the order's number."""
+    """One key for each round, and one for the permutation's number."""
     return key_words(seed, stream, _ROUNDS + 1)

@@ -1,13 +1,13 @@
-"""Which sample stands where: the plan of an epoch as a pure function of the mixture and the epoch.
+"""The plan of an epoch: which sample is at which position, as a pure function of the mixture and the epoch.
 
-Nothing is drawn at random along the way and nothing is stored: what stands at a position is computed from the position,
-so that a plan of any length takes the same memory, and workers, ranks, batch size and resumption cannot change it.
+The sample at a position is computed from the position alone. A plan of any length therefore takes the same memory, and
+workers, ranks, batch size and resumption cannot change it.
 
-A position leads to a *rank* by an order keyed by (seed, epoch); ranks are divided among the sources in turn, by their
-quotas (quotas.py). Within its source, a sample's running number counts over all epochs. Real scans follow one another
-through endless permutations of their source: after any number of epochs each was given equally often, up to one.
-Synthetic scans are counted up, so that they are fresh. With ``reuse = k`` they come in laps, as long as an epoch at its
-most, and every lap is given k times before the next: the k times fall into k epochs.
+A permutation keyed by (seed, epoch) maps a position to a *rank*; the ranks are divided among the sources in order, by
+their quotas (quotas.py). Within its source, a sample has a running number that counts over all epochs. Real sources are
+permuted again each time they are exhausted: after any number of epochs, the numbers of uses of two real scans differ
+by at most one. Synthetic scans are numbered upwards, so that each is new. With ``reuse = k`` they come in laps whose
+length is the largest number that an epoch takes; every lap comes k times, in k epochs, before the next lap begins.
 """
 
 import hashlib
@@ -25,26 +25,26 @@ from lidar_synth.mixing.quotas import Mixture, PlannedSource, deal, quotas, runn
 from lidar_synth.mixing.schedules import share_of
 
 VERSION = "lidar-synth-plan/2"
-"""PlannedSource of every plan's hash; changes when the same mixture gives another order."""
+"""Part of every plan's hash; changes when the same mixture gives another order."""
 
-_ORDER, _REALS, _SOURCES = range(3)  # streams of the permutations; each source has one of its own
-_BLOCK = 256  # positions that are computed together: most are asked for one after another
-_BLOCKS = 8  # blocks that are kept
+_ORDER, _REALS, _SOURCES = range(3)  # streams of the permutations; each source has its own
+_BLOCK = 256  # number of positions computed together, as most are accessed in order
+_BLOCKS = 8  # number of blocks in the cache
 
 
 @dataclass(frozen=True)
 class MixingPlan:
-    """An epoch: what stands at each of its N positions.
+    """The samples at the N positions of an epoch.
 
-    ``plan[position]`` is the number of the source (the real ones in order, then the synthetic ones) and the local index
-    in it. ``plan.at(positions)`` gives both for many at once.
+    ``plan[position]`` is the number of the source (real sources in order, then synthetic ones) and the local index
+    within it. ``plan.at(positions)`` returns both for many positions at once.
 
     Args:
-        mixture: of sources.
+        mixture: the sources and the settings.
         epoch: 0 <= epoch < 2^40.
 
     Raises:
-        ConfigError: on an epoch for which there is no ratio, or none that the sources can serve.
+        ConfigError: on an epoch without a ratio, or with one that the sources cannot serve.
     """
 
     mixture: Mixture
@@ -55,45 +55,45 @@ class MixingPlan:
 
     @cached_property
     def counts(self) -> tuple[int, ...]:
-        """Samples of each source."""
+        """Number of samples from each source."""
         return quotas(self.mixture, self.epoch)
 
     @cached_property
     def before(self) -> tuple[int, ...]:
-        """Samples of each source in all earlier epochs together."""
+        """Number of samples from each source in all earlier epochs together."""
         return running_counts(self.mixture, self.epoch)
 
     @property
     def reals(self) -> int:
-        """How many real sources there are."""
+        """Number of real sources."""
         return len(self.mixture.real)
 
     @property
     def synthetics(self) -> int:
-        """How many samples are synthetic."""
+        """Number of synthetic samples."""
         return sum(self.counts[self.reals :])
 
     def __len__(self) -> int:
         return self._total
 
     def __getitem__(self, position: int) -> tuple[int, int]:
-        """Source and local index.
+        """The source and the local index of the sample at a position.
 
         Raises:
-            IndexError: where the epoch has no such position.
+            IndexError: if the epoch has no such position.
         """
         if not 0 <= position < len(self):
             raise IndexError(f"position {position} of {len(self)}")
         block, offset = divmod(int(position), _BLOCK)
-        if (found := self._kept.get(block)) is None:
-            found = self.at(np.arange(block * _BLOCK, min((block + 1) * _BLOCK, len(self))))
-            if len(self._kept) >= _BLOCKS:
-                self._kept.clear()
-            self._kept[block] = found
-        return int(found[0][offset]), int(found[1][offset])
+        if (entries := self._cache.get(block)) is None:
+            entries = self.at(np.arange(block * _BLOCK, min((block + 1) * _BLOCK, len(self))))
+            if len(self._cache) >= _BLOCKS:
+                self._cache.clear()
+            self._cache[block] = entries
+        return int(entries[0][offset]), int(entries[1][offset])
 
     def at(self, positions: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Sources and local indices of (N,) positions, 0 <= position < length; (N,) each."""
+        """The sources and local indices, (N,) each, of (N,) positions, 0 <= position < length."""
         rank = self._balanced(positions) if self.mixture.balanced else self._shuffled(positions)
         source = np.searchsorted(np.cumsum(self.counts), rank, side="right")
         number = (np.array(self.before, np.int64) - self._starts)[source] + rank
@@ -105,23 +105,23 @@ class MixingPlan:
 
     @property
     def source(self) -> NDArray[np.int64]:
-        """(N,) the source of every position; this and the next two are computed when they are asked for."""
+        """(N,) the source at every position, computed on access."""
         return self.at(np.arange(len(self)))[0]
 
     @property
     def index(self) -> NDArray[np.int64]:
-        """(N,) the local index of every position."""
+        """(N,) the local index at every position, computed on access."""
         return self.at(np.arange(len(self)))[1]
 
     @property
     def domain(self) -> NDArray[np.bool_]:
-        """(N,) where a synthetic sample stands."""
+        """(N,) True at the positions of synthetic samples, computed on access."""
         synthetic: NDArray[np.bool_] = self.source >= self.reals
         return synthetic
 
     @cached_property
     def facts(self) -> dict[str, Any]:
-        """All that the plan follows from, in values that JSON knows."""
+        """Everything that determines the plan, in JSON types."""
         mixture = self.mixture
         return {
             "order": VERSION,
@@ -131,8 +131,8 @@ class MixingPlan:
             "epoch_size": mixture.epoch_size,
             "reuse": mixture.reuse,
             "balanced": mixture.balanced,
-            "real": [_facts_of(part) for part in mixture.real],
-            "synthetic": [_facts_of(part) for part in mixture.synthetic],
+            "real": [_facts_of(source) for source in mixture.real],
+            "synthetic": [_facts_of(source) for source in mixture.synthetic],
             "samples": list(self.counts),
             "samples before": list(self.before),
             "synthetic before": str(synthetic_before(mixture, self.epoch)),
@@ -141,7 +141,7 @@ class MixingPlan:
 
     @cached_property
     def hash(self) -> str:
-        """sha256 of ``facts``, in hexadecimal."""
+        """SHA-256 of ``facts``, as hexadecimal digits."""
         return hashlib.sha256(json.dumps(self.facts, sort_keys=True).encode()).hexdigest()
 
     @cached_property
@@ -155,14 +155,14 @@ class MixingPlan:
         return starts
 
     @cached_property
-    def _kept(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def _cache(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]]:
         return {}
 
     def _shuffled(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
         return permute(positions, len(self), self.mixture.seed, _ORDER, self.epoch)
 
     def _balanced(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Ranks where synthetic samples are spread evenly, and the sources among them."""
+        """Ranks with synthetic samples spread evenly over the epoch, and synthetic sources among them."""
         before, after = self._synthetic_up_to(positions), self._synthetic_up_to(positions + 1)
         synthetic, seed = after > before, self.mixture.seed
         rank = np.empty(len(positions), np.int64)
@@ -180,33 +180,32 @@ class MixingPlan:
         return rank
 
     def _synthetic_up_to(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
-        """How many of the first samples of the epoch are synthetic: the exact number over all epochs, rounded up.
+        """Number of synthetic samples among the first ``positions`` of the epoch: the exact number, rounded up.
 
-        At the epoch's end this is its quota: where n synthetic samples were asked for and n + d given, the exact
-        number there is between those at the epoch's beginning and end, each rounded up with less than 1 to spare.
+        The exact number counts from the first epoch on, so that at the end of an epoch the result equals its quota.
         """
         p, q = share_of(self.mixture.ratio, self.epoch).as_integer_ratio()
         exact = synthetic_before(self.mixture, self.epoch)
-        ahead = floor((ceil(exact) - exact) * q)  # what was rounded up so far, in units of 1 / q
+        ahead = floor((ceil(exact) - exact) * q)  # surplus from rounding up so far, in units of 1 / q
         return -((ahead - positions * p) // q)
 
     def _local(self, source: int, number: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The scans of a source's running numbers."""
+        """The local indices of a source's running numbers."""
         mixture = self.mixture
         if source < self.reals:
             length = mixture.real[source].length or 0
             return permute(number % length, length, mixture.seed, _SOURCES + source, number // length)
-        part = mixture.synthetic[source - self.reals]
+        planned = mixture.synthetic[source - self.reals]
         if mixture.reuse > 1:
             lap = mixture.laps[source - self.reals]
             number = number // (mixture.reuse * lap) * lap + number % lap
-        return number if part.length is None else number % part.length
+        return number if planned.length is None else number % planned.length
 
 
 def plan(mixture: Mixture, epoch: int) -> MixingPlan:
-    """The plan of an epoch; see ``MixingPlan``."""
+    """Make the plan of an epoch; see ``MixingPlan``."""
     return MixingPlan(mixture, epoch)
 
 
-def _facts_of(part: PlannedSource) -> dict[str, Any]:
-    return {"length": part.length, "weight": part.weight, "identity": part.identity}
+def _facts_of(source: PlannedSource) -> dict[str, Any]:
+    return {"length": source.length, "weight": source.weight, "identity": source.identity}

@@ -1,12 +1,12 @@
-"""How many samples of each source an epoch gives, and how many all epochs before it gave.
+"""The number of samples from each source in an epoch, and in all epochs before it.
 
-Exact shares are fractions. They are added up over the epochs and only the sum is rounded, so that what one epoch has
-too little of, a later one gets: after any number of epochs, the synthetic samples are the exact number, rounded up.
+Exact shares are fractions. They are added up over the epochs and only the sum is rounded, so that rounding errors do
+not add up: after any number of epochs, the number of synthetic samples is the exact number, rounded up.
 
-Several sources of a kind share its samples by their weights in the same way. The sources stand at the leaves of a
-binary tree, and at each node the first m samples divide into ``round(m * share)`` to the left and the rest to the
-right. Both numbers only rise with m, so that the tree deals samples one by one, and both the counts after m samples
-and the source of sample m follow from m alone.
+Several sources of a kind divide its samples by their weights in the same way. The sources are the leaves of a binary
+tree, and each node sends ``round(m * share)`` of its first m samples to the left and the rest to the right. Both
+numbers increase monotonically with m, so that both the counts after m samples and the source of sample m follow from m
+alone.
 """
 
 from collections.abc import Sequence
@@ -23,23 +23,22 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.mixing.schedules import Schedule, settled, share_of
 
 EpochSize = Literal["add", "replace"] | int
-"""How long an epoch is: ``"add"`` gives every real scan once and adds synthetic ones until the ratio holds;
-``"replace"`` keeps the number of real scans as the length and gives synthetic ones in the place of some; a number is
-the length."""
+"""The length of an epoch: ``"add"`` uses every real scan once and adds synthetic ones to reach the ratio;
+``"replace"`` has as many samples as there are real scans, some of them synthetic; a number is the length itself."""
 
 _FINEST = 2**30  # largest denominator of a source's share: products stay within 64 bits
-_LOOKED_AT = 100  # epochs of a changing schedule that tell how long a lap is
+_LAP_EPOCHS = 100  # number of epochs of a changing schedule that determine the length of a lap
 
 
 @dataclass(frozen=True)
 class PlannedSource:
-    """A source of scans as the plan sees it.
+    """The properties of a source of scans that determine a plan.
 
     Args:
-        length: how many scans there are; None = endless.
-        weight: its share among the sources of its kind is proportional to this; None = by its length (real) or
-            the same for each (synthetic).
-        identity: what tells it from other sources; goes into the plan's hash.
+        length: number of scans; None = endless.
+        weight: the source's share among the sources of its kind is proportional to its weight. None: the length of a
+            real source, the same weight for all synthetic ones.
+        identity: text that distinguishes it from other sources; part of the plan's hash.
     """
 
     length: int | None
@@ -49,21 +48,21 @@ class PlannedSource:
 
 @dataclass(frozen=True)
 class Mixture:
-    """What a plan is made of.
+    """The sources and settings that determine all plans.
 
     Args:
         real: sources of real scans.
         synthetic: sources of synthetic scans.
         ratio: the share of synthetic samples by epoch.
-        seed: of the order, 0 <= seed < 2^64.
+        seed: seed of the order, 0 <= seed < 2^64.
         epoch_size: see ``EpochSize``.
-        reuse: how often a synthetic scan is given, in as many epochs.
-        balanced: spread synthetic samples evenly, so that any B samples in a row of an epoch hold B times the ratio of
-            them, up to one, and exactly where that is a whole number, and every synthetic source's share of them, up
-            to two; otherwise they are shuffled over the epoch.
+        reuse: number of epochs in which each synthetic scan is used.
+        balanced: whether to spread synthetic samples evenly instead of shuffling them over the epoch. Any B
+            consecutive samples of an epoch then hold B * ratio synthetic ones, exactly if that is a whole number and
+            otherwise up to one, and every synthetic source's share of these up to two.
 
     Raises:
-        ConfigError: on values that no epoch can be planned with.
+        ConfigError: on values with which no epoch can be planned.
         DataError: on a real source without scans.
     """
 
@@ -80,17 +79,17 @@ class Mixture:
         if size not in ("add", "replace") and not (isinstance(size, int) and not isinstance(size, bool) and size > 0):
             raise ConfigError(f"epoch_size={size!r}", "'add', 'replace' or a number of samples")
         if self.reuse < 1:
-            raise ConfigError(f"reuse={self.reuse}", "how often a synthetic scan is given, at least 1")
+            raise ConfigError(f"reuse={self.reuse}", "the number of epochs that use a synthetic scan, at least 1")
         if not 0 <= self.seed < 2**64:
             raise ConfigError(f"seed {self.seed}", "0 <= seed < 2^64")
-        for part in self.real + self.synthetic:
-            if part.length == 0:
-                raise DataError(f"a source without scans ({part.identity})", "at least one scan")
-            if part.weight is not None and not 0 < part.weight < float("inf"):
-                raise ConfigError(f"weight {part.weight} of a source", "a positive number")
-        if size == "add" and any(part.weight is not None for part in self.real):
+        for source in self.real + self.synthetic:
+            if source.length == 0:
+                raise DataError(f"a source without scans ({source.identity})", "at least one scan")
+            if source.weight is not None and not 0 < source.weight < float("inf"):
+                raise ConfigError(f"weight {source.weight} of a source", "a positive number")
+        if size == "add" and any(source.weight is not None for source in self.real):
             raise ConfigError(
-                "weights of real sources with epoch_size='add', which gives every real scan once",
+                "weights of real sources with epoch_size='add', which uses every real scan once",
                 "no weights, or another epoch_size",
                 "Use epoch_size='replace' or a number of samples.",
             )
@@ -98,28 +97,28 @@ class Mixture:
 
     @property
     def real_length(self) -> int:
-        """Scans of all real sources together."""
-        return sum(part.length or 0 for part in self.real)
+        """Number of scans in all real sources together."""
+        return sum(source.length or 0 for source in self.real)
 
     @cached_property
     def real_weights(self) -> tuple[Fraction, ...]:
-        """What real sources count, by default their lengths."""
-        return tuple(_exact(part.length or 0 if part.weight is None else part.weight) for part in self.real)
+        """The weights of the real sources, by default their lengths."""
+        return tuple(_exact(s.length or 0 if s.weight is None else s.weight) for s in self.real)
 
     @cached_property
     def synthetic_weights(self) -> tuple[Fraction, ...]:
-        """What synthetic sources count, by default all the same."""
-        return tuple(_exact(1 if part.weight is None else part.weight) for part in self.synthetic)
+        """The weights of the synthetic sources, by default all equal."""
+        return tuple(_exact(1 if s.weight is None else s.weight) for s in self.synthetic)
 
     @cached_property
     def laps(self) -> tuple[int, ...]:
-        """For each synthetic source, the most scans that an epoch takes of it, at least 1.
+        """For each synthetic source, the largest number of scans that an epoch takes from it, at least 1.
 
-        With ``reuse`` its scans come in laps of this length, so that no epoch has one of them twice. A schedule that
-        is a function is asked for its first hundred epochs.
+        With ``reuse``, scans come in laps of this length, so that no epoch contains a scan twice. For a schedule that
+        is a function, the first hundred epochs count.
         """
         last = settled(self.ratio)
-        epochs = [*range(_LOOKED_AT if last is None else min(last, _LOOKED_AT)), last or 0]
+        epochs = [*range(_LAP_EPOCHS if last is None else min(last, _LAP_EPOCHS)), last or 0]
         exact = [Fraction(0)]
         for epoch in epochs:
             try:
@@ -130,16 +129,16 @@ class Mixture:
 
     @cached_property
     def _sums(self) -> dict[int, Fraction]:
-        """By epoch, the exact number of synthetic samples before it, as far as it was asked for."""
+        """A cache: {epoch: exact number of synthetic samples before it}."""
         return {0: Fraction(0)}
 
 
 def exact_synthetic(mixture: Mixture, epoch: int) -> Fraction:
-    """How many synthetic samples an epoch should give, before rounding.
+    """The number of synthetic samples that an epoch should have, before rounding.
 
     Raises:
-        ConfigError: where the ratio cannot be kept with these sources.
-        DataError: where there are no real scans to keep it.
+        ConfigError: if the sources cannot serve the ratio.
+        DataError: if the ratio needs real scans and there are none.
     """
     share, size = share_of(mixture.ratio, epoch), mixture.epoch_size
     real = mixture.real_length
@@ -149,7 +148,7 @@ def exact_synthetic(mixture: Mixture, epoch: int) -> Fraction:
         raise DataError(
             f"no real scans, with ratio {float(share):g} and epoch_size={size!r}",
             "a real source with scans",
-            "For synthetic scans only, use ratio=1 and give epoch_size the number of samples.",
+            "For synthetic scans only, use ratio=1 and set epoch_size to the number of samples.",
         )
     if size != "add":
         return (real if size == "replace" else int(size)) * share
@@ -163,7 +162,7 @@ def exact_synthetic(mixture: Mixture, epoch: int) -> Fraction:
 
 
 def synthetic_before(mixture: Mixture, epoch: int) -> Fraction:
-    """How many synthetic samples all epochs before this one should give together, before rounding."""
+    """The number of synthetic samples that all epochs before this one should have together, before rounding."""
     same_from = settled(mixture.ratio)
     changing = epoch if same_from is None else min(epoch, same_from)
     sums = mixture._sums
@@ -174,10 +173,10 @@ def synthetic_before(mixture: Mixture, epoch: int) -> Fraction:
 
 
 def running_counts(mixture: Mixture, epoch: int) -> tuple[int, ...]:
-    """How many samples of each source all epochs before this one give together, real sources first."""
+    """The number of samples from each source in all epochs before this one together, real sources first."""
     synthetic, size = ceil(synthetic_before(mixture, epoch)), mixture.epoch_size
     if size == "add":
-        reals = tuple(epoch * (part.length or 0) for part in mixture.real)
+        reals = tuple(epoch * (source.length or 0) for source in mixture.real)
     else:
         total = epoch * (mixture.real_length if size == "replace" else int(size))
         reals = split(mixture.real_weights, total - synthetic)
@@ -185,20 +184,20 @@ def running_counts(mixture: Mixture, epoch: int) -> tuple[int, ...]:
 
 
 def quotas(mixture: Mixture, epoch: int) -> tuple[int, ...]:
-    """How many samples of each source an epoch gives, real sources first; their sum is its length.
+    """The number of samples from each source in an epoch, real sources first; their sum is the epoch's length.
 
     Raises:
-        ConfigError: where the ratio cannot be kept with these sources.
-        DataError: where there are no real scans to keep it.
+        ConfigError: if the sources cannot serve the ratio.
+        DataError: if the ratio needs real scans and there are none.
     """
-    exact_synthetic(mixture, epoch)  # raises where the schedule has no such epoch
+    exact_synthetic(mixture, epoch)  # raises if the schedule has no such epoch
     before, after = running_counts(mixture, epoch), running_counts(mixture, epoch + 1)
     return tuple(b - a for a, b in zip(before, after, strict=True))
 
 
 @dataclass(frozen=True)
 class _Node:
-    """``round(m * p / q)`` of the first m samples go left, the others right; a leaf is the number of a source."""
+    """Sends ``round(m * p / q)`` of its first m samples to the left, the others right; a leaf is a source's number."""
 
     p: int
     q: int
@@ -210,10 +209,10 @@ Number = TypeVar("Number", int, NDArray[np.int64])
 
 
 def split(weights: Sequence[Fraction], total: int) -> tuple[int, ...]:
-    """How many of the first ``total`` samples each source gets.
+    """Divide the first ``total`` samples among the sources.
 
-    Their sum is ``total``, none falls when ``total`` rises, and with up to four sources each is within one of its exact
-    share (a leaf at depth 2 is off by less than 1/2 + 1/2); with n sources, within ``log2(n) / 2`` rounded up.
+    The counts sum to ``total`` and increase monotonically with it. With up to four sources each is within one of its
+    exact share (the error at depth 2 is less than 1/2 + 1/2); with n sources, within ``log2(n) / 2`` rounded up.
     """
     counts = [0] * len(weights)
 
@@ -231,7 +230,7 @@ def split(weights: Sequence[Fraction], total: int) -> tuple[int, ...]:
 
 
 def deal(weights: Sequence[Fraction], samples: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The source of each sample, and how many that source got before it; ``split`` counts the same.
+    """The source of each sample, and its number within that source; consistent with ``split``.
 
     Args:
         weights: of the sources.
@@ -242,14 +241,14 @@ def deal(weights: Sequence[Fraction], samples: NDArray[np.int64]) -> tuple[NDArr
     """
     sources, numbers = np.empty_like(samples), np.empty_like(samples)
 
-    def walk(node: _Node | int, where: NDArray[np.intp], given: NDArray[np.int64]) -> None:
+    def walk(node: _Node | int, where: NDArray[np.intp], number: NDArray[np.int64]) -> None:
         if isinstance(node, int):
-            sources[where], numbers[where] = node, given
+            sources[where], numbers[where] = node, number
         else:
-            left = _left(node, given)
-            goes_left = _left(node, given + 1) > left
+            left = _left(node, number)
+            goes_left = _left(node, number + 1) > left
             walk(node.left, where[goes_left], left[goes_left])
-            walk(node.right, where[~goes_left], (given - left)[~goes_left])
+            walk(node.right, where[~goes_left], (number - left)[~goes_left])
 
     walk(_tree(tuple(weights)), np.arange(len(samples)), samples)
     return sources, numbers
@@ -257,28 +256,28 @@ def deal(weights: Sequence[Fraction], samples: NDArray[np.int64]) -> tuple[NDArr
 
 def _left(node: _Node, count: Number) -> Number:
     """``round(count * p / q)``, halves up."""
-    whole, rest = count // node.q, count % node.q
-    return whole * node.p + (2 * rest * node.p + node.q) // (2 * node.q)
+    quotient, rest = count // node.q, count % node.q
+    return quotient * node.p + (2 * rest * node.p + node.q) // (2 * node.q)
 
 
 def _most(node: _Node | int, count: int) -> tuple[int, ...]:
-    """The most that each source, in order, can get of so many samples in a row."""
-    found: dict[int, int] = {}
+    """The largest number of samples that each source, in order, can get out of ``count`` consecutive ones."""
+    most: dict[int, int] = {}
 
     def walk(node: _Node | int, count: int) -> None:
         if isinstance(node, int):
-            found[node] = count
+            most[node] = count
         else:
             walk(node.left, ceil(Fraction(count * node.p, node.q)))
             walk(node.right, ceil(Fraction(count * (node.q - node.p), node.q)))
 
     walk(node, count)
-    return tuple(count for _, count in sorted(found.items()))
+    return tuple(count for _, count in sorted(most.items()))
 
 
 @lru_cache(256)
 def _tree(weights: tuple[Fraction, ...]) -> _Node | int:
-    """A tree of halves, the heaviest sources first, so that they stand where there are fewer roundings."""
+    """A balanced binary tree, the heaviest sources first, because the first leaves have the fewest roundings."""
 
     def grow(sources: Sequence[int]) -> _Node | int:
         if len(sources) == 1:
@@ -292,5 +291,5 @@ def _tree(weights: tuple[Fraction, ...]) -> _Node | int:
 
 
 def _exact(value: Any) -> Fraction:
-    """0.1 is one tenth, not the float beside it."""
+    """The fraction of a number's decimal text: 0.1 is exactly one tenth."""
     return Fraction(repr(float(value)))

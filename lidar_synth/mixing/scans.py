@@ -29,16 +29,16 @@ Ratio = float | Sequence[float] | Mapping[int, float] | Schedule
 """The share of synthetic samples in [0, 1], see ``make_schedule``."""
 
 ToSample = Callable[[Scan, np.random.Generator], Any]
-"""Makes a sample of a scan; the generator is keyed by (seed, epoch, position)."""
+"""Makes a sample from a scan; the random generator is keyed by (seed, epoch, position)."""
 
 
 class MixedScans(Dataset[Any]):
     """A dataset of real scans mixed with synthetic ones at an exact ratio; real scans stay unchanged.
 
-    What stands where in an epoch is a pure function of the arguments and the epoch (plan.py), already shuffled: go
-    through it in order (a ``DataLoader`` without ``shuffle``) or by ``batches``, which also serves several ranks. Any
-    other sampler works too. Call ``set_epoch`` before each epoch; otherwise the same scans come again, with a warning.
-    ``set_epoch`` after ``iter(loader)`` raises, but with ``batches``, where it counts from the next pass on.
+    The order of an epoch is a pure function of the arguments and the epoch (plan.py) and is already shuffled: iterate
+    in order (a ``DataLoader`` without ``shuffle``), or use ``batches``, which also serves several ranks. Any other
+    sampler works too. Call ``set_epoch`` before each epoch; otherwise the same scans are repeated, with a warning.
+    ``set_epoch`` after ``iter(loader)`` raises an error; with ``batches`` it takes effect with the next pass.
 
     Args:
         real: indexable source of ``Scan``, or ``Sources`` of several; None with ratio 1.
@@ -48,26 +48,28 @@ class MixedScans(Dataset[Any]):
         labels: label policy of the synthetic scans: a name of ``lidar_synth.labels.POLICIES`` or a function.
         seed: of the order, of all random numbers of a sample, and of a generator's scans.
         label_options: keyword arguments of the label policy.
-        epoch_size: ``"add"`` gives every real scan once and adds synthetic ones; ``"replace"`` keeps the number of
-            real scans as the length; a number is the length.
-        reuse: how often a synthetic scan is given, in as many epochs, each time augmented anew.
-        balanced: spread synthetic samples evenly, so that every batch in order holds its exact share (up to one
-            sample where that is no whole number).
+        epoch_size: ``"add"`` uses every real scan once and adds synthetic ones; ``"replace"`` has as many samples as
+            there are real scans; a number is the length.
+        reuse: number of epochs in which each synthetic scan is used, with different random augmentations.
+        balanced: whether to spread synthetic samples evenly, so that every batch in the order of the plan holds its
+            exact share (up to one sample if that is not a whole number).
         augment: ``(scan, rng) -> scan`` for synthetic scans, after the label policy.
-        augment_real: whether ``augment`` is also for real scans, which otherwise stay unchanged, bit for bit.
+        augment_real: whether to apply ``augment`` to real scans too; otherwise they stay unchanged, bit for bit.
         to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py).
         collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"`` (collate.py), or
             your own function.
-        unlabelled: ``"error"`` refuses a batch without one valid label, ``"allow"`` hands it out, as
-            ``labels="none"`` always does.
-        real_as_is: real samples are no ``Scan`` but what a trainer wants already; see ``wrap``.
-        compare: compare the first real sample with a synthetic one here, where ``real_as_is``; see ``check_alike``.
+        unlabelled: ``"error"`` refuses a batch without any valid label; ``"allow"`` returns it, which is always the
+            case with ``labels="none"``.
+        real_as_is: whether real samples are returned unchanged, because they are not ``Scan`` but already have the
+            trainer's form; see ``wrap``.
+        compare: with ``real_as_is``, whether to compare the first real sample with a synthetic one at construction;
+            see ``check_alike``.
 
     Attributes:
         collate: the ``collate_fn``.
         mixture: the settings that determine the plan.
         real, synthetic: the sources, in the plan's order.
-        current: the epoch that all its processes see.
+        current: the current epoch, shared by all processes of this dataset.
 
     Raises:
         ConfigError: on a ratio outside [0, 1], sources of different sensors or classes, a policy that a source
@@ -170,7 +172,7 @@ class MixedScans(Dataset[Any]):
         return cls(dataset, synth, ratio, to_sample=to_sample, collate=collate, real_as_is=True, **options)
 
     def __getattr__(self, name: str) -> Any:
-        # Only for names that are not found here. Double underscores ask what an object can do (copy, __getitems__).
+        # Called only for missing attributes. Names with double underscores are protocols (copy, __getitems__).
         state = self.__dict__
         if name.startswith("__") or not state.get("_real_as_is") or len(state["real"]) != 1:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
@@ -188,13 +190,14 @@ class MixedScans(Dataset[Any]):
 
     @property
     def fetched(self) -> int:
-        """How many samples of ``batches`` were fetched so far, by this process and its workers."""
+        """Number of samples of ``batches`` that this process and its workers have fetched."""
         return self.current.fetched
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch, before a ``DataLoader`` begins to iterate; its workers are told, persistent ones too.
+        """Set the epoch, before a ``DataLoader`` begins to iterate; all its workers see it, persistent ones too.
 
-        Where one is iterating already, its next sample raises; those of ``batches`` keep the epoch they began in.
+        If a loader is already iterating, its next sample raises an error; a loader with ``batches`` finishes the
+        epoch in which it began.
 
         Raises:
             ConfigError: on an epoch for which there is no ratio.
@@ -208,37 +211,37 @@ class MixedScans(Dataset[Any]):
             self.expect(epoch)
 
     def plan(self, epoch: int | None = None) -> MixingPlan:
-        """The plan of an epoch, by default of the current one; its hash is logged once in the main process."""
+        """The plan of an epoch, by default the current one; the main process logs its hash once."""
         epoch = self.epoch if epoch is None else epoch
         if self._planned is None or self._planned[0] != epoch:
             self._planned = (epoch, MixingPlan(self.mixture, epoch))
             if get_worker_info() is None:
-                made = self._planned[1]
+                plan = self._planned[1]
                 log.info(
                     "epoch %d: %d samples, %d of them synthetic, plan %s",
-                    epoch, len(made), made.synthetics, made.hash[:16],
+                    epoch, len(plan), plan.synthetics, plan.hash[:16],
                 )  # fmt: skip
         return self._planned[1]
 
     def expect(self, epoch: int, positions: Iterable[int] | None = None) -> None:
-        """Tell synthetic sources that work ahead what will be asked for.
+        """Announce the next positions to synthetic sources that work ahead.
 
         Args:
-            epoch: of the plan.
-            positions: in order, of which the first ``AHEAD`` count; by default all.
+            epoch: the epoch of the positions.
+            positions: the positions in the order of their use, by default all; only the first ``AHEAD`` are announced.
         """
         if any(hasattr(source, "expect") for source in self.synthetic):
-            made = self.plan(epoch)
-            asked = islice(range(len(made)) if positions is None else positions, AHEAD)
-            sources, indices = made.at(np.fromiter(asked, np.int64))
-            for number, source in enumerate(self.synthetic, made.reals):
+            plan = self.plan(epoch)
+            upcoming = islice(range(len(plan)) if positions is None else positions, AHEAD)
+            sources, indices = plan.at(np.fromiter(upcoming, np.int64))
+            for number, source in enumerate(self.synthetic, plan.reals):
                 if hasattr(source, "expect"):
                     source.expect(indices[sources == number].tolist())
 
     def length(self, epoch: int) -> int:
-        """Samples of an epoch."""
-        made = self._planned
-        return len(made[1] if made is not None and made[0] == epoch else MixingPlan(self.mixture, epoch))
+        """Number of samples in an epoch."""
+        planned = self._planned
+        return len(planned[1] if planned is not None and planned[0] == epoch else MixingPlan(self.mixture, epoch))
 
     def __len__(self) -> int:
         return self.length(self.epoch)
@@ -260,29 +263,29 @@ class MixedScans(Dataset[Any]):
             >>> domains.count(0), domains.count(1)
             (3, 3)
         """
-        made = self.plan(index.epoch if isinstance(index, Position) else None)
-        return SYNTHETIC if made[index if index >= 0 else index + len(made)][0] >= made.reals else REAL
+        plan = self.plan(index.epoch if isinstance(index, Position) else None)
+        return SYNTHETIC if plan[index if index >= 0 else index + len(plan)][0] >= plan.reals else REAL
 
     def epoch_of(self, index: int) -> int:
-        """The epoch of an index that is fetched: that in which iterating began.
+        """The epoch of an index that is being fetched: the one in which iteration began.
 
-        For those who fetch scans elsewhere, such as in the main process on a GPU.
+        This is for callers that make scans elsewhere, such as in the main process on a GPU.
 
         Raises:
-            ConfigError: where another epoch was set since.
+            ConfigError: if another epoch was set since.
         """
         return self.current.of(index)
 
     def sample(self, epoch: int, position: int) -> Any:
         """The sample at a position of an epoch, 0 <= position < length; ``self[i]`` is ``sample(epoch, i)``."""
-        made = self.plan(epoch)
-        source, index = made[position]
-        if source >= made.reals:
-            return self.finish(self.synthetic[source - made.reals][index], epoch, position)
+        plan = self.plan(epoch)
+        source, index = plan[position]
+        if source >= plan.reals:
+            return self.finish(self.synthetic[source - plan.reals][index], epoch, position)
         real = self.real[source][index]
         if self._real_as_is:
             return real
-        if real.domain != REAL:  # to this mixture it is, the town for instance
+        if real.domain != REAL:  # scans of the town, for instance, count as real here
             real = replace(real, domain=REAL)
         rng = keyed_rng(self.seed, epoch, position)
         if self._augment is not None and self._augment_real:
@@ -294,9 +297,9 @@ class MixedScans(Dataset[Any]):
 
         This is for callers that make the scan elsewhere, such as in the main process on a GPU.
         """
-        made = self.plan(epoch)
+        plan = self.plan(epoch)
         rng = keyed_rng(self.seed, epoch, position)
-        return self._finish(made[position][0] - made.reals, scan, rng)
+        return self._finish(plan[position][0] - plan.reals, scan, rng)
 
     def _finish(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
         scan = self._policies[source](scan, rng)

@@ -1,7 +1,8 @@
 """The share of synthetic samples, epoch by epoch.
 
-A schedule is a function from the epoch to a share in [0, 1]. Those here say from which epoch on they stay the same,
-so that what came before an epoch can be counted without visiting every earlier one.
+A schedule is a function from the epoch to a share in [0, 1]. The schedules of this module have an attribute
+``settled``, the epoch from which on the share is constant, so that earlier samples can be counted without visiting
+every epoch.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,18 +13,18 @@ from typing import Any
 from lidar_synth.errors import ConfigError
 
 Schedule = Callable[[int], float]
-"""Epoch, from 0, to the share of synthetic samples in [0, 1]."""
+"""``epoch -> share``: from an epoch, counted from 0, to the share of synthetic samples in [0, 1]."""
 
 _FINEST = 10**6  # largest denominator of a share: products with positions stay within 64 bits
 
 
 @dataclass(frozen=True)
 class Steps:
-    """A share from each of some epochs on.
+    """A share that changes at given epochs.
 
     Args:
-        shares: (epoch, share) pairs, by epoch, the first at 0.
-        length: epochs that there are; None = the last share holds for ever.
+        shares: (epoch, share) pairs, sorted by epoch, the first at epoch 0.
+        length: number of epochs in the schedule; None = the last share holds for ever.
     """
 
     shares: tuple[tuple[int, float], ...]
@@ -37,7 +38,7 @@ class Steps:
 
     @property
     def settled(self) -> int:
-        """The epoch from which on the share stays the same."""
+        """The epoch from which on the share is constant."""
         return self.shares[-1][0]
 
     def __call__(self, epoch: int) -> float:
@@ -81,23 +82,23 @@ class Linear:
 
     @property
     def settled(self) -> int:
-        """The epoch from which on the share stays the same."""
+        """The epoch from which on the share is constant."""
         return self.epochs - 1
 
     def __call__(self, epoch: int) -> float:
-        way = min(epoch / (self.epochs - 1), 1.0)
-        return self.first * (1 - way) + self.last * way
+        progress = min(epoch / (self.epochs - 1), 1.0)
+        return self.first * (1 - progress) + self.last * progress
 
 
 def make_schedule(ratio: float | Sequence[float] | Mapping[int, float] | Schedule) -> Schedule:
-    """A schedule from what users write.
+    """Make a schedule from a user's argument.
 
     Args:
         ratio: one share for all epochs; a list with one for each; ``{epoch: share}``, each from its epoch on;
             ``Linear(first, last, epochs)``; or any function of the epoch.
 
     Raises:
-        ConfigError: on a share outside [0, 1], or none for epoch 0.
+        ConfigError: on a share outside [0, 1], or no share for epoch 0.
     """
     if callable(ratio):
         return ratio
@@ -109,7 +110,7 @@ def make_schedule(ratio: float | Sequence[float] | Mapping[int, float] | Schedul
 
 
 def share_of(schedule: Schedule, epoch: int) -> Fraction:
-    """The share of synthetic samples in an epoch; 0.1 is one tenth, not the float beside it.
+    """The share of synthetic samples in an epoch as a fraction; 0.1 is exactly one tenth.
 
     Raises:
         ConfigError: on a share outside [0, 1], a negative epoch, or one after the schedule's end.
@@ -120,7 +121,7 @@ def share_of(schedule: Schedule, epoch: int) -> Fraction:
 
 
 def settled(schedule: Schedule) -> int | None:
-    """The epoch from which on a schedule stays the same; None where it does not say."""
+    """The epoch from which on a schedule is constant; None if unknown."""
     return getattr(schedule, "settled", None)
 
 

@@ -1,4 +1,4 @@
-"""Several sources as one, and the check that sources can be mixed."""
+"""``Sources``: several sources as one; and the check that sources can be mixed."""
 
 import hashlib
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ class Sources:
         return sum(map(len, self.sources))
 
     def __getitem__(self, index: int) -> Any:
-        """The scan at ``index``; the sources follow one another."""
+        """The scan at ``index`` of the concatenated sources."""
         if not 0 <= index < len(self):
             raise IndexError(f"scan {index} of {len(self)}")
         for source in self.sources:
@@ -54,7 +54,7 @@ class Sources:
 
 
 def each(source: Any) -> tuple[tuple[Any, float | None], ...]:
-    """(source, weight) of what a user gives as one argument; none for None."""
+    """The (source, weight) pairs of an argument: a source, ``Sources``, or None for no source."""
     if source is None:
         return ()
     if isinstance(source, Sources):
@@ -63,7 +63,7 @@ def each(source: Any) -> tuple[tuple[Any, float | None], ...]:
 
 
 def identity_of(source: Any) -> str:
-    """What tells a source from others: its own word, or its class, its length and the names of its scans."""
+    """A text that identifies a source: its ``identity``, or its class, its length and a hash of its scans' names."""
     if own := getattr(source, "identity", ""):
         return str(own)
     names = "\n".join(map(str, getattr(source, "ids", ())))
@@ -71,10 +71,10 @@ def identity_of(source: Any) -> str:
 
 
 def sensor_of(source: Any) -> Sensor:
-    """The sensor of a source of scans, from its first scan where it does not say.
+    """The sensor of a source of scans: its attribute ``sensor``, or the sensor of its first scan.
 
     Raises:
-        ConfigError: where its samples are no scans.
+        ConfigError: if its samples are not scans.
     """
     sensor = getattr(source, "sensor", None)
     if isinstance(sensor, Sensor):
@@ -90,13 +90,13 @@ def sensor_of(source: Any) -> Sensor:
 
 
 def check_together(sources: Sequence[Any]) -> list[Sensor]:
-    """The sensors of sources of scans, whose samples have to belong in one training set.
+    """Check that scans of several sources fit into one training set, and return the sources' sensors.
 
-    Sensors agree when their rows and columns look in the same directions; range limits and names may differ. A
-    source can say by ``classes`` (names by train id) what its labels mean; by default it is SemanticKITTI's 19.
+    Sensors agree if their rows and columns have the same directions; range limits and names may differ. A source's
+    attribute ``classes`` (names by train id) defines its labels; by default they are SemanticKITTI's 19 classes.
 
     Raises:
-        ConfigError: on another grid or other classes.
+        ConfigError: on different grids or classes.
     """
     sensors = [sensor_of(source) for source in sources]
     for sensor in sensors[1:]:
@@ -104,8 +104,8 @@ def check_together(sources: Sequence[Any]) -> list[Sensor]:
             raise ConfigError(
                 f"sources of the sensors {_grid(sensors[0])} and {_grid(sensor)}",
                 "one grid for all real and synthetic scans",
-                "Open the real scans with the generator's sensor (sensor=generator.sensor), or take a model or bank "
-                "of theirs.",
+                "Open the real scans with the generator's sensor (sensor=generator.sensor), or use a model or bank "
+                "of the real scans' sensor.",
             )
     for source in sources:
         classes = tuple(getattr(source, "classes", NAMES))
@@ -113,7 +113,7 @@ def check_together(sources: Sequence[Any]) -> list[Sensor]:
             raise ConfigError(
                 f"a source whose labels mean {classes[:4]}... ({type(source).__name__})",
                 f"SemanticKITTI's {len(NAMES)} train ids, {NAMES[:4]}...",
-                "Map its labels when they are read (Taxonomy.decode), then leave out its attribute 'classes'.",
+                "Map its labels when they are read (Taxonomy.decode), then remove its attribute 'classes'.",
             )
     return sensors
 

@@ -1,7 +1,7 @@
-"""How far a run has come, and where a process stands among others.
+"""The state of a training run, for resumption, and the rank of a process.
 
-A state is ``{"version", "seed", "epoch", "position", "plan", "mixture"}``: the hash of the epoch's plan, and all that
-the plan follows from in readable form, so that a refusal can name the difference.
+A state is ``{"version", "seed", "epoch", "position", "plan", "mixture"}``. ``plan`` is the hash of the epoch's plan,
+``mixture`` everything that determines the plan in readable form, so that an error can name what differs.
 """
 
 import os
@@ -17,15 +17,15 @@ from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import Mixture
 
 VERSION = 2
-"""Of a state. The first one had seed, epoch and position only."""
+"""The version of a state. Version 1 had only seed, epoch and position."""
 
 
 def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
     """This process's rank and the number of ranks.
 
     Args:
-        rank, world_size: given ones count. By default those of ``torch.distributed``, before it is set up those that
-            torchrun tells (``RANK``, ``WORLD_SIZE``), else 0 of 1.
+        rank, world_size: returned if given. The default is that of ``torch.distributed``, or before it is initialised
+            the environment variables of torchrun (``RANK``, ``WORLD_SIZE``), or else 0 of 1.
 
     Raises:
         ConfigError: on one without the other, or a rank out of range.
@@ -41,37 +41,37 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
 
 
 def check_unshared(what: str, rank: int, world_size: int) -> None:
-    """Refuse ranks by default where an ``Accelerator`` may share the batches among the same processes once more.
+    """Refuse default ranks if an ``Accelerator`` may divide the batches among the same processes a second time.
 
     Raises:
-        ConfigError: there.
+        ConfigError: if an ``Accelerator`` is set up for several processes.
     """
     accelerate = sys.modules.get("accelerate.state")
     if world_size > 1 and accelerate and accelerate.PartialState._shared_state.get("num_processes", 1) > 1:
         raise ConfigError(
-            f"{what} for rank {rank} of {world_size} by default, and an Accelerator, which shares what it prepares "
-            "among the same processes: most samples would never be seen",
-            "one of the two to share",
-            f"For a loader that accelerator.prepare gets, give {what} rank=0, world_size=1; for any other one "
-            "rank=accelerator.process_index, world_size=accelerator.num_processes.",
+            f"{what} with the default rank {rank} of {world_size} and an Accelerator, which divides prepared loaders "
+            "among the same processes again: most samples would never be seen",
+            "only one of the two to divide the samples",
+            f"For a loader that is passed to accelerator.prepare, call {what} with rank=0, world_size=1; for any other "
+            "loader with rank=accelerator.process_index, world_size=accelerator.num_processes.",
         )
 
 
 def make_state(mixture: Mixture, epoch: int, position: int) -> dict[str, Any]:
-    """The state of a run that goes on at a position of an epoch."""
-    made = MixingPlan(mixture, epoch)
+    """The state of a run that resumes at a position of an epoch."""
+    plan = MixingPlan(mixture, epoch)
     return {
         "version": VERSION,
         "seed": mixture.seed,
         "epoch": epoch,
         "position": position,
-        "plan": made.hash,
-        "mixture": made.facts,
+        "plan": plan.hash,
+        "mixture": plan.facts,
     }
 
 
 def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
-    """Epoch and position where an epoch is over: the next one's beginning, or its own end where the schedule ends."""
+    """Epoch and position after an epoch: the beginning of the next, or the same epoch's end if it was the last."""
     try:
         MixingPlan(mixture, epoch + 1)
     except ConfigError:
@@ -80,7 +80,7 @@ def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
 
 
 def checked_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]:
-    """Epoch and position of a state.
+    """The epoch and position of a state, after checking that it fits the mixture.
 
     Raises:
         ConfigError: on missing or impossible values, or the state of another mixture.
@@ -91,34 +91,35 @@ def checked_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]
     seed, epoch, position = (int(value or 0) for value in values)
     if seed != mixture.seed:
         raise ConfigError(f"the state of seed {seed} for a mixture of seed {mixture.seed}", "the seed of the state")
-    here = MixingPlan(mixture, epoch)
+    plan = MixingPlan(mixture, epoch)
     if "plan" not in state:
         _check_old(state, position)
-    elif state["plan"] != here.hash:
-        differences = list(_differences(state.get("mixture"), here.facts, ""))
+    elif state["plan"] != plan.hash:
+        differences = list(_differences(state.get("mixture"), plan.facts, ""))
         raise ConfigError(
             f"a state of another mixture: {'; '.join(differences[:4]) or 'its plan has another hash'}",
-            "the mixture that it was taken from",
-            f"To begin epoch {epoch} of this mixture anew, call set_epoch({epoch}) and load no state.",
+            "the mixture with which the state was saved",
+            f"To start epoch {epoch} of this mixture from the beginning, call set_epoch({epoch}) and load no state.",
         )
-    if position > len(here):
-        raise ConfigError(f"position {position} of an epoch of {len(here)} samples", "a state of this mixture")
+    if position > len(plan):
+        raise ConfigError(f"position {position} of an epoch of {len(plan)} samples", "a state of this mixture")
     return epoch, position
 
 
 def _check_old(state: Mapping[str, Any], position: int) -> None:
-    """A state of the first version: it cannot tell its mixture, and its order is no longer made."""
+    """Check a state of version 1, which does not identify its mixture and whose order no longer exists."""
     if position:
         raise ConfigError(
-            f"a state without its plan, {dict(state)}, in the middle of an epoch; this version makes another order",
-            "a state that this version gave",
-            "To begin that epoch anew, set its position to 0; to leave the rest of it out, add 1 to its epoch too.",
+            f"a state without its plan, {dict(state)}, in the middle of an epoch; this version has another order",
+            "a state that this version saved",
+            "To start that epoch from the beginning, set the state's position to 0; to skip the rest of the epoch, "
+            "also add 1 to its epoch.",
         )
-    warnings.warn("a state without its plan: whether it belongs to this mixture cannot be told", stacklevel=4)
+    warnings.warn("a state without its plan: it cannot be checked against this mixture", stacklevel=4)
 
 
 def _differences(then: Any, now: Any, name: str) -> Iterator[str]:
-    """What differs, by its name, leaf by leaf."""
+    """Describe each value that differs, with its name."""
     if isinstance(then, Mapping) and isinstance(now, Mapping):
         for key in now:
             yield from _differences(then.get(key), now[key], f"{name} {key}".strip())

@@ -20,11 +20,12 @@ class MixedStream(IterableDataset[Any]):
     Worker w of W yields every W-th batch, so that ``DataLoader(stream, batch_size=B, num_workers=W)`` with the same B
     yields the same batches in the same order for every W. Over all ranks and workers every sample is yielded once.
 
-    ``set_epoch`` counts from the next pass on: a pass stays in the epoch in which it began, and where persistent
-    workers cannot tell which one that was, it raises.
+    ``set_epoch`` takes effect with the next pass: a pass stays in the epoch in which it began. If persistent workers
+    cannot determine that epoch, an error is raised.
 
-    The state (state.py) says where the batches given so far end. A worker's own state, which torchdata's
-    ``StatefulDataLoader`` asks for, adds how many samples it has given since, and fits the same ranks and workers only.
+    The state (state.py) holds the position after the batches yielded so far. The state of a worker, which torchdata's
+    ``StatefulDataLoader`` saves, adds the number of samples that the worker has yielded since; it fits only the same
+    ranks and workers.
 
     Args:
         scans: the mixed dataset; also one that ``MixedScans.wrap`` made.
@@ -34,7 +35,8 @@ class MixedStream(IterableDataset[Any]):
         drop_last: without ``endless``, whether to drop the samples that do not fill a batch on every rank. If they are
             kept, the last batches of the ranks differ in size and some ranks may have none, so that trainers whose
             ranks wait for one another hang.
-        rank, world_size: see ``place``; they have to be known before workers start.
+        rank, world_size: rank of this process and number of ranks (see ``place`` for the defaults); they must be known
+            before workers start.
 
     Raises:
         ConfigError: on a batch size below 1 or a rank out of range; on iterating with default ranks where an
@@ -66,11 +68,11 @@ class MixedStream(IterableDataset[Any]):
         self.drop_last, self.collate = drop_last, scans.collate
         self.rank, self.world_size = place(rank, world_size)
         self._by_default = rank is None
-        self._process = os.getpid()  # that has iterated last
-        self._start = shared_integers(0, 0)  # epoch and position where a state said to go on
-        self._given = 0  # samples that this process has given since it began to iterate
+        self._process = os.getpid()  # the process that has iterated last
+        self._start = shared_integers(0, 0)  # epoch and position of the loaded state
+        self._given = 0  # samples that this process has yielded since it began to iterate
         self._begun: tuple[int, int] | None = None  # epoch and position where it began
-        self._resume: dict[str, Any] = {}  # a state that this process has to go on from
+        self._resume: dict[str, Any] = {}  # the state from which this process has to resume
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch in which iterating begins."""
@@ -84,7 +86,7 @@ class MixedStream(IterableDataset[Any]):
             raise ConfigError(
                 f"the state of one process, {self._resume}, in another, {self._place()}",
                 "the same ranks, workers and batch size",
-                "state_dict(done=...) gives a state that fits any.",
+                "state_dict(done=...) makes a state that fits any number of ranks and workers.",
             )
         again = self._process == os.getpid() and get_worker_info() is not None
         self._begun, self._given, self._resume, self._process = (epoch, position), given, {}, os.getpid()
@@ -96,33 +98,34 @@ class MixedStream(IterableDataset[Any]):
 
         Args:
             begin, position: where to begin.
-            guarded: a persistent worker's later pass, which may have begun after its ``iter``: refuse another epoch.
+            guarded: whether to refuse a change of the epoch. A later pass of a persistent worker may begin only after
+                ``iter(loader)`` returned, and would miss the change.
         """
         worker, workers = self._place()["worker"], self._place()["workers"]
         batches = islice(self._batches(begin, position), worker, None, workers)
-        epoch, first, told = begin, -position, 0  # number of the epoch's first sample; where to tell sources again
+        epoch, first, announced = begin, -position, 0  # first: the number of the epoch's first sample
         for number in islice(chain.from_iterable(batches), self._given, None):
             if guarded:
                 check_pass(begin, self.scans.epoch)
             while number >= (end := first + self.scans.length(epoch)):
-                epoch, first, told = epoch + 1, end, 0
-            if worker == 0 and number >= told:
+                epoch, first, announced = epoch + 1, end, 0
+            if worker == 0 and number >= announced:
                 ahead = chain.from_iterable(self._batches(begin, position, number))
                 self.scans.expect(epoch, (n - first for n in takewhile(end.__gt__, ahead) if n >= number))
-                told = min(end, number + AHEAD * self.world_size // 2)
+                announced = min(end, number + AHEAD * self.world_size // 2)
             self._given += 1
             yield self.scans.sample(epoch, number - first)
 
     def state_dict(self, done: int | None = None) -> dict[str, Any]:
-        """Where to go on.
+        """The progress of training, from which it can be resumed.
 
         Args:
-            done: batches that this rank has trained on since it began to iterate; the state then fits any number of
-                ranks and workers. By default the state of this process, which is enough without workers and in a
-                ``StatefulDataLoader``.
+            done: number of batches that this rank has trained on since it began to iterate; the state then fits any
+                number of ranks and workers. The default, the progress of this process, is correct without workers and
+                in a ``StatefulDataLoader``.
 
         Raises:
-            ConfigError: on more batches than there are.
+            ConfigError: on more batches than the epoch has.
         """
         epoch, position, given = self._progress()
         if done is not None:
@@ -133,39 +136,39 @@ class MixedStream(IterableDataset[Any]):
             return make_state(self.scans.mixture, epoch, position) | self._place() | {"given": given}
         after = self._after(epoch, position, done + (part > 0))
         if not self.endless and after[0] > epoch:
-            # Not the next epoch yet: whoever resumes here still has to see this one end.
+            # Not the next epoch yet: a trainer that resumes here still has to see the end of this one.
             after = epoch, self.scans.length(epoch)
         return make_state(self.scans.mixture, *after)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where a state says.
+        """Resume from a state.
 
         Raises:
-            ConfigError: on a state that is none, or of another mixture.
+            ConfigError: on an invalid state, or one of another mixture.
         """
         epoch, position = checked_state(state, self.scans.mixture)
         self._begun, self._resume = None, {k: v for k, v in state.items() if k not in ("plan", "mixture")}
         self.scans.current.forget_pass()
         if get_worker_info() is None:
-            # A worker keeps its state to itself: what is shared, the main process may have changed since.
+            # A worker does not write to shared memory, which the main process may have changed since.
             self._start[0], self._start[1] = epoch, position
             go_to(self.scans, epoch, position)
 
     def _progress(self) -> tuple[int, int, int]:
-        """Epoch and position where iterating began, or would begin, and the samples given since."""
+        """Epoch and position where iteration began, or would begin, and the number of samples yielded since."""
         in_worker = get_worker_info() is not None
         if self._begun is not None and (in_worker or self._begun[0] == self.scans.epoch):
             return *self._begun, self._given
         if in_worker and self._resume:
             return self._resume["epoch"], self._resume["position"], self._resume.get("given", 0)
-        # A worker that has just started begins where the main process stood at its iter(loader).
+        # A worker that has just started begins in the epoch that the main process had at iter(loader).
         started = in_worker and self._process != os.getpid()
         epoch = self.scans.current.at_start if started else self.scans.epoch
         position = int(self._start[1]) if int(self._start[0]) == epoch else 0
         return epoch, position, self._resume.get("given", 0) if self._resume.get("epoch") == epoch else 0
 
     def _place(self) -> dict[str, int]:
-        """Which process this is of how many."""
+        """Rank, worker and batch size of this process."""
         worker = get_worker_info()
         return {
             "rank": self.rank,
@@ -176,7 +179,7 @@ class MixedStream(IterableDataset[Any]):
         }
 
     def _batches(self, epoch: int, position: int, since: int = 0) -> Iterator[range]:
-        """This rank's batches for all workers, from that with number ``since`` on; numbers count from the beginning."""
+        """This rank's batches for all workers, as ranges of sample numbers, from the step with number ``since`` on."""
         size = self.batch_size * self.world_size
         steps: Iterable[range] = (range(i * size, (i + 1) * size) for i in count(since // size))
         if not self.endless:
@@ -189,11 +192,11 @@ class MixedStream(IterableDataset[Any]):
             check_unshared("MixedStream(...)", self.rank, self.world_size)
 
     def __getstate__(self) -> dict[str, Any]:
-        self._check()  # workers that are spawned do not see the Accelerator
+        self._check()  # here, because spawned workers do not see the Accelerator
         return self.__dict__
 
     def _steps(self, start: int, end: int) -> CutSteps:
-        # A loader cuts batches of its own size, so what is left has to stay a batch of its own.
+        # The loader's batches have a fixed size, so the remainder cannot be added to the last batch.
         return cut_steps(start, end, self.batch_size, self.world_size, self.drop_last, join=False)
 
     def _after(self, epoch: int, position: int, done: int) -> tuple[int, int]:

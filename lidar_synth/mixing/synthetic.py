@@ -16,14 +16,14 @@ from lidar_synth.mixing.sources import identity_of
 class Synthetic(Protocol):
     """A source of synthetic scans by number.
 
-    One that works ahead may also have ``set_epoch(epoch)`` and ``expect(numbers)``, the numbers that this process and
-    its workers will ask for next, in order; ``MixedScans`` calls them.
+    A source that works ahead may also have the methods ``set_epoch(epoch)`` and ``expect(numbers)``; ``MixedScans``
+    calls them. ``numbers`` are the scans that this process and its workers will request next, in order.
 
     Attributes:
-        sensor: whose scans they are.
-        fields: which of ``POINT_FIELDS`` they carry.
-        length: how many there are, numbers 0 .. length - 1; None = endless.
-        identity: what its scans follow from, such as checkpoint and seed; goes into the plan's hash.
+        sensor: the sensor of the scans.
+        fields: the fields of ``POINT_FIELDS`` that the scans have.
+        length: number of scans, numbered 0 .. length - 1; None = endless.
+        identity: text of everything that determines the scans, such as checkpoint and seed; part of the plan's hash.
     """
 
     @property
@@ -39,7 +39,7 @@ class Synthetic(Protocol):
     def identity(self) -> str: ...
 
     def __getitem__(self, number: int, /) -> Scan:
-        """The scan, of domain ``SYNTHETIC``; a function of the number alone."""
+        """The scan, with domain ``SYNTHETIC``; a function of the number alone."""
         ...
 
 
@@ -83,8 +83,8 @@ class Generated:
                 "Generated(generator, condition=real) conditions it on the scans of a source.",
             )
         self.generator, self.seed, self.condition = generator, seed, condition
-        self._sampling, self._cache = sampling, cache
-        self._kept: OrderedDict[int, Scan] = OrderedDict()
+        self._sampling, self._cache_size = sampling, cache
+        self._cached: OrderedDict[int, Scan] = OrderedDict()
 
     @property
     def sensor(self) -> Sensor:
@@ -105,14 +105,14 @@ class Generated:
         return f"generated:{model}:{self.seed}:{options}:{conditions}"
 
     def __getitem__(self, number: int) -> Scan:
-        if number in self._kept:
-            self._kept.move_to_end(number)
-            return self._kept[number]
+        if number in self._cached:
+            self._cached.move_to_end(number)
+            return self._cached[number]
         [scan] = self.scans([number])
-        if self._cache:
-            self._kept[number] = scan
-            if len(self._kept) > self._cache:
-                self._kept.popitem(last=False)
+        if self._cache_size:
+            self._cached[number] = scan
+            if len(self._cached) > self._cache_size:
+                self._cached.popitem(last=False)
         return scan
 
     def scans(self, numbers: Sequence[int]) -> list[Scan]:
@@ -121,14 +121,14 @@ class Generated:
         return self.generator.scans(self.seed, numbers, condition, **self._sampling)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_kept": OrderedDict()}
+        return self.__dict__ | {"_cached": OrderedDict()}
 
 
 class Held:
-    """Scans that are there already (a folder that ``lidar-synth sample`` wrote, a town) as synthetic ones.
+    """Existing scans (a folder that ``lidar-synth sample`` wrote, a town) as a synthetic source.
 
     Args:
-        source: of the scans; those of its fields count that its first scan has.
+        source: the scans; the fields of the first scan count as those of all.
     """
 
     def __init__(self, source: Source) -> None:
@@ -144,14 +144,14 @@ class Held:
 
 
 def make_synthetic(source: Any, seed: int = 0) -> Synthetic:
-    """A synthetic source from what users give: a generator, a bank or another ``Synthetic``, or held scans.
+    """Make a synthetic source from a user's argument: a generator, a bank or another ``Synthetic``, or existing scans.
 
     Args:
         source: one of these.
-        seed: of the scans, where a generator makes them.
+        seed: seed of the scans that a generator makes.
 
     Raises:
-        ConfigError: on anything else.
+        ConfigError: on any other type.
     """
     if isinstance(source, Generator):
         return Generated(source, seed)

@@ -40,16 +40,16 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
     """Unfold a scan to a range image with one row per laser; a cell shows its nearest return.
 
     Args:
-        scan: N points in raw ring order, or a crop of such a scan; or in any order with ``scan.ring`` known.
-        sensor: whose lasers and columns; the scan's own by default.
-        anchor: how a ring finds its row, where ``scan.ring`` does not tell it.
+        scan: N points in raw ring order, or a crop of such a scan; with ``scan.ring``, the points may be in any order.
+        sensor: defines lasers and columns; by default the scan's own sensor.
+        anchor: how rows are assigned to rings if the scan has no ``ring``.
 
     Returns:
         An image on ``sensor.by_beams()``, whose rays have the elevations of the lasers.
 
     Raises:
         DataError: on a scan that is not in ring order: more rings than the sensor has lasers, rings that spread over
-            more than one laser's elevation, or a crop that is too narrow to tell.
+            more than one laser's elevation, or a crop that is too narrow to decide.
 
     Example:
         >>> from lidar_synth import open_scans, unfold

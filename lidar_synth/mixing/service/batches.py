@@ -1,8 +1,8 @@
 """Batch mixing: real samples from DataLoader workers, synthetic scans made in the main process on the training device.
 
-A thread makes the scans of the next batch while the trainer works on this one, on a CUDA stream of its own where
-there is a GPU. What comes out is what the dataset gives in any other way: label policy, augmentation and
-``to_sample`` are its own.
+A thread makes the scans of the next batch while the trainer works on the current one; on a GPU it uses a CUDA stream
+of its own. Label policy, augmentation and ``to_sample`` are those of the dataset, so that the samples are the same as
+with any other way of loading.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -20,12 +20,12 @@ from lidar_synth.mixing import Generated, MixedScans
 
 
 class Place(NamedTuple):
-    """One sample of a batch in the making.
+    """One sample of an unfinished batch.
 
     Args:
-        epoch, position: where it stands in the plan.
+        epoch, position: its place in the plan.
         missing: (number of the synthetic source, index) of the scan that is still to be made, or None.
-        sample: where no scan is missing.
+        sample: the finished sample if no scan is missing.
     """
 
     epoch: int
@@ -38,13 +38,13 @@ class BatchMixer:
     """A replacement of ``DataLoader`` for a ``MixedScans`` whose generator is on the GPU.
 
     Args:
-        dataset: whose samples are loaded. The main process makes the scans of generators, workers all other samples.
+        dataset: the dataset. The main process makes the scans of generators; workers load all other samples.
         batch_size: number of samples in a batch, in the order of the plan.
         batch_sampler: instead of ``batch_size``, such as ``dataset.batches(...)`` of one rank.
         options: other options of ``DataLoader``, such as ``num_workers``; ``collate_fn`` is ``dataset.collate``.
 
     Raises:
-        ConfigError: on both or none of ``batch_size`` and ``batch_sampler``.
+        ConfigError: if both or neither of ``batch_size`` and ``batch_sampler`` are given.
 
     Example:
         >>> from lidar_synth import BatchMixer, MixedScans, load_generator, open_scans
@@ -77,14 +77,14 @@ class BatchMixer:
 
     def __iter__(self) -> Iterator[Any]:
         with ThreadPoolExecutor(1, "lidar-synth") as thread:
-            before: Future[Any] | None = None
+            ready: Future[Any] | None = None
             for places in self._loader:
-                making = thread.submit(self._batch, places)
-                if before is not None:
-                    yield before.result()
-                before = making
-            if before is not None:
-                yield before.result()
+                upcoming = thread.submit(self._batch, places)
+                if ready is not None:
+                    yield ready.result()
+                ready = upcoming
+            if ready is not None:
+                yield ready.result()
 
     def _batch(self, places: Sequence[Place]) -> Any:
         scans: dict[tuple[int, int], Scan] = {}
@@ -99,20 +99,20 @@ class BatchMixer:
         )
 
     def _stream(self, device: torch.device) -> AbstractContextManager[Any]:
-        """The stream for scans, so that they do not queue up behind the trainer's work."""
+        """The CUDA stream on which scans are made, so that they do not queue behind the trainer's work."""
         if device.type != "cuda":
             return nullcontext()
         if device not in self._streams:
             self._streams[device] = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-            torch.cuda.synchronize(device)  # the weights are there
+            torch.cuda.synchronize(device)  # until the weights are loaded
         return torch.cuda.stream(self._streams[device])
 
 
 class _Others(Dataset[Place]):
-    """What the workers load: every sample but those whose scan the main process makes."""
+    """The dataset of the workers: all samples except those whose scan the main process makes."""
 
     def __init__(self, dataset: MixedScans, missing: Collection[int]) -> None:
-        # Workers get no network: one on a GPU would not even survive the way.
+        # Workers get no network: one on a GPU could not be sent to them.
         sources: list[Any] = [None if n in missing else source for n, source in enumerate(dataset.synthetic)]
         self._dataset = copy(dataset)
         self._dataset.synthetic = tuple(sources)
@@ -122,8 +122,8 @@ class _Others(Dataset[Place]):
 
     def __getitem__(self, position: int) -> Place:
         epoch = self._dataset.epoch_of(position)
-        made = self._dataset.plan(epoch)
-        source, index = made[position]
-        if source >= made.reals and self._dataset.synthetic[source - made.reals] is None:
-            return Place(epoch, position, (source - made.reals, index))
+        plan = self._dataset.plan(epoch)
+        source, index = plan[position]
+        if source >= plan.reals and self._dataset.synthetic[source - plan.reals] is None:
+            return Place(epoch, position, (source - plan.reals, index))
         return Place(epoch, position, sample=self._dataset.sample(epoch, position))

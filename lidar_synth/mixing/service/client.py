@@ -1,6 +1,6 @@
-"""The other side of the generator process: who starts it, asks it, waits for it and ends it.
+"""The client of the generator process: it starts the process, sends requests, waits for answers and ends it.
 
-Every wait ends: with an answer, with the news of a death, which closes the connection, or with the time-out.
+Every wait ends: with an answer, with a closed connection because the process died, or with the timeout.
 """
 
 import os
@@ -18,19 +18,19 @@ from lidar_synth.mixing.service.slots import Slots
 
 
 class Client:
-    """A generator process, as its parent and the parent's workers see it.
+    """A generator process, as used by its parent process and the parent's workers.
 
     Args:
-        plan: what it does.
-        slots: what it fills.
-        timeout: seconds that a wait may last.
+        plan: the job of the process.
+        slots: the shared memory that it fills.
+        timeout: maximum seconds of a wait.
 
     Attributes:
-        pid: the process's number.
+        pid: the process id.
 
     Raises:
-        ConfigError: in a worker.
-        ProcessError: where it does not start, with its reason.
+        ConfigError: if it is made in a worker process.
+        ProcessError: if the process does not start; the message names the reason.
     """
 
     def __init__(self, plan: GeneratorJob, slots: Slots, timeout: float) -> None:
@@ -58,10 +58,10 @@ class Client:
             raise
 
     def ask(self, *request: int) -> list[int]:
-        """The answer to a request.
+        """Send a request and return the answer.
 
         Raises:
-            ProcessError: where there is none.
+            ProcessError: if the process has died, or does not answer in time.
         """
         answered = False
         try:
@@ -75,28 +75,28 @@ class Client:
         except (EOFError, OSError) as error:
             raise error if isinstance(error, ProcessError) else self._died() from error
         finally:
-            if not answered:  # what comes late is not taken for the answer to another request
+            if not answered:  # a late answer must not be taken for that of another request
                 self._connections.pop(_here(), None)
 
     def tell(self, *request: int) -> None:
-        """A request without an answer; ``OSError`` where nobody hears it."""
+        """Send a request that has no answer; raises ``OSError`` if the process has died."""
         send(self._line(), *request)
 
     def close(self) -> None:
-        """End the process, where it was started here."""
+        """End the process, if this process started it."""
         self._connections.clear()
         if os.getpid() == self._owner:
             self._end()
 
     def __getstate__(self) -> dict[str, Any]:
-        assert_spawning(self)  # elsewhere the pickle would hold a copy of the slots that nobody fills
+        assert_spawning(self)  # in any other pickle the slots would be a copy that no process fills
         return {k: v for k, v in self.__dict__.items() if k not in ("_process", "_end")} | {"_connections": {}}
 
     def _line(self) -> Connection:
-        """This thread's own connection; a fork inherits its parent's, but has to leave them alone."""
+        """This thread's own connection; a forked process must not use the ones inherited from its parent."""
         if _here() not in self._connections:
             if os.getpid() == self._owner and not self._end.alive:
-                raise ConfigError("a rolling bank that is closed", "one that is open")
+                raise ConfigError("a rolling bank that is closed", "an open one")
             for inherited in [key for key in self._connections if key[0] != os.getpid()]:
                 del self._connections[inherited]
             line = self._connections[_here()] = connection.Client(self._address)
@@ -108,10 +108,10 @@ class Client:
         if os.getpid() == self._owner:
             self._process.join(1)
             code = f", exit code {self._process.exitcode}"
-        words = self._slots.last_words or "it said nothing: killed, out of memory, or closed by the main process"
+        words = self._slots.last_words or "no message: killed, out of memory, or closed by the main process"
         return ProcessError(
             f"the generator process of the rolling bank died (process {self.pid}{code}; {words})",
-            "one that lives as long as training",
+            "a process that lives as long as training",
             hint,
         )
 
@@ -120,8 +120,8 @@ class Client:
         return ProcessError(
             f"the generator process of the rolling bank (process {self.pid}, {made} scans made so far) has not {what} "
             f"within {self.timeout:g} s",
-            "a model that keeps up",
-            "Give timeout= more seconds, use a faster device or fewer steps, or serve held scans: starved='reuse'.",
+            "a model that is fast enough",
+            "Increase timeout=, use a faster device or fewer steps, or reuse scans in memory: starved='reuse'.",
         )
 
 
@@ -131,5 +131,5 @@ def _here() -> tuple[int, int]:
 
 def _end(process: BaseProcess, owner: int) -> None:
     if os.getpid() == owner:  # not in a fork
-        process.kill()  # it holds nothing that it could save
+        process.kill()  # it has nothing to save
         process.join()

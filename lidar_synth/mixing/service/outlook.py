@@ -1,7 +1,7 @@
-"""Which scans will be asked for, and when: what a rolling bank makes ahead, and which scans it can let go.
+"""Outlooks predict which scans will be requested next, and which slots of a rolling bank may be overwritten.
 
-An outlook gives every scan a *use*: how far along it is needed next, ``NEVER`` where it is not. The scan with the
-nearest use is made first, and the one with the farthest gives way to it (Belady's rule, which no other beats).
+An outlook assigns every scan a *use*: the position of its next request, or ``NEVER``. The scan with the nearest use is
+made first, and the scan with the farthest use is overwritten (Belady's rule, which is optimal).
 """
 
 import math
@@ -13,26 +13,26 @@ NEVER = math.inf
 
 
 class Outlook(Protocol):
-    """What the ledger needs to know of the future."""
+    """A prediction of requests for the ledger."""
 
     def answer(self, number: int) -> int:
-        """Which scan a request for ``number`` gets; it is noted that the request came."""
+        """The number of the scan that serves a request for ``number``; the request is recorded."""
         ...
 
     def upcoming(self, held: Container[int]) -> tuple[float, int] | None:
-        """Use and number of the nearest scan that is not held; None where no more is known."""
+        """The use and number of the next scan that is not held in memory; None if no further request is known."""
         ...
 
     def next_use(self, number: int, served: int) -> float:
-        """The next use of a scan that was served so many times already."""
+        """The next use of a scan that was already served ``served`` times."""
         ...
 
 
 class SequentialPrefetch:
-    """Nobody said anything: 0, 1, 2, ... or on from wherever requests are.
+    """Predicts 0, 1, 2, ..., or consecutive numbers from the latest request on, when no order was announced.
 
     Args:
-        window: how far requests come out of order at most; what is left behind farther will not be asked for.
+        window: maximum distance of requests that come out of order; older scans are not expected to be requested.
     """
 
     def __init__(self, window: int) -> None:
@@ -41,7 +41,7 @@ class SequentialPrefetch:
 
     def answer(self, number: int) -> int:
         if not self._past <= number < self._next + self._window:
-            self._past = self._next = number  # not out of order, but training that goes on somewhere else
+            self._past = self._next = number  # a jump: training has resumed at another position
         self._past = max(self._past, number - self._window)
         return number
 
@@ -55,10 +55,10 @@ class SequentialPrefetch:
 
 
 class KnownOrder:
-    """The numbers are known, in order; a number may stand there more than once.
+    """Predicts an announced order of numbers, which may contain a number several times.
 
     Args:
-        numbers: of the scans.
+        numbers: numbers of the scans, in the order of their requests.
         window: as for ``SequentialPrefetch``.
     """
 
@@ -93,11 +93,11 @@ class KnownOrder:
 
 
 class RotatingPool:
-    """Some scans that serve for an epoch; with the next one, the oldest of them are replaced.
+    """A pool of scans that serves all requests of an epoch; each new epoch replaces the oldest scans.
 
     Args:
-        size: scans in the pool.
-        replaced: how many an epoch replaces.
+        size: number of scans in the pool.
+        replaced: number of scans that an epoch replaces.
     """
 
     def __init__(self, size: int, replaced: int) -> None:
@@ -105,7 +105,7 @@ class RotatingPool:
         self.set_epoch(0)
 
     def set_epoch(self, epoch: int) -> None:
-        """Move on to this epoch's scans."""
+        """Switch to this epoch's scans."""
         self._first = self._next = epoch * self._replaced
 
     def answer(self, number: int) -> int:

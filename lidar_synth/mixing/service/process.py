@@ -1,8 +1,8 @@
 """The generator process: it owns the model, fills the slots and answers the readers.
 
-One thread makes scans; one for each reader answers it; one ends the process when its parent is gone, however that
-ended. A message is a few int64, so that nothing is ever unpickled and a reader that dies in mid-message leaves
-nothing behind but a closed connection.
+One thread makes scans, one thread answers each reader, and one ends the process when its parent has ended in any way.
+A message is a few int64 numbers, so that nothing is ever unpickled, and a reader that dies in the middle of a message
+leaves only a closed connection behind.
 """
 
 import hmac
@@ -29,27 +29,28 @@ from lidar_synth.mixing.service.ledger import Ledger, Slot, Starved
 from lidar_synth.mixing.service.slots import Slots
 
 GET, GIVE_BACK, SET_EPOCH, EXPECT = range(4)
-"""First number of a request; then a scan's number, nothing, an epoch, and (whether it is the last part, numbers...).
+"""The first number of a request. The others are the scan's number (``GET``), none (``GIVE_BACK``), the epoch
+(``SET_EPOCH``), or whether this is the last part, followed by the numbers (``EXPECT``).
 
-``GET`` is answered by (slot, number, checksum), ``GIVE_BACK`` not at all, the others by 0.
+The answer to ``GET`` is (slot, number, checksum); ``GIVE_BACK`` has no answer; the others are answered by 0.
 """
 
 WATCH = 0.5
-"""Seconds between two looks at the parent."""
+"""Seconds between two checks that the parent is alive."""
 
 
 @dataclass(frozen=True)
 class GeneratorJob:
-    """What the process does.
+    """The job of the generator process.
 
     Args:
-        model: as ``load_generator`` takes it.
-        options: for ``load_generator``.
-        sampling: for ``Generator.range_images``.
-        seed: of the scans.
-        starved, replaced: as ``Ledger`` takes them.
-        threads: of torch; None = torch's own choice.
-        secret: the first message of a reader.
+        model: as for ``load_generator``.
+        options: options of ``load_generator``.
+        sampling: options of ``Generator.range_images``.
+        seed: seed of the scans.
+        starved, replaced: as for ``Ledger``.
+        threads: number of torch threads; None = torch's default.
+        secret: the first message of every reader, which authenticates it.
     """
 
     model: str | Path
@@ -63,23 +64,23 @@ class GeneratorJob:
 
 
 def send(connection: Connection, *values: int) -> None:
-    """A message of int64."""
+    """Send a message of int64 numbers."""
     connection.send_bytes(np.array(values, np.int64).tobytes())
 
 
 def receive(connection: Connection) -> list[int]:
-    """The inverse of ``send``."""
+    """Receive a message; the inverse of ``send``."""
     values: list[int] = np.frombuffer(connection.recv_bytes(), np.int64).tolist()
     return values
 
 
 def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
-    """The process; returns never.
+    """The main function of the process; it never returns.
 
     Args:
-        plan: what to do.
-        slots: what to fill.
-        started: where to send the address once the model is loaded.
+        plan: the job.
+        slots: the shared memory to fill.
+        started: the pipe to which the address is sent once the model is loaded.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; the parent ends us
     Thread(target=_watch_parent, daemon=True).start()
@@ -88,7 +89,7 @@ def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
             torch.set_num_threads(plan.threads)
         generator = load_generator(plan.model, **plan.options)
         ledger = Ledger(slots.count, slots.counters, plan.starved, plan.replaced)
-        # Linux: a name that no file stands for and that ends with the process.
+        # Linux: an abstract socket name, which has no file and disappears with the process.
         name = f"\0lidar-synth-{token_hex(16)}" if sys.platform == "linux" else None
         listener = Listener(name, backlog=128)
         Thread(target=_accept, args=(listener, plan.secret, ledger), daemon=True).start()
@@ -109,9 +110,9 @@ def _make(generator: Generator, plan: GeneratorJob, claimed: Sequence[Slot], slo
 
 
 def _watch_parent() -> None:
-    """End with the parent. Its pipe alone does not tell: forked workers hold the other end, too."""
+    """End this process with its parent. Its pipe does not show this, because forked workers hold the other end too."""
     parent = parent_process()
-    assert parent is not None, "a generator process that nobody started"
+    assert parent is not None, "a generator process without a parent"
     number = parent.pid if os.name == "posix" else os.getppid()
     while parent.is_alive() and os.getppid() == number:
         parent.join(WATCH)
@@ -125,7 +126,7 @@ def _accept(listener: Listener, secret: bytes, ledger: Ledger) -> None:
 
 
 def _answer(connection: Connection, secret: bytes, ledger: Ledger) -> None:
-    """Serve one reader as long as it lives."""
+    """Serve one reader until its connection is closed."""
     lent: Slot | None = None
     expected: list[int] = []
     with connection, suppress(OSError, EOFError):

@@ -28,7 +28,7 @@ from lidar_synth.mixing.service.ledger import COUNTERS, Starved
 from lidar_synth.mixing.service.process import EXPECT, GET, GIVE_BACK, SET_EPOCH, GeneratorJob
 from lidar_synth.mixing.service.slots import Slots
 
-_PART = 8192  # numbers in one message: less than a socket holds, so that sending never waits
+_PART = 8192  # numbers in one message: fewer than fit into a socket's buffer, so that sending never blocks
 
 
 class RollingBank:
@@ -61,7 +61,7 @@ class RollingBank:
         sensor: the sensor that defines the scans' grid.
         fields: the fields that the scans have besides their points.
         length: None, because the scans are endless.
-        identity: the text that stands for the bank in a plan's hash.
+        identity: the text that identifies the bank in a plan's hash.
 
     Raises:
         ConfigError: on invalid values.
@@ -97,13 +97,13 @@ class RollingBank:
         header, checksum = read_header(path)
         if header.conditioning:
             raise ConfigError(f"a rolling bank of {path}, a conditional model", "an unconditional model")
-        made = set(header.channels) | ({"confidence"} if "label" in header.channels else set())
+        channels = set(header.channels) | ({"confidence"} if "label" in header.channels else set())
         replaced = round((refresh or 0) * slots)
         self.sensor = header.sensor
-        self.fields = frozenset(made - {"range"} | {"reflectance"})
+        self.fields = frozenset(channels - {"range"} | {"reflectance"})
         self.identity = f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:{starved}:{replaced}"
         self._name = f"{path.stem}/{seed}"
-        self._slots = Slots(Encoding(header.sensor, made), slots + replaced)
+        self._slots = Slots(Encoding(header.sensor, channels), slots + replaced)
         plan = GeneratorJob(path, seed, starved, replaced, threads, options, {"steps": steps, "solver": solver})
         self._client = Client(plan, self._slots, timeout)
 
@@ -120,8 +120,8 @@ class RollingBank:
             ProcessError: if the generator process died, or made no scan within ``timeout`` seconds.
             DataError: if the scan's bytes in shared memory are not those that were written.
         """
-        made, arrays = self.read(number)
-        return replace(unproject(self._slots.encoding.decode(arrays)), id=f"{self._name}/{made}", domain=SYNTHETIC)
+        served, arrays = self.read(number)
+        return replace(unproject(self._slots.encoding.decode(arrays)), id=f"{self._name}/{served}", domain=SYNTHETIC)
 
     def image(self, number: int) -> RangeImage:
         """The range image of the scan at ``number``; raises as ``bank[number]``."""
@@ -131,11 +131,11 @@ class RollingBank:
         """The number of the scan that serves a request, and its encoded arrays; raises as ``bank[number]``."""
         if not 0 <= number < 2**63:
             raise ConfigError(f"scan {number}", "0 <= number < 2^63")
-        slot, made, checksum = self._client.ask(GET, int(number))
+        slot, served, checksum = self._client.ask(GET, int(number))
         try:
-            return made, self._slots.read(slot, made, checksum)
+            return served, self._slots.read(slot, served, checksum)
         finally:
-            with suppress(OSError):  # where it is dead, the next request says so
+            with suppress(OSError):  # if the process is dead, the next request raises an error
                 self._client.tell(GIVE_BACK)
 
     def expect(self, numbers: Sequence[int]) -> None:

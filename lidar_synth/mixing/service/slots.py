@@ -1,8 +1,8 @@
-"""Shared memory with encoded scans: what the generator process writes and the readers copy.
+"""Shared memory with encoded scans, which the generator process writes and the readers copy.
 
-One block that belongs to no file: where it has no name (Linux, Windows), the kernel frees it with the last process
-that maps it, however that one ends; elsewhere torch's own manager does. Beside the scans it holds the counters and
-the last words of the process that fills it.
+It is one block without a file. On Linux and Windows it has no name either, so that the kernel frees it when the last
+process that maps it ends in any way; elsewhere torch's own manager frees it. Besides the scans it holds the counters
+and the last words of the process that fills it.
 """
 
 import math
@@ -22,14 +22,14 @@ _WORDS = 4096  # bytes for the last words
 
 
 class Slots:
-    """Room for some scans, shared with every process that this object is handed to.
+    """Memory for a number of scans, shared with every process to which this object is passed.
 
     Args:
-        encoding: of the scans.
-        count: how many.
+        encoding: the encoding of the scans.
+        count: number of slots.
 
     Raises:
-        ConfigError: where there is not enough shared memory.
+        ConfigError: if there is not enough shared memory.
     """
 
     def __init__(self, encoding: Encoding, count: int) -> None:
@@ -44,18 +44,18 @@ class Slots:
         except RuntimeError as error:
             raise ConfigError(
                 f"a rolling bank of {count} slots, {count * self._size / 1e6:.0f} MB of shared memory ({error})",
-                "less than is free",
-                "Use fewer slots, or give the machine more: docker run --shm-size=1g.",
+                "no more than is free",
+                "Use fewer slots, or a container with more shared memory: docker run --shm-size=1g.",
             ) from error
 
     @property
     def counters(self) -> NDArray[np.int64]:
-        """(4,) the values of ``COUNTERS``, in place; only the generator process writes them."""
+        """(4,) a view of the values of ``COUNTERS``; only the generator process writes them."""
         return self._part(0, 8 * len(COUNTERS)).view(np.int64)
 
     @property
     def last_words(self) -> str:
-        """Why the generator process ended, as far as it could say so."""
+        """The reason why the generator process ended, if it could write one."""
         return bytes(self._words()).rstrip(b"\0").decode(errors="replace")
 
     @last_words.setter
@@ -64,16 +64,16 @@ class Slots:
         self._words()[: len(content)] = np.frombuffer(content, np.uint8)
 
     def write(self, slot: int, number: int, image: RangeImage) -> int:
-        """Put scan ``number`` into a slot that nobody reads; returns its checksum."""
+        """Write scan ``number`` into a slot without readers, and return its checksum."""
         place = self._slot(slot)
         self.encoding.encode(image, out=self._arrays(place))
         return _checksum(place, number)
 
     def read(self, slot: int, number: int, checksum: int) -> dict[str, NDArray[Any]]:
-        """A copy of scan ``number`` in a slot, as the encoding has it.
+        """A copy of the encoded arrays of scan ``number`` in a slot.
 
         Raises:
-            DataError: where the bytes are not those that were written.
+            DataError: if the bytes are not those that were written.
         """
         copy = self._slot(slot).copy()
         if _checksum(copy, number) != checksum:
@@ -101,5 +101,5 @@ class Slots:
 
 
 def _checksum(content: NDArray[np.uint8], number: int) -> int:
-    """CRC-32 of a slot's bytes and of the scan's number, so that a scan in another's place is noticed as well."""
+    """CRC-32 of a slot's bytes and of the scan's number, so that a scan in a wrong slot is noticed as well."""
     return zlib.crc32(content.data, zlib.crc32(number.to_bytes(8, "little")))
