@@ -2,12 +2,12 @@
 
 import math
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from conftest import Golden
 from flows import MEAN, STD, gaussian_flow, gaussian_velocity
 from safetensors.torch import load_file
 from torch import Tensor
@@ -123,7 +123,7 @@ def test_four_steps_of_the_student_reach_the_end_of_the_teacher() -> None:
 
 @pytest.mark.parametrize("k", [1, 2, 4])
 @pytest.mark.parametrize("name", ["uniform", "u_shaped", "logit_normal"])
-def test_times_are_rounded_as_in_r2flow(golden: Path, name: str, k: int) -> None:
+def test_times_are_rounded_as_in_r2flow(golden: Golden, name: str, k: int) -> None:
     """R2Flow rounds its time (0 = noise) down to floor(t k) / k, where a sampler of k steps evaluates."""
     vectors = load_file(golden / "r2flow_losses.safetensors")
     theirs = vectors[f"timesteps/{name}/first_64"]

@@ -4,10 +4,10 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
+from conftest import Golden
 from flows import MEAN, STD, gaussian_velocity
 from safetensors.torch import load_file
 from torch import Tensor
@@ -114,7 +114,7 @@ def test_metrics_equal_values_computed_by_hand() -> None:
 
 
 @pytest.mark.parametrize("case", range(3))
-def test_pseudo_huber_equals_that_of_r2flow(golden: Path, case: int) -> None:
+def test_pseudo_huber_equals_that_of_r2flow(golden: Golden, case: int) -> None:
     stored = load_file(golden / "r2flow_losses.safetensors")
     vectors = {k.split("/")[1]: v for k, v in stored.items() if f"_{case}/" in k}
     v = vectors["v"].requires_grad_()
@@ -129,7 +129,7 @@ def test_pseudo_huber_equals_that_of_r2flow(golden: Path, case: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["uniform", "u_shaped", "logit_normal"])
-def test_distributions_of_t_equal_those_of_r2flow(golden: Path, name: str) -> None:
+def test_distributions_of_t_equal_those_of_r2flow(golden: Golden, name: str) -> None:
     """R2Flow's time runs the other way; all three distributions are symmetric and are compared both ways."""
     vectors = load_file(golden / "r2flow_losses.safetensors")
     t = TIMESTEPS[name](uniform(0, range(10000))).double()

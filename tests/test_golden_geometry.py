@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import Golden
 from safetensors.torch import load_file
 
 from lidar_synth.formats.points import read_points
@@ -85,7 +86,7 @@ def kitti_scan(real_scans: Path) -> Scan:
 
 @pytest.mark.parametrize("columns", [1024, 2048])
 @pytest.mark.parametrize("kind", ["spherical", "unfolding"])
-def test_r2flow_projection_of_a_real_scan(golden: Path, kitti_scan: Scan, kind: str, columns: int) -> None:
+def test_r2flow_projection_of_a_real_scan(golden: Golden, kitti_scan: Scan, kind: str, columns: int) -> None:
     expected = np.load(golden / "r2flow_projection.npz")
     image = (project if kind == "spherical" else unfold)(kitti_scan, hdl64(columns))
     different = image.range != expected[f"{kind}_{columns}/depth"].reshape(64, columns)
@@ -94,7 +95,7 @@ def test_r2flow_projection_of_a_real_scan(golden: Path, kitti_scan: Scan, kind: 
     assert np.array_equal(image.reflectance[same], expected[f"{kind}_{columns}/reflectance"].reshape(64, columns)[same])
 
 
-def test_lidm_projection_of_a_real_scan(golden: Path, kitti_scan: Scan) -> None:
+def test_lidm_projection_of_a_real_scan(golden: Golden, kitti_scan: Scan) -> None:
     expected = np.load(golden / "lidm_projection.npz")
     image = project(kitti_scan, lidm(1024))
     different = np.where(image.mask, image.range, -1) != expected["range"]
@@ -103,7 +104,7 @@ def test_lidm_projection_of_a_real_scan(golden: Path, kitti_scan: Scan) -> None:
 
 
 @pytest.mark.parametrize(("name", "offset"), [("log", 1e-4), ("linear", 0.0)])
-def test_lidm_scales_and_points(golden: Path, kitti_scan: Scan, name: str, offset: float) -> None:
+def test_lidm_scales_and_points(golden: Golden, kitti_scan: Scan, name: str, offset: float) -> None:
     """LiDM adds 0.1 mm before the logarithm and does not subtract it again; its rays point to cell corners."""
     expected = np.load(golden / "lidm_projection.npz")
     scale: Normalisation = NORMALISATIONS[f"lidm_{name}"]

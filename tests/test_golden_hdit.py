@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from conftest import Golden
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -52,7 +53,7 @@ TINY = ("r2flow_hdit_tiny_learnable", "r2flow_hdit_tiny_fourier")
 
 @pytest.mark.parametrize("grad", [False, True], ids=["inference", "training"])
 @pytest.mark.parametrize("name", TINY)
-def test_velocities_equal_those_of_r2flow(golden: Path, name: str, grad: bool) -> None:
+def test_velocities_equal_those_of_r2flow(golden: Golden, name: str, grad: bool) -> None:
     """v(y, t) = -u(1 - t, y): R2Flow's t = 0 is noise, and its velocity points to the data."""
     net, tensors, tolerance = golden_network(golden, name)
     with torch.set_grad_enabled(grad):
@@ -63,7 +64,7 @@ def test_velocities_equal_those_of_r2flow(golden: Path, name: str, grad: bool) -
 
 @pytest.mark.parametrize("name", TINY)
 @torch.no_grad()
-def test_intermediate_results_equal_those_of_r2flow(golden: Path, name: str) -> None:
+def test_intermediate_results_equal_those_of_r2flow(golden: Golden, name: str) -> None:
     net, tensors, tolerance = golden_network(golden, name)
     taps = {}
     net.down[0][-1].register_forward_hook(lambda _, __, out: taps.update(down_level_0=out))
@@ -80,7 +81,7 @@ def test_intermediate_results_equal_those_of_r2flow(golden: Path, name: str) -> 
 
 @pytest.mark.parametrize("name", TINY)
 @torch.no_grad()
-def test_sampled_states_equal_those_of_r2flow(golden: Path, name: str) -> None:
+def test_sampled_states_equal_those_of_r2flow(golden: Golden, name: str) -> None:
     """Euler steps in our descending time reach the same states as R2Flow's."""
     net = golden_network(golden, name)[0]
     about, tensors = read_golden(golden, "r2flow_sampling")
@@ -99,7 +100,7 @@ def test_sampled_states_equal_those_of_r2flow(golden: Path, name: str) -> None:
 @pytest.mark.parametrize("grid", ["polar", "hdl64e"])
 @pytest.mark.parametrize("basis", sorted(BASES))
 @torch.no_grad()
-def test_position_encodings_equal_those_of_r2flow(golden: Path, basis: str, grid: str) -> None:
+def test_position_encodings_equal_those_of_r2flow(golden: Golden, basis: str, grid: str) -> None:
     about, tensors = read_golden(golden, "r2flow_positions")
     config, coords = about["config"], tensors[f"input.coords_{grid}"][0]
     expected = tensors[f"basis.{basis}/{grid}"][0].movedim(0, -1)

@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from conftest import Golden
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -38,7 +39,7 @@ def tolerance(figures: dict[str, float]) -> float:
 
 @pytest.mark.parametrize("grad", [False, True], ids=["inference", "training"])
 @pytest.mark.parametrize("name", ["lidm_unet_tiny_uncond", "lidm_unet_tiny_context"])
-def test_the_unet_equals_that_of_lidm(golden: Path, name: str, grad: bool) -> None:
+def test_the_unet_equals_that_of_lidm(golden: Golden, name: str, grad: bool) -> None:
     about, tensors, weights = read_golden(golden, name)
     parts = {VELOCITY: unet_part(about["config"], name)}
     net = cast(DiffusionUNet, convert({UNET + k: v for k, v in weights.items()}, parts)[VELOCITY])
@@ -55,7 +56,7 @@ def test_the_unet_equals_that_of_lidm(golden: Path, name: str, grad: bool) -> No
 
 
 @torch.no_grad()
-def test_the_autoencoder_equals_that_of_lidm(golden: Path) -> None:
+def test_the_autoencoder_equals_that_of_lidm(golden: Golden) -> None:
     about, tensors, weights = read_golden(golden, "lidm_vqvae_tiny")
     net = cast(VQVAE, convert(weights, {CODEC: codec_part(about["config"], about["size"], "")})[CODEC])
     assert sum(p.numel() for p in net.parameters()) == about["parameters"]
@@ -107,7 +108,7 @@ def test_the_masked_autoencoder_equals_that_of_lidm() -> None:
 
 
 @torch.no_grad()
-def test_encoded_label_maps_equal_those_of_lidm(golden: Path) -> None:
+def test_encoded_label_maps_equal_those_of_lidm(golden: Golden) -> None:
     """LiDM uses 0 for unlabelled and classes from 1; we use 255 and classes from 0."""
     about, tensors, weights = read_golden(golden, "lidm_spatial_rescaler")
     theirs = tensors["input.labels"]

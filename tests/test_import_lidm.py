@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from conftest import Golden
 from safetensors.torch import load_file
 from torch import Tensor
 from typer.testing import CliRunner
@@ -180,7 +181,7 @@ def test_weights_without_an_average_are_imported_unchanged(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", ["vqvae", "uncond", "sem2lidar", "cam2lidar"])
-def test_all_keys_of_the_published_networks_are_imported(name: str, golden: Path, tmp_path: Path) -> None:
+def test_all_keys_of_the_published_networks_are_imported(name: str, golden: Golden, tmp_path: Path) -> None:
     """Up to 395 M parameters by name and shape; each tensor is one expanded number."""
     published = json.loads((golden / f"lidm_{name}_full_keys.json").read_text())
     zero = torch.zeros(())
@@ -297,7 +298,7 @@ def test_code_in_a_pickle_does_not_run(tmp_path: Path) -> None:
         read_lidm(path)
 
 
-def test_an_imported_checkpoint_gives_the_results_of_lidm(golden: Path, tmp_path: Path) -> None:
+def test_an_imported_checkpoint_gives_the_results_of_lidm(golden: Golden, tmp_path: Path) -> None:
     """.ckpt -> import -> checkpoint -> autoencoder gives LiDM's own results."""
     about = json.loads((golden / "lidm_vqvae_tiny.json").read_text())
     tensors = load_file(golden / "lidm_vqvae_tiny.safetensors")

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from conftest import Golden
 from safetensors.torch import load_file
 from torch import Tensor
 from typer.testing import CliRunner
@@ -137,7 +138,7 @@ def test_time_and_sign_are_folded_into_the_weights(released: Path) -> None:
     assert torch.equal(net.detokenize.weight, -weights["detokenizer.1.weight"])
 
 
-def test_all_keys_of_the_released_network_are_imported(golden: Path, tmp_path: Path) -> None:
+def test_all_keys_of_the_released_network_are_imported(golden: Golden, tmp_path: Path) -> None:
     """80.9 M parameters by name and shape; each tensor is one expanded number, so that the file stays small."""
     published = json.loads((golden / "r2flow_hdit_full_keys.json").read_text())
     weights = {key: torch.zeros(1).expand(shape) for key, shape, _, _ in published["keys"]}
@@ -149,7 +150,7 @@ def test_all_keys_of_the_released_network_are_imported(golden: Path, tmp_path: P
     assert header.sensor.shape == (64, 1024)
 
 
-def test_an_imported_checkpoint_gives_the_results_of_r2flow(golden: Path, tmp_path: Path) -> None:
+def test_an_imported_checkpoint_gives_the_results_of_r2flow(golden: Golden, tmp_path: Path) -> None:
     """.pth -> import -> checkpoint -> network gives R2Flow's own results."""
     name = "r2flow_hdit_tiny_learnable"
     about = json.loads((golden / f"{name}.json").read_text())

@@ -1,11 +1,10 @@
 """Measures of realism against the numbers of both protocols, and by hand."""
 
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import random_scan
+from conftest import Golden, random_scan
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.numpy import load_file
@@ -35,7 +34,7 @@ Vectors = dict[str, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def vectors(golden: Path) -> Vectors:
+def vectors(golden: Golden) -> Vectors:
     return load_file(golden / "metrics.safetensors")
 
 

@@ -1,12 +1,12 @@
 """Solvers on flows with known solutions."""
 
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from conftest import Golden
 from flows import gaussian_flow, gaussian_velocity
 from safetensors.torch import load_file
 from torch import Tensor
@@ -86,7 +86,7 @@ def test_the_state_keeps_its_dtype() -> None:
 
 
 @pytest.mark.parametrize("model", ["r2flow_hdit_tiny_learnable", "r2flow_hdit_tiny_fourier"])
-def test_euler_on_uneven_grids_equals_that_of_r2flow(golden: Path, model: str) -> None:
+def test_euler_on_uneven_grids_equals_that_of_r2flow(golden: Golden, model: str) -> None:
     """R2Flow's states follow from its velocities in our convention of time and sign; no network is involved."""
     vectors = {k.removeprefix(f"{model}/"): v for k, v in load_file(golden / "r2flow_sampling.safetensors").items()}
     answers = iter(vectors["velocities"])
