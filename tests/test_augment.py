@@ -101,7 +101,7 @@ def test_boxes_contain_the_same_points(name: str, seed: int) -> None:
 
 @settings(max_examples=25)
 @given(seed=seeds, angle=st.floats(-7, 7), factor=st.floats(0.5, 2))
-def test_what_is_done_can_be_undone(seed: int, angle: float, factor: float) -> None:
+def test_augmentations_can_be_inverted(seed: int, angle: float, factor: float) -> None:
     scan = scan_with_boxes(seed % 50, 300)
     for changed in (
         rotated(rotated(scan, angle), -angle),
@@ -131,7 +131,7 @@ def test_yaws_turn_and_flip_with_their_boxes() -> None:
     assert np.allclose(scaled(scan, 2).boxes.values[0, 3:6], 2 * scan.boxes.values[0, 3:6])
 
 
-def test_what_the_camera_saw_is_forgotten_where_the_world_moves() -> None:
+def test_moving_a_scan_removes_its_camera_image() -> None:
     scan = scan_with_boxes(0)
     for changed in (rotated(scan, 1), mirrored(scan, "x"), scaled(scan, 1.1)):
         assert changed.pose is None and changed.image_path is None and changed.boxes is not None

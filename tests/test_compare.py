@@ -74,7 +74,7 @@ def as_sample(form: Callable[..., Any], ignored: int = -1) -> Callable[..., Any]
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_the_same_form_is_taken_whatever_it_is(name: str) -> None:
+def test_samples_of_the_same_form_are_accepted(name: str) -> None:
     train = MixedScans.wrap(Theirs(FORMS[name]), Endless(), 0.5, to_sample=as_sample(FORMS[name]))
     assert len(train) == 12
 

@@ -152,7 +152,7 @@ def test_a_scan_that_the_format_cannot_hold_is_skipped(tmp_path: Path) -> None:
     assert report.written == 1 and list(report.skipped) == ["0"]
 
 
-def test_a_full_target_stops_the_run_whatever_the_policy(tmp_path: Path) -> None:
+def test_a_full_target_stops_the_run_for_every_policy(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("in the way")
     with pytest.raises(FileError, match="cannot be written"):
         convert([some_scan()], WRITERS["npz"](tmp_path / "out"), on_bad="skip", progress=False)
@@ -191,7 +191,7 @@ def test_the_command(dataset: Path, tmp_path: Path) -> None:
     assert "0 scans written, 3 were there already, 0 skipped" in result.output
 
 
-def test_the_command_prints_what_it_skipped_and_why(dataset: Path, tmp_path: Path) -> None:
+def test_the_command_prints_skipped_scans_with_reasons(dataset: Path, tmp_path: Path) -> None:
     [*_, path] = sorted(dataset.rglob("*.bin"))
     path.write_bytes(b"cut")
     result = CliRunner().invoke(app, [str(dataset), str(tmp_path / "out"), "--to", "kitti", "--on-bad", "skip"])

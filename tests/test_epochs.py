@@ -93,7 +93,7 @@ def test_a_hook_at_the_beginning_of_an_epoch(workers: int) -> None:
         assert samples(iterator) == planned(train, 1)
 
 
-def test_a_worker_that_is_slow_to_start_knows_where_its_pass_began() -> None:
+def test_a_slow_worker_starts_in_the_epoch_in_which_its_pass_began() -> None:
     """It has fetched nothing yet, but the others may have."""
     train = mixed()
     loader = DataLoader(train, 4, num_workers=1, collate_fn=list, worker_init_fn=lambda _: time.sleep(0.5))
@@ -182,7 +182,7 @@ def caught() -> Iterator[list[warnings.WarningMessage]]:
 AGAIN = "epoch 0 begins again"
 
 
-def test_an_epoch_that_comes_again_is_said_once(caught: list[warnings.WarningMessage]) -> None:
+def test_a_repeated_epoch_gives_one_warning(caught: list[warnings.WarningMessage]) -> None:
     for carried in (False, True):
         train = mixed(9)
         how: dict[str, Any] = {"batch_sampler": train.batches(4)} if carried else {"batch_size": 4}

@@ -56,7 +56,7 @@ def trained_on(folder: Path, data: dict[str, object]) -> None:
 
 
 @pytest.mark.parametrize("same", [True, False])
-def test_what_the_model_was_trained_on_is_no_reference(folders: tuple[Path, Path], tmp_path: Path, same: bool) -> None:
+def test_training_data_is_refused_as_reference(folders: tuple[Path, Path], tmp_path: Path, same: bool) -> None:
     real, fake = (shutil.copytree(folder, tmp_path / folder.name) for folder in folders)
     call = ["evaluate", str(real), str(fake), "--protocol", "town", "--json"]
     trained_on(fake, {"path": f"{real.parent}/../{tmp_path.name}/real", "split": None if same else "train"})
@@ -160,7 +160,7 @@ def test_overlapping_drives_are_refused(model: str, split: str, shared: list[str
 
 @pytest.mark.parametrize("parent", ["teacher", "weaker", "init", "codec"])
 @pytest.mark.parametrize("model", OLDER)
-def test_what_a_model_was_made_from_counts(model: str, parent: str) -> None:
+def test_training_data_of_parent_checkpoints_counts(model: str, parent: str) -> None:
     own = {"data": {"town": 5, "seed": 1}}
     child = own | {f"{parent}_provenance": {"data": "?", "init_provenance": OLDER[model]}}
     assert seen_by(OLDER[model])
@@ -190,7 +190,7 @@ def test_an_exported_town_is_not_the_dataset_whose_layout_it_has(kitti360: Path,
     assert "town seed 4 (all frames)" in str(refused(judge(town, fake)))
 
 
-def test_what_is_not_known_is_said(kitti360: Path, fake: Path) -> None:
+def test_unknown_training_data_is_reported(kitti360: Path, fake: Path) -> None:
     (fake / NOTE).write_text(json.dumps({"trained_on": "KITTI raw"}))
     result = judge(kitti360, fake)
     assert result.exception is None
@@ -204,7 +204,7 @@ def test_kittis_object_set_may_share_frames_with_raw_drives(odometry: Path, fake
     assert "whether the two share frames is not known" in judge(odometry, fake).stderr
 
 
-def test_a_bank_tells_what_its_model_was_trained_on(kitti360: Path, tmp_path: Path) -> None:
+def test_a_bank_records_the_training_data_of_its_model(kitti360: Path, tmp_path: Path) -> None:
     bank = tmp_path / "bank"
     write_bank(bank, [some_image(i) for i in range(2)], provenance=OLDER["own lidm/train"])
     assert "2013_05_28_drive_0002_sync" in str(refused(judge(kitti360, bank, "--split", "r2flow/test")))

@@ -79,7 +79,7 @@ def test_labels_without_raw_values_are_written_as_static_classes(label: np.ndarr
     assert (raw[label == IGNORE] == 0).all() and raw.max() < 100
 
 
-def test_a_changed_label_is_what_is_written() -> None:
+def test_a_changed_label_is_written() -> None:
     scan = some_scan()
     assert scan.label is not None
     scan.label = np.where(scan.label == 0, 8, scan.label).astype(np.uint8)
@@ -158,7 +158,7 @@ def test_pose_files_by_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.loadtxt(folder / "cam0_to_world.txt"), camera, atol=1e-12)
 
 
-def test_kitti_object_lists_what_the_camera_sees(tmp_path: Path) -> None:
+def test_kitti_object_lists_boxes_in_the_cameras_view(tmp_path: Path) -> None:
     values = [(20, 0, -1, 4, 2, 1.5, 0), (-20, 0, -1, 4, 2, 1.5, 0), (20, 40, -1, 4, 2, 1.5, 0)]
     scan = some_scan()
     scan.boxes = Boxes(np.array(values), ("Car", "Car", "Van"), dont_care=np.array([(1, 2, 30, 40)], np.float32))

@@ -125,7 +125,7 @@ def test_kitti360_points_fall_into_the_image(real_scans: Path) -> None:
     [(100, 11), (360, 5), (570, 1), (729, 3), (947, 8), (1134, 7), (1461, 10), (1597, 6), (1866, 0), (2449, 137),
      (2903, 3), (2939, 4)],
 )  # fmt: skip
-def test_kitti360_cars_stand_where_their_points_are(real_scans: Path, frame: int, filled: int) -> None:
+def test_kitti360_boxes_of_cars_contain_their_points(real_scans: Path, frame: int, filled: int) -> None:
     """The boxes there are corners in camera 0's frame, which the calibration has to bring into the sensor's."""
     source = KITTI360(real_scans / "kitti360")
     camera = source.calibration(0)

@@ -95,7 +95,7 @@ def test_synthesis_after_the_transfer_gives_the_same_batches(workers: int) -> No
     assert max(map(len, made.asked)) > 1  # several at once
 
 
-def test_what_cannot_be_made_on_the_device_is_refused() -> None:
+def test_on_device_refuses_sources_that_are_not_generators() -> None:
     mixed = MixedScans(Scans("r", REAL), Endless())
     with pytest.raises(ConfigError, match="on_device with .'Endless'."):
         module.MixedData(mixed, on_device=True)
@@ -138,7 +138,7 @@ def trainer(root: Path, epochs: int = 3, **options: Any) -> Any:
 
 @pytest.mark.parametrize("how", ["step", "exception", "epoch"])
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_checkpoint_goes_on_after_its_last_batch(workers: int, how: str, tmp_path: Path) -> None:
+def test_a_checkpoint_resumes_after_its_last_batch(workers: int, how: str, tmp_path: Path) -> None:
     """Taken after a training step, on an exception in the next one, or at an epoch's end."""
     callbacks = lightning.pytorch.callbacks
     callback = {

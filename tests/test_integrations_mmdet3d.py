@@ -267,7 +267,7 @@ def test_a_bank_is_read_by_url(made: Path) -> None:
             read_url(wrong)
 
 
-def test_what_cannot_be_trained_on_is_refused_before(made: Path, tmp_path: Path) -> None:
+def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_path: Path) -> None:
     listed, root = made / "sk" / "train.json", {"data_root": made / "sk"}
     for labels in ("none", "ignore"):
         with pytest.raises(ConfigError, match="loss, a mean over no label, is NaN"):

@@ -149,7 +149,7 @@ def test_boxes_hold_their_points_after_augmentation(made: Path) -> None:
             assert len(counts) >= 2 and np.abs(counts[:2] - before).max() <= 3  # those on a face
 
 
-def test_gt_sampling_stands_on_the_synthetic_ground(made: Path) -> None:
+def test_gt_sampling_places_objects_on_the_synthetic_ground(made: Path) -> None:
     """The stock setting wants a plane and a calibration, which a synthetic scan has to bring."""
     dataset = build(made, "bare")
     np.random.seed(1)  # OpenPCDet draws from it
@@ -211,7 +211,7 @@ def test_a_database_of_any_source_is_drawn_from(made: Path, tmp_path: Path) -> N
         assert held(boxes, sample["points"][:, :3]).min() >= 5
 
 
-def test_what_cannot_be_mixed_is_refused(made: Path) -> None:
+def test_invalid_settings_are_refused(made: Path) -> None:
     dataset = build(made)
     with pytest.raises(ConfigError, match="epochs one by one"):
         dataset.merge_all_iters_to_one_epoch(True, 3)

@@ -150,7 +150,7 @@ def test_a_map_of_classes_that_does_not_fit_is_refused(made: Path, monkeypatch: 
         build(made)
 
 
-def test_what_cannot_be_mixed_is_refused(made: Path) -> None:
+def test_invalid_settings_are_refused(made: Path) -> None:
     for option in ("cache", "test_mode"):
         with pytest.raises(ConfigError, match="training without a cache"):
             build(made, **{option: True})

@@ -310,7 +310,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
 
 
 @pytest.mark.parametrize(("name", "options", "message"), refusals(), ids=lambda v: v if isinstance(v, str) else "")
-def test_what_the_sources_cannot_serve_is_refused(name: str, options: dict[str, Any], message: str) -> None:
+def test_policies_that_the_sources_cannot_support_are_refused(name: str, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make_policy(name, **({"fields": FIELDS} | options))
 

@@ -34,7 +34,7 @@ def seen(box: np.ndarray, ground: float = -HEIGHT) -> Object:
 @settings(max_examples=25)
 @example((22.0, 0.0, 1.0), [(20.0, 1.0)])  # the foot of a wall in the cells where the car meets the ground
 @given(places, st.lists(st.tuples(st.floats(4, 40), st.floats(-180, 180)), max_size=3))
-def test_a_pasted_car_is_what_the_sensor_would_have_seen(
+def test_a_pasted_car_looks_as_the_sensor_would_see_it(
     place: tuple[float, float, float], walls: list[tuple[float, float]]
 ) -> None:
     box = at(place)
@@ -70,7 +70,7 @@ def test_a_car_across_the_seam_is_whole(x: float) -> None:
 
 @pytest.mark.parametrize("ground", [-2.3, -1.5])
 @pytest.mark.parametrize("labelled", [True, False])
-def test_it_stands_on_the_ground_that_is_there(ground: float, labelled: bool) -> None:
+def test_a_pasted_object_stands_on_the_ground(ground: float, labelled: bool) -> None:
     host = cast(ground=ground)
     host = host if labelled else replace(host, label=None, instance=None)
     candidate = seen(car(22, 5, 0.4))
@@ -83,7 +83,7 @@ def test_it_stands_on_the_ground_that_is_there(ground: float, labelled: bool) ->
     assert_nothing_shares_a_ray(pasted, 1)
 
 
-def test_it_stands_on_a_slope() -> None:
+def test_a_pasted_object_stands_on_a_slope() -> None:
     host = cast()
     rise = 0.15
     host.points[:, 2] += rise * host.points[:, 0]
@@ -92,7 +92,7 @@ def test_it_stands_on_a_slope() -> None:
     assert pasted.boxes.values[0, 2] - 0.8 == pytest.approx(rise * 5 - HEIGHT, abs=0.03)
 
 
-def test_where_it_cannot_stand_it_does_not() -> None:
+def test_an_object_is_not_placed_without_suitable_ground() -> None:
     candidate = seen(car(12, 0))
     for host in (
         cast([], [wall(12, 0.5)]),  # a wall through it
@@ -108,7 +108,7 @@ def test_where_it_cannot_stand_it_does_not() -> None:
         assert pasted.boxes is not None and len(pasted.boxes) == len(host.boxes or ())
 
 
-def test_what_stands_in_front_hides_it() -> None:
+def test_objects_in_front_occlude_a_pasted_object() -> None:
     """A narrow wall covers part of the car, and the car nothing of the wall."""
     alone = seen(car(15, 0, np.pi / 2))
     shares = {}
@@ -130,7 +130,7 @@ def test_what_stands_in_front_hides_it() -> None:
     assert none.boxes is not None and len(none.boxes) == 0  # a detector's sample has boxes, be there any or not
 
 
-def test_gaps_in_what_stands_in_front_show_nothing_of_it() -> None:
+def test_gaps_between_occluding_returns_show_nothing() -> None:
     host, alone = cast([], [wall(9, 0, np.pi / 2, 1.6)]), seen(car(15, 0, np.pi / 2))
     label = project(host).label
     assert label is not None
@@ -143,7 +143,7 @@ def test_gaps_in_what_stands_in_front_show_nothing_of_it() -> None:
     assert (whole == CAR).sum() == (pierced == CAR).sum() > 100
 
 
-def test_what_it_hides_goes_with_its_box() -> None:
+def test_occluded_objects_are_removed_with_their_boxes() -> None:
     behind, beside, farther = car(22, 0.2), car(10, 12, 1.0), car(20, 4.0)
     host = cast([behind, beside, farther])
     host.boxes = replace(host.boxes, occlusion=np.array([0, 0, 0]))
@@ -163,7 +163,7 @@ def test_what_it_hides_goes_with_its_box() -> None:
     assert_nothing_shares_a_ray(pasted, 4)
 
 
-def test_several_hide_each_other_whatever_their_order() -> None:
+def test_pasted_objects_occlude_one_another_in_any_order() -> None:
     cars = [car(9, 0), car(15, 0.8), car(22, 3, 0.3), car(-9, 4, 2.0)]
     candidates = [seen(c) for c in cars]
     truth = cast(cars)

@@ -30,7 +30,7 @@ def rows(made: MixingPlan) -> list[str]:
     return [f"{'rs'[source]}{index}" for source, index in zip(made.source, made.index, strict=True)]
 
 
-def test_the_order_is_what_it_always_was() -> None:
+def test_the_order_is_the_same_in_all_versions() -> None:
     """Literally: a run that is resumed with a later version has to find the rest of its epoch."""
     assert [rows(plan(mixture(), epoch)) for epoch in range(3)] == [
         ["r1", "r5", "r2", "r3", "s0", "s1", "r4", "r0"],
@@ -297,7 +297,7 @@ def test_ranks_share_every_step_and_all_take_as_many(batch: int, ranks: int) -> 
             assert end - (whole[-1].stop if whole else start) < batch * ranks
 
 
-def test_what_is_left_is_left_for_any_number_of_ranks() -> None:
+def test_the_remaining_samples_do_not_depend_on_the_number_of_ranks() -> None:
     for step in cut_steps(0, 23, 2, 3):
         for batch, ranks in ((1, 1), (4, 2), (2, 3), (3, 4)):
             rest = [i for s in cut_steps(step.stop, 23, batch, ranks) for i in s]

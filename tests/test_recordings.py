@@ -80,7 +80,7 @@ def test_a_sequence_of_the_benchmark_is_a_part_of_a_raw_drive() -> None:
     assert frames_of("semantic_kitti", ["13"]).drives == {(KITTI, "odometry 13"): None}
 
 
-def test_frames_without_a_number_stand_for_the_drive() -> None:
+def test_frames_without_a_number_count_as_the_complete_drive() -> None:
     assert frames_of("kitti360", ["drive/left", "drive/0000000001"]).drives == {(KITTI360, "drive"): None}
     assert not frames_of("npz", ["drive/0000000001"])
     assert set(PLACES) == {"kitti360", "kitti_raw", "semantic_kitti", "kitti_object"}
@@ -106,12 +106,12 @@ def test_all_of_lidms_models_know_both_datasets() -> None:
         [1], {"a": 5}, {"a": [[1]]}, {"a": [["b", 2]]}
     ))],
 )  # fmt: skip
-def test_what_is_no_set(values: Any) -> None:
+def test_invalid_recordings_are_refused(values: Any) -> None:
     with pytest.raises(DataError, match="expected datasets, their drives and frames"):
         Recordings.from_list(values)
 
 
-def test_they_are_told_in_words() -> None:
+def test_recordings_are_described_in_words() -> None:
     some = frames_of("kitti360", ["a/1", "a/2", "a/5", "b", "c/7"])
     assert str(some) == "KITTI-360 a (3 frames from 1 to 5), KITTI-360 b (all frames), KITTI-360 c (frame 7)"
     assert str(whole(KITTI, map(str, range(8)))).endswith("KITTI 5 (all frames) and 2 more drives")

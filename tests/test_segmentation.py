@@ -34,7 +34,7 @@ def batches(count: int, seed: int = 0) -> list[Images]:
     return made
 
 
-def test_it_learns_and_the_confusion_says_so() -> None:
+def test_the_segmenter_learns_as_its_confusion_matrix_shows() -> None:
     torch.manual_seed(0)
     network = RangeSegmenter(widths=(8, 8, 8))
     untrained = mean_iou(confusion(network.eval(), batches(4, 1), HEIGHT))

@@ -119,7 +119,7 @@ def test_the_generators_last_words_are_heard(path: Path, tmp_path: Path) -> None
                 bank[0]
 
 
-def test_banks_do_not_meet_and_end_when_nobody_holds_them(path: Path) -> None:
+def test_banks_are_independent_and_end_with_their_last_reference(path: Path) -> None:
     first, second = (RollingBank(path, seed=seed, slots=2, threads=1, timeout=60) for seed in (1, 2))
     assert [bank[4].id for bank in (first, second)] == ["small/1/4", "small/2/4"]
     pid = first.pid
@@ -166,7 +166,7 @@ def test_a_trainer_that_ends_without_closing_leaves_nothing(how: str, code: int,
     assert gone(int(pid))
 
 
-def test_a_script_without_a_guard_is_told(path: Path, tmp_path: Path) -> None:
+def test_a_script_without_a_main_guard_gets_a_hint(path: Path, tmp_path: Path) -> None:
     script = tmp_path / "trainer.py"
     script.write_text(TRAINER + "main()\n")
     trainer = subprocess.run([sys.executable, script, path, "return"], capture_output=True, text=True, timeout=60)

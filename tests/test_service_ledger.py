@@ -128,7 +128,7 @@ def test_a_scan_for_which_a_reader_waits_is_not_overwritten() -> None:
     assert claimed(ledger) == [6]
 
 
-def test_starved_requests_are_counted_and_take_what_was_served_least() -> None:
+def test_starved_requests_are_counted_and_get_the_scan_served_least() -> None:
     counters = np.zeros(4, np.int64)
     ledger = Ledger(4, counters, "reuse")
     assert claimed(ledger) == [0, 1]

@@ -90,7 +90,7 @@ def test_the_last_samples_may_be_left_out() -> None:
     assert sorted(x for batches in given for batch in batches for x in batch) == sorted(sequence()[:12])
 
 
-def test_what_is_left_stays_a_batch_of_its_own() -> None:
+def test_the_remainder_is_a_batch_of_its_own() -> None:
     given = [MixedStream(mixed(), batch_size=7, endless=False, rank=rank, world_size=2) for rank in range(2)]
     assert [[len(batch) for batch in load(stream, 0)] for stream in given] == [[7, 1], [7]]
     assert given[0].state_dict(1) == state(0, 14)
@@ -128,7 +128,7 @@ def test_a_state_fits_any_number_of_ranks_and_workers(
 
 @pytest.mark.parametrize("endless", [False, True])
 @pytest.mark.parametrize("given", range(15))
-def test_without_workers_the_stream_knows_where_it_is(given: int, endless: bool) -> None:
+def test_without_workers_the_stream_tracks_its_position(given: int, endless: bool) -> None:
     stream = MixedStream(mixed(), batch_size=4, endless=endless)
     iterator = iter(stream)
     seen = list(islice(iterator, given))
@@ -266,7 +266,7 @@ def test_torchdata(workers: int, done: int, endless: bool) -> None:
         assert seen + list(islice(again, count)) == cut(sequence()[:total], 4)
 
 
-def test_what_a_stream_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_options_and_states_of_a_stream_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match="batch_size=0"):
         MixedStream(mixed(), batch_size=0)
     stream = MixedStream(mixed(), batch_size=4, endless=False)
@@ -293,7 +293,7 @@ class Ahead(Endless):
         self.told.append(list(numbers))
 
 
-def test_a_source_that_works_ahead_is_told_this_ranks_share() -> None:
+def test_only_this_ranks_share_is_announced_to_a_source_that_works_ahead() -> None:
     source = Ahead()
     scans = MixedScans(Scans("r", 6), source, 0.5)
     asked = [[int(scans.sample(e, i)["id"][1:]) if scans.plan(e).domain[i] else -1 for i in range(12)] for e in (0, 1)]

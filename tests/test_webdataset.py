@@ -114,7 +114,7 @@ class Interrupted:
         return self.scans[index]
 
 
-def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+def test_a_resumed_run_writes_the_same_bytes(tmp_path: Path) -> None:
     scans = [some_scan(i) for i in range(5)]
     convert(scans, WebDatasetWriter(tmp_path / "once", shard_size=2), progress=False)
     with pytest.raises(KeyboardInterrupt):
@@ -138,7 +138,7 @@ def test_killed_while_gathering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert tars(tmp_path) == {"scans-000000.tar": before}
 
 
-def test_what_was_skipped_comes_later(tmp_path: Path) -> None:
+def test_skipped_scans_are_added_by_a_later_run(tmp_path: Path) -> None:
     scans = [some_scan(i) for i in range(5)]
     report = convert(Interrupted(scans, DataError), WebDatasetWriter(tmp_path), on_bad="skip", progress=False)
     assert report.written == 4 and len(open_scans(tmp_path)) == 4
