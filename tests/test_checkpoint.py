@@ -389,3 +389,23 @@ def test_weights_outside_the_range_of_float32_are_refused(saved: Path, change: A
     replace_weights(saved, one)
     with pytest.raises(DataError, match="has NaN or infinity in"):
         load_checkpoint(saved)
+
+
+def test_weights_of_many_dimensions_are_refused(saved: Path) -> None:
+    def one(tensors: dict[str, Tensor]) -> None:
+        name = min(tensors)
+        tensors[name] = tensors[name].reshape(*[1] * 70, *tensors[name].shape)
+
+    try:
+        replace_weights(saved, one)
+    except RuntimeError:
+        pytest.skip("this torch makes no such tensors")
+    with pytest.raises(DataError, match="of more than 8 dimensions"):
+        load_checkpoint(saved)
+
+
+def test_arguments_that_ask_for_a_huge_network_are_refused_at_once(saved: Path) -> None:
+    spec = NetworkSpec("hdit", ARGUMENTS | {"depths": [1, 2_000_000_000]})
+    rewrite(saved, networks={VELOCITY: spec._asdict()})
+    with pytest.raises(DataError, match="more than .* modules"):
+        load_checkpoint(saved)

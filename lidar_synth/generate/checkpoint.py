@@ -51,6 +51,8 @@ LABEL_ENCODING = f"{LABEL_BITS} analog bits, most significant first, code 19 = n
 VELOCITY, CODEC, ENCODER = "velocity", "codec", "condition"
 """Names of the parts: the flow's velocity network, the autoencoder, the encoder of the condition."""
 
+_MOST_DIMENSIONS = 8  # torch computes with up to 64
+
 
 class NetworkSpec(NamedTuple):
     """The arguments of ``models.build_network``."""
@@ -322,7 +324,9 @@ def _checksum(values: Mapping[str, Any]) -> str:
 
 
 def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
-    """Raise a DataError on values that are complex, or not finite in float32."""
+    """Raise a DataError on values that are complex, or not finite in float32, or of too many dimensions."""
+    if deep := [k for k, v in tensors.items() if v.dim() > _MOST_DIMENSIONS]:
+        raise DataError(f"{what} has tensors of more than {_MOST_DIMENSIONS} dimensions: {deep}", "weights")
     if bad := [k for k, v in tensors.items() if v.is_complex() or not bool(torch.isfinite(v.float()).all())]:
         raise DataError(f"{what} has NaN or infinity in {bad}", "finite weights and ray angles")
 

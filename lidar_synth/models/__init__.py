@@ -5,11 +5,13 @@ arguments have to be plain values, since a checkpoint stores them; its class att
 provides beyond them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_module_registration_hook
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.models.encoders.calibrated_camera import SightEncoder
@@ -75,6 +77,28 @@ def build_network(architecture: str, arguments: dict[str, Any]) -> Network:
         raise ConfigError(f"{architecture}({given})", f"the arguments of its class ({error})") from error
 
 
+@contextmanager
+def _bounded(most: int) -> Iterator[None]:
+    """Inside, building more than ``most`` modules fails: the arguments of a file may ask for 10^9 layers.
+
+    Raises:
+        ConfigError: on more modules.
+    """
+    built = 0
+
+    def count(module: nn.Module, name: str, part: nn.Module | None) -> None:
+        nonlocal built
+        built += 1
+        if built > most:
+            raise ConfigError(f"a network of more than {most} modules", "a network that its weights can fill")
+
+    hook = register_module_module_registration_hook(count)
+    try:
+        yield
+    finally:
+        hook.remove()
+
+
 def assemble(
     architecture: str,
     arguments: dict[str, Any],
@@ -94,7 +118,8 @@ def assemble(
         DataError: on invalid arguments, missing or unexpected keys, or weights of other shapes.
     """
     try:
-        with torch.device("meta"):  # saves time and memory for weights that will be replaced
+        # On "meta" there is neither time nor memory for weights that will be replaced.
+        with torch.device("meta"), _bounded(64 + 16 * len(state)):
             network = build_network(architecture, arguments)
     except ConfigError as error:
         raise DataError(f"{what}: {error}") from error
