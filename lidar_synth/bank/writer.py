@@ -15,17 +15,17 @@ import numpy as np
 from lidar_synth.bank.chunks import checksum, deflate, filters
 from lidar_synth.bank.index import Entry, Facts
 from lidar_synth.bank.layout import metadata_size
-from lidar_synth.bank.sink import Sink
 from lidar_synth.errors import DataError, FileError, LibraryError
 from lidar_synth.geometry.scan import RangeImage
 
 _VERSION = "v110"
 _PAGE = 4 << 20  # bytes: a paged file keeps its metadata together, for fewer requests over a network
+_BLOCK = 4 << 20  # bytes by which a shard grows in memory
 _PENDING = 8  # scans per thread that may wait to be written
 
 
 class ShardWriter:
-    """Writes one shard. The file is complete only after ``close`` has returned.
+    """Writes one shard. It is built in memory, and its file is complete only after ``close`` has returned.
 
     Args:
         path: path of the file; an existing file is overwritten.
@@ -59,11 +59,10 @@ class ShardWriter:
         self._pool = ThreadPoolExecutor(threads, "compress")
         self._limit = _PENDING * threads
         with _on_disk(path):
-            self._sink = Sink(path)
-            self._file = _create(self._sink, facts, entry.scans)
+            self._out = path.open("wb")
+            self._file = _create(path.name, facts, entry.scans)
             try:
                 self._declare(facts)
-                self._sink.check()
             except BaseException:
                 self.discard()
                 raise
@@ -98,16 +97,20 @@ class ShardWriter:
             raise DataError(f"{self._next} scans for {self.path}", f"{self.entry.scans}")
         with _on_disk(self.path):
             self._file["crc"][:] = self._crc
+            self._file.flush()
+            self._out.write(self._file.id.get_file_image())
+            self._out.flush()
+            os.fsync(self._out.fileno())
+            self._out.close()
             self._file.close()
-            self._sink.sync()
-            self._sink.close()
 
     def discard(self) -> None:
         """Abort and remove the file."""
         self._pool.shutdown(cancel_futures=True)
         with suppress(OSError, RuntimeError):
             self._file.close()
-        self._sink.close()
+        with suppress(OSError):
+            self._out.close()
         with suppress(OSError):
             self.path.unlink(missing_ok=True)
 
@@ -179,15 +182,16 @@ class ShardWriter:
                 else:
                     shape, dtype = self.encoding.sensor.shape, self._types()[name]
                     self._datasets[name][position] = np.frombuffer(chunk, dtype).reshape(shape)
-            self._sink.check()
 
 
-def _create(sink: Sink, facts: Facts, scans: int) -> h5py.File:
+def _create(name: str, facts: Facts, scans: int) -> h5py.File:
     # One block, so that a remote reader gets all metadata with one request.
     options: dict[str, Any] = {"meta_block_size": metadata_size(facts, scans)}
     if facts.layout == "paged":
         options = {"fs_strategy": "page", "fs_page_size": _PAGE}
-    return h5py.File(sink, "w", libver=(_VERSION, _VERSION), **options)
+    # In memory: on a full disk, HDF5 would end the process when it cannot write its metadata.
+    options |= {"driver": "core", "backing_store": False, "block_size": _BLOCK}
+    return h5py.File(name, "w", libver=(_VERSION, _VERSION), **options)
 
 
 @contextmanager
