@@ -140,7 +140,7 @@ def test_what_does_not_fit_together(scans: Path, codec: Path, teacher: Path, tmp
 
     refuse("an autoencoder with a codec or a condition", network=CODEC_NETWORK, condition=SEMANTIC)
     refuse("decoder without init", decoder=True)
-    refuse("expected a model whose autoencoder says", decoder=True, init=str(teacher))
+    refuse("expected a model whose autoencoder predicts", decoder=True, init=str(teacher))
     refuse("expected a checkpoint of the same kind", decoder=True, init=str(codec))
     refuse("of a latent model", codec=str(codec), recipe={"weights": {"label": 0.5}})
     refuse(f"channels .*expected that of {codec}", codec=str(codec), channels=["range"])

@@ -196,12 +196,12 @@ def test_unknown_training_data_is_reported(kitti360: Path, fake: Path) -> None:
     assert result.exception is None
     assert "does not record its model's training data" in result.stderr
     (fake / NOTE).write_text(json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]}))
-    assert "whether the two share frames is not known" not in judge(kitti360, fake).stderr
+    assert "whether the two sets share frames is not known" not in judge(kitti360, fake).stderr
 
 
 def test_kittis_object_set_may_share_frames_with_raw_drives(odometry: Path, fake: Path) -> None:
     (fake / NOTE).write_text(json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]}))
-    assert "whether the two share frames is not known" in judge(odometry, fake).stderr
+    assert "whether the two sets share frames is not known" in judge(odometry, fake).stderr
 
 
 def test_a_bank_records_the_training_data_of_its_model(kitti360: Path, tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_it_is_distilled_on_timesteps_selected_with_its_conditions(
     assert read_header(tmp_path / "student" / "student.safetensors")[0].provenance["iterations"] == 10
 
 
-def test_a_student_learns_what_leads_away_from_a_weaker_teacher(
+def test_a_student_learns_the_autoguided_teacher(
     scans: Path, codec: Path, teacher: Path, tmp_path: Path
 ) -> None:
     small = UNET | {"arguments": UNET["arguments"] | {"width": 8}}  # type: ignore[dict-item]
@@ -103,7 +103,7 @@ def test_a_student_learns_what_leads_away_from_a_weaker_teacher(
     assert torch.allclose(flow(y, t, maps)[1], a[1], atol=1e-5)  # t = 0.8
 
     for changes, message in (
-        (["guidance=1"], "weak.safetensors with guidance 1; expected a scale"),
+        (["guidance=1"], "weak.safetensors with guidance 1; expected a guidance scale"),
         (["within=[0.9,0.1]"], r"within \(0.9, 0.1\); expected two increasing times"),
         ([f"weaker={codec}"], "codec.safetensors, an autoencoder; expected a model that generates"),
         ([f"teacher={without_condition(teacher, tmp_path)}"], "of another conditioning; expected those of"),

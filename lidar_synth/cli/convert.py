@@ -66,6 +66,6 @@ def convert(
     for name, reason in report.skipped.items():
         print(f"  skipped {name}: {reason}", file=sys.stderr)
     for name, count in report.dropped.items():
-        print(f"  dropped {count} points of {name}, that are NaN or infinite", file=sys.stderr)
+        print(f"  dropped {count} points of {name}, which are NaN or infinite", file=sys.stderr)
     for what in report.left_out:
         print(f"  left out {what}", file=sys.stderr)
