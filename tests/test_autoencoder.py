@@ -176,6 +176,7 @@ def test_the_loss_by_hand(rare: float) -> None:
     assert noisy(x, torch.randn_like(x)).item() != pytest.approx(noisy(x).item(), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_it_learns_scans_and_its_latents_have_variance_one() -> None:
     net, x = network(), tensors()
     trained = Autoencoding(net.train(), TENSORS, SENSOR, Losses(), METRICS["l1"], {})

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,13 @@ from typer.testing import CliRunner
 
 import lidar_synth.bake.shard as shard_module
 from lidar_synth.bake import ENGINES, BakeJob, BakePlan, Resources, Share, bake
-from lidar_synth.bake.folder import SETTINGS, finish, prepare
+from lidar_synth.bake.folder import SETTINGS, finish, prepare, write_bank_files
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import regenerate
-from lidar_synth.bank import INDEX, Bank, Encoding
+from lidar_synth.bank import INDEX, Bank, Encoding, Entry, Index
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
+from lidar_synth.files.disk import sha256
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import ENCODER, VELOCITY, Header, NetworkSpec, save_checkpoint
 from lidar_synth.generate.generator import load_generator
@@ -54,6 +56,7 @@ def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     return files(plan.out)
 
 
+@pytest.mark.slow
 def test_a_bank_holds_the_models_scans(plan: BakePlan, model: Path, expected: dict[str, bytes]) -> None:
     index = bake(plan, progress=False)
     assert index is not None and index.scans == COUNT and [e.scans for e in index.shards] == [3, 3, 3, 1]
@@ -115,6 +118,7 @@ def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
 # The same bytes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_processes_write_the_same_bytes(plan: BakePlan, expected: dict[str, bytes], workers: int) -> None:
     prepare(plan)
@@ -148,6 +152,7 @@ def test_ranks_of_torchrun_one_after_another_write_the_same_bytes(
     assert index is not None and files(plan.out) == expected
 
 
+@pytest.mark.slow
 def test_torchrun_writes_the_same_bytes(plan: BakePlan, model: Path, expected: dict[str, bytes]) -> None:
     """Two concurrent processes, started by torchrun itself."""
     options = ["--model", model, "--count", COUNT, "--shard-size", SIZE, "--seed", 4, "--engine", "torchrun"]
@@ -304,3 +309,36 @@ def test_the_index_needs_a_record_of_every_shard(plan: BakePlan) -> None:
     bake(plan, share=Share(1, 2), progress=False)
     (plan.out / INDEX).unlink()
     assert finish(plan) is None  # a finished bake has removed the records, so a rerun checks the shards
+
+
+SHARD = b"shard".ljust(64)
+
+
+@pytest.mark.slow
+def test_a_rerun_over_many_shards_parses_the_index_once(
+    plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """10,000 shards, of which 20 are missing. A few bytes stand in for each shard, because its content is not read."""
+    many = plan_in(plan.out, model, count=10_000, shard_size=1)
+    prepare(many)
+    for entry in many.shards:
+        (plan.out / entry.file).write_bytes(SHARD)
+    content = {"bytes": len(SHARD), "sha256": sha256(plan.out / many.shards[0].file)}
+    write_bank_files(plan.out, Index((many.facts,), tuple(replace(e, **content) for e in many.shards)), baked=True)
+    for entry in many.shards[::500]:
+        (plan.out / entry.file).unlink()
+    parsed, made = [0], [0]
+    parse, begin = Index.from_json, Entry.__post_init__
+
+    def count_parsed(text: bytes, where: str) -> Index:
+        parsed[0] += 1
+        return parse(text, where)
+
+    def count_made(entry: Entry) -> None:
+        made[0] += 1
+        begin(entry)
+
+    monkeypatch.setattr(Index, "from_json", count_parsed)
+    monkeypatch.setattr(Entry, "__post_init__", count_made)
+    assert bake(many, progress=False) is not None
+    assert parsed[0] <= 3 and made[0] < 10 * len(many.shards)

@@ -12,7 +12,6 @@ import time
 from collections import namedtuple
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +23,9 @@ import lidar_synth.bake.folder as folder_module
 import lidar_synth.bake.run as run_module
 import lidar_synth.bake.shard as shard_module
 from lidar_synth.bake import ENGINES, BakePlan, Resources, Share, bake, bake_shard
-from lidar_synth.bake.folder import SETTINGS, prepare, write_bank_files
-from lidar_synth.bank import INDEX, Entry, Index
+from lidar_synth.bake.folder import SETTINGS, prepare
+from lidar_synth.bank import INDEX, Index
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files.disk import sha256
 from lidar_synth.formats.writer import NOTES
 
 
@@ -100,6 +98,7 @@ def wait_for_shards(process: subprocess.Popen[str], out: Path, count: int) -> No
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path) -> None:
     reference = plan_in(tmp_path / "reference" / "bank", model, count=60, shard_size=5)
     bake(reference, progress=False)
@@ -120,6 +119,7 @@ def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path) -> None:
     assert files(out) == files(reference.out)
 
 
+@pytest.mark.slow
 def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
     """A terminal sends the signal to every process of the group; only the parent reports it."""
     process = start(tmp_path / "bank", model, "--engine", "processes", "--workers", "2", process_group=0)
@@ -133,6 +133,7 @@ def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
     assert "stopped; finished shards are kept" in errors and "Traceback" not in errors
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_reported(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
     plan = plan_in(tmp_path / "bank", model, count=300, shard_size=100)
 
@@ -147,6 +148,7 @@ def test_a_killed_worker_is_reported(model: Path, tmp_path: Path, expected: dict
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.slow
 def test_an_error_of_a_worker_is_raised(plan: BakePlan, model: Path) -> None:
     prepare(plan)
     (plan.out / SETTINGS).unlink()
@@ -198,6 +200,7 @@ def test_three_concurrent_bakes_write_the_same_bytes(model: Path, tmp_path: Path
     assert files(out) == files(reference.out)
 
 
+@pytest.mark.slow
 def test_a_bake_that_ends_leaves_the_open_shard_of_another_one(plan: BakePlan, expected: dict[str, bytes]) -> None:
     """A complete bake starts and ends while another one is in the middle of a shard."""
     ended: list[subprocess.CompletedProcess[str]] = []
@@ -248,38 +251,6 @@ def test_two_bakes_may_end_at_the_same_time(
     monkeypatch.setattr(folder_module, "write_bank_files", both)
     assert bake(plan, progress=False) is not None
     assert files(plan.out) == expected
-
-
-SHARD = b"shard".ljust(64)
-
-
-def test_a_rerun_over_many_shards_parses_the_index_once(
-    plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """10,000 shards, of which 20 are missing. A few bytes stand in for each shard, because its content is not read."""
-    many = plan_in(plan.out, model, count=10_000, shard_size=1)
-    prepare(many)
-    for entry in many.shards:
-        (plan.out / entry.file).write_bytes(SHARD)
-    content = {"bytes": len(SHARD), "sha256": sha256(plan.out / many.shards[0].file)}
-    write_bank_files(plan.out, Index((many.facts,), tuple(replace(e, **content) for e in many.shards)), baked=True)
-    for entry in many.shards[::500]:
-        (plan.out / entry.file).unlink()
-    parsed, made = [0], [0]
-    parse, begin = Index.from_json, Entry.__post_init__
-
-    def count_parsed(text: bytes, where: str) -> Index:
-        parsed[0] += 1
-        return parse(text, where)
-
-    def count_made(entry: Entry) -> None:
-        made[0] += 1
-        begin(entry)
-
-    monkeypatch.setattr(Index, "from_json", count_parsed)
-    monkeypatch.setattr(Entry, "__post_init__", count_made)
-    assert bake(many, progress=False) is not None
-    assert parsed[0] <= 3 and made[0] < 10 * len(many.shards)
 
 
 # The disk

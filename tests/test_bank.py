@@ -128,6 +128,7 @@ def points(bank: Bank, queue: Any) -> None:
     queue.put(sum(len(scan) for scan in bank))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_workers_read_a_bank(root: Path, method: str) -> None:
     bank = Bank(root)

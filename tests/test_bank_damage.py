@@ -27,6 +27,7 @@ def read_all(root: Path) -> list[bytes]:
     return [scan.points.tobytes() + scan.label.tobytes() + scan.reflectance.tobytes() for scan in Bank(root)]
 
 
+@pytest.mark.slow
 def test_no_flipped_bit_gives_a_wrong_scan(root: Path) -> None:
     expected = read_all(root)
     path = root / "shard-00001.h5"

@@ -172,6 +172,7 @@ HARMFUL: dict[str, Change] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux to measure the memory")
 def test_malicious_shards_allocate_no_memory(tmp_path: Path) -> None:
     made = [harmful(tmp_path / str(number), what) for number, what in enumerate(HARMFUL)]
@@ -232,6 +233,7 @@ def use(root: Path) -> None:
     dataset_card("bank", bank.index).encode(), bank.index.to_json()
 
 
+@pytest.mark.slow
 def test_an_edited_index_is_read_or_refused(tmp_path: Path) -> None:
     write_bank(tmp_path, [some_image(i) for i in range(3)])
     text = (tmp_path / INDEX).read_text()

@@ -57,6 +57,7 @@ def autoencoding(metric: str = "l1", weights: dict[str, float] | None = None, **
     return Autoencoding(network(), TENSORS, SENSOR, Losses(**losses), METRICS[metric], weights or {})  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_mask_is_trained_and_removes_returns() -> None:
     x = tensors()
     net = network(mask=True)
@@ -185,6 +186,7 @@ def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
         )  # the gradient of the adversarial term alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("losses", [{}, {"geometric": 1.0, "adversarial": 0.05}], ids=["plain", "all terms"])
 def test_training_reduces_the_loss_and_the_reconstruction_error(losses: dict[str, float]) -> None:
     batches = Batches(cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False), TENSORS, seed=1)

@@ -93,6 +93,7 @@ def test_a_resumed_run_writes_the_same_files(tmp_path: Path) -> None:
     assert [scan.pose is not None and scan.boxes is not None for scan in open_scans(tmp_path / "twice")] == [True] * 3
 
 
+@pytest.mark.slow
 def test_processes_write_the_same_files(tmp_path: Path) -> None:
     write_all("semantic_kitti", tmp_path / "in", [some_scan(i, count=80) for i in range(12)])
     source = open_scans(tmp_path / "in")
@@ -130,6 +131,7 @@ def test_a_bank_has_no_boxes_for_kitti_objects(tmp_path: Path) -> None:
     assert convert(open_scans(tmp_path / "bank"), writer, progress=False) == Report(written=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("jobs", "policy"), [(1, "error"), (1, "skip"), (2, "skip")])
 def test_bad_scans_stop_the_run_or_are_named(tmp_path: Path, jobs: int, policy: str) -> None:
     paths = MAKERS["folder"](tmp_path / "in")

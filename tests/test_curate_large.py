@@ -113,6 +113,7 @@ def test_the_approximate_similarity_never_exceeds_the_exact_one(many: Planted) -
     assert np.median(exact - similarity) < 0.03
 
 
+@pytest.mark.slow
 def test_the_block_size_changes_nothing(many: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = find_similar(many.signatures, progress=False)
     for rows in (97, 5000):
@@ -201,6 +202,7 @@ def bank(tmp_path: Path) -> Bank:
     return Bank(tmp_path / "bank")
 
 
+@pytest.mark.slow
 def test_the_size_of_the_files_changes_no_score(bank: Bank, request: pytest.FixtureRequest) -> None:
     expected = score(bank, progress=False)
     request.getfixturevalue("small_files")

@@ -77,6 +77,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> Path:
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", public_names())
 def test_the_example_runs(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)

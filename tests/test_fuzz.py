@@ -145,6 +145,7 @@ def gives_nan(root: Path) -> list[Any]:
     return [scan]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reader", "verdict", "detail"),
     [

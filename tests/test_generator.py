@@ -60,6 +60,7 @@ def test_images_are_the_solution_of_the_flow_from_the_documented_noise(generator
     assert not np.array_equal(images[0].range, images[1].range)
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(indices=st.lists(st.integers(0, 2**62), min_size=1, max_size=5), batch=st.integers(1, 3))
 def test_a_scan_does_not_depend_on_the_others_of_its_batch(
@@ -222,6 +223,7 @@ def write_latent(path: Path, architecture: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("architecture", [name for name, cls in NETWORKS.items() if cls.is_autoencoder])
 def test_compile_compiles_the_decoder_too(architecture: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Uses a backend that counts graphs and convolutions; the default backend needs a C++ compiler."""
@@ -270,6 +272,7 @@ def test_mps_is_refused_if_it_is_unavailable(path: Path, monkeypatch: pytest.Mon
         load_generator(path, device="mps")
 
 
+@pytest.mark.slow
 def test_the_shipped_models_generate_scans(tmp_path: Path) -> None:
     town = Town(1, scans=1)
     Image.fromarray(town.image(0)).save(tmp_path / "seen.png")

@@ -230,6 +230,7 @@ def test_half_precision_keeps_the_angles_in_float32() -> None:
         assert 1e-4 < distance(v, expected) < 0.1
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_it_compiles_as_one_graph() -> None:
     net, y, t = network(), torch.randn(2, 2, 8, 64), torch.tensor([0.1, 0.8])

@@ -80,9 +80,7 @@ def test_it_is_distilled_on_timesteps_selected_with_its_conditions(
     assert read_header(tmp_path / "student" / "student.safetensors")[0].provenance["iterations"] == 10
 
 
-def test_a_student_learns_the_autoguided_teacher(
-    scans: Path, codec: Path, teacher: Path, tmp_path: Path
-) -> None:
+def test_a_student_learns_the_autoguided_teacher(scans: Path, codec: Path, teacher: Path, tmp_path: Path) -> None:
     small = UNET | {"arguments": UNET["arguments"] | {"width": 8}}  # type: ignore[dict-item]
     call("train", write_config(scans, tmp_path, "weak", codec=str(codec), network=small, condition=SEMANTIC))
     weaker = tmp_path / "weak" / "weak.safetensors"
@@ -168,6 +166,7 @@ class Fixed(nn.Module):
         return self.network.decode(torch.zeros_like(z), uniform_noise)
 
 
+@pytest.mark.slow
 def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(scans: Path, tmp_path: Path) -> None:
     network = {"architecture": "autoencoder", "arguments": {"widths": [8, 8], "depth": 2, "fine": 8}}
     call("train", write_config(scans, tmp_path, "codec", network=network, samples={"every": 8, "count": 2}))
@@ -187,6 +186,7 @@ def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(scans: Pat
     assert np.array_equal(same[0].mask, same[2].mask) and not np.array_equal(same[0].mask, same[1].mask)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("condition", [None, SEMANTIC | {"arguments": {"channels": 8, "method": "patches"}}])
 def test_a_decoder_goes_on_alone(condition: dict[str, Any] | None, scans: Path, tmp_path: Path) -> None:
     network = {"architecture": "autoencoder", "arguments": {"widths": [8, 8], "depth": 2, "fine": 8, "window": [3, 3]}}

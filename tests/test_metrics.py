@@ -80,6 +80,7 @@ def test_lidm_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> No
     assert lidm.minimum_matching_distance(a, b) == pytest.approx(vectors[f"lidm/mmd{suffix}"][0], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_figures_of_features(vectors: Vectors) -> None:
     a, b = vectors["features_a"], vectors["features_b"]
     assert frechet_distance(a, b) == pytest.approx(vectors["r2flow/frechet"][0], rel=1e-9)

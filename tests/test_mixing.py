@@ -106,6 +106,7 @@ def _apart(batch: dict[str, Any]) -> Iterator[dict[str, Any]]:
         yield {"points": batch["points"][a:b]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ranks", "method"), [(2, "fork"), (3, "spawn")])
 def test_ranks_divide_an_epoch_without_duplicates_or_loss(ranks: int, method: str, free_port: int) -> None:
     mp.start_processes(gathered, (ranks, free_port), nprocs=ranks, start_method=method)

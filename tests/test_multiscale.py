@@ -64,6 +64,7 @@ def test_a_cell_without_a_return_reads_nothing() -> None:
         assert torch.equal(net.expand(z, x).returned, net.expand(z, other).returned)
 
 
+@pytest.mark.slow
 def test_drawn_neighbours_are_alike_where_those_that_were_learnt_were() -> None:
     """Nearly all that readings differ by is common to blocks of cells, and the latent does not say it: cells that were
     drawn one by one would have nothing to do with each other."""

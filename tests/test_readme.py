@@ -19,6 +19,7 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, re.S)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("code", "printed"), list(zip(blocks("python"), ("torch.Size", "dict_keys"), strict=True)))
 def test_the_python_blocks_run(code: str, printed: str, tmp_path: Path) -> None:
     pytest.importorskip("embreex")

@@ -66,6 +66,7 @@ def test_unfolding_finds_the_beam_of_each_ring_also_in_cropped_scans(scans: list
         assert filled.tolist() == list(range(expected)), scan_id
 
 
+@pytest.mark.slow
 def test_halves_have_the_rings_of_the_complete_scan(scans: list[Scan]) -> None:
     for scan in (s for s in scans if len(s) > FULL_TURN):
         ring, (x, y, _) = ring_numbers(scan.points), scan.points.T

@@ -96,6 +96,7 @@ def state(folder: Path) -> dict[str, torch.Tensor]:
     return load_file(folder / "run" / "state.safetensors")
 
 
+@pytest.mark.slow
 def test_a_run_leaves_a_checkpoint_that_samples_and_all_else_it_promises(scans: Path, tmp_path: Path) -> None:
     out = call("train", write_config(scans, tmp_path, samples={"every": 6, "count": 2}))
     run = tmp_path / "run"
@@ -115,6 +116,7 @@ def test_a_run_leaves_a_checkpoint_that_samples_and_all_else_it_promises(scans: 
     assert not all(torch.equal(saved[f"network.{name}"], value) for name, value in checkpoint.items())
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(scans: Path, tmp_path: Path) -> None:
     configs = {}
     for name in ("whole", "killed"):
@@ -143,6 +145,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(scans: Path, tmp_path: 
     assert all(torch.equal(resumed[name], whole[name]) for name in whole)
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one(scans: Path, tmp_path: Path) -> None:
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
@@ -342,6 +345,7 @@ def test_a_run_is_not_resumed_with_other_settings(override: str, named: str, sca
     assert [file.read_bytes() for file in files] == before
 
 
+@pytest.mark.slow
 def test_a_run_is_resumed_with_more_iterations_and_what_changes_no_result(scans: Path, tmp_path: Path) -> None:
     config = write_config(scans, tmp_path)
     call("train", config, "--minutes", "0")

@@ -71,6 +71,7 @@ def judge() -> Judge:
     return Judge(RangeSegmenter().eval(), presets()["town"], {"data": "none"})
 
 
+@pytest.mark.slow
 def test_a_judge_sees_a_scan_as_the_network_sees_its_image(judge: Judge) -> None:
     scan = random_scan(presets()["town"], 3000, seed=0)
     image = project(scan)

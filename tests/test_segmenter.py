@@ -1,5 +1,6 @@
 """The small range-view segmenter."""
 
+import pytest
 import torch
 
 from lidar_synth.models.segmenter import ROW_BANDS, RangeSegmenter, segmenter_input
@@ -17,6 +18,7 @@ def test_shapes_and_that_columns_wrap() -> None:
     assert torch.allclose(network.features(x.roll(16, -1)), network.features(x), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_it_learns_what_depends_on_height() -> None:
     torch.manual_seed(0)
     network = RangeSegmenter(classes=2, widths=(8, 8, 8))

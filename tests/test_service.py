@@ -83,6 +83,7 @@ def test_last_words_fit() -> None:
     assert not slots._slot(0).any()
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(numbers=st.lists(st.integers(0, 20) | st.integers(0, 2**62), min_size=1, max_size=5))
 def test_a_rolling_bank_gives_the_generators_scans_in_every_order(
@@ -110,6 +111,7 @@ class Codes(Dataset[Any]):
         return scan.id, codes(scan)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [{}, {"num_workers": 2, "multiprocessing_context": "fork", "persistent_workers": True},
@@ -169,6 +171,7 @@ def wait_until(what: Callable[[], bool], seconds: float = 60) -> None:
     raise AssertionError("it did not happen")
 
 
+@pytest.mark.slow
 def test_micro_batches_change_rounding_only(path: Path, generator: Generator) -> None:
     with RollingBank(path, seed=SEED, slots=8, threads=1, timeout=60, batch=3) as bank:
         pairs = [(codes(bank[n]), expected(generator, n)) for n in range(30)]
@@ -177,6 +180,7 @@ def test_micro_batches_change_rounding_only(path: Path, generator: Generator) ->
         assert (abs(given - whole) <= 1).mean() >= 0.999  # one step of the encoding: 1.2 mm
 
 
+@pytest.mark.slow
 def test_a_pool_is_refreshed_with_the_epoch(path: Path, generator: Generator) -> None:
     with RollingBank(path, seed=SEED, slots=4, refresh=0.5, threads=1, timeout=60) as bank:
         assert [bank[n].id[-1] for n in range(8)] == list("01230123")
@@ -187,6 +191,7 @@ def test_a_pool_is_refreshed_with_the_epoch(path: Path, generator: Generator) ->
         assert bank.counts()["made"] <= 8
 
 
+@pytest.mark.slow
 def test_a_starved_bank_serves_scans_in_memory(path: Path, generator: Generator) -> None:
     with RollingBank(path, seed=SEED, slots=4, starved="reuse", threads=1, timeout=60) as bank:
         bank[0]
@@ -226,6 +231,7 @@ def test_the_error_names_why_the_process_did_not_start(path: Path) -> None:
         RollingBank(path, device="nowhere", timeout=60)
 
 
+@pytest.mark.slow
 def test_a_closed_bank_raises_an_error(path: Path) -> None:
     bank = RollingBank(path, seed=SEED, slots=2, threads=1, timeout=60)
     assert bank[0].id == f"small/{SEED}/0"

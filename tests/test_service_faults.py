@@ -107,6 +107,7 @@ def test_a_model_that_loads_for_too_long(path: Path) -> None:
         RollingBank(path, timeout=0.01)
 
 
+@pytest.mark.slow
 def test_the_generators_last_words_are_heard(path: Path, tmp_path: Path) -> None:
     checkpoint = load_checkpoint(path)
     for parameter in checkpoint.networks[VELOCITY].parameters():
@@ -147,6 +148,7 @@ def main():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("how", "code"), [("raise", 1), ("vanish", 0), ("interrupt", -signal.SIGINT)])
 def test_a_trainer_that_ends_without_closing_leaves_nothing(how: str, code: int, path: Path, tmp_path: Path) -> None:
     script = tmp_path / "trainer.py"
@@ -174,6 +176,7 @@ def test_a_script_without_a_main_guard_gets_a_hint(path: Path, tmp_path: Path) -
     assert "A script that starts processes begins with: if __name__ == '__main__':" in trainer.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_a_killed_trainer_leaves_nothing() -> None:
     """A short run of the stress test; the whole one takes minutes."""

@@ -127,6 +127,7 @@ def test_a_custom_metric_and_one_condition_per_trajectory() -> None:
     assert found.costs[0, 2] == pytest.approx(11 / 16, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_trajectories() -> None:
     def live() -> int:
         return sum(x.numel() for x in gc.get_objects() if type(x) is Tensor and x.shape[-3:] == SHAPE)

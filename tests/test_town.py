@@ -54,6 +54,7 @@ def as_bytes(scan: Scan) -> list[bytes]:
     return [np.ascontiguousarray(a).tobytes() for a in arrays]
 
 
+@pytest.mark.slow
 def test_a_scan_is_the_same_in_any_order_and_process(scans: dict[int, Scan]) -> None:
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         elsewhere = pool.submit(fingerprint, 444)
@@ -342,6 +343,7 @@ def test_camera_and_lidar_see_the_same_classes(town: Town, scans: dict[int, Scan
     assert (turned == scan.label[inside]).mean() < (seen == scan.label[inside]).mean() - 0.03  # type: ignore[index]
 
 
+@pytest.mark.slow
 def test_the_camera_image_shows_a_street_with_sky(town: Town) -> None:
     image = town.image(4)
     assert image.shape == (376, 1408, 3) and image.dtype == np.uint8

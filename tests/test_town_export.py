@@ -182,6 +182,7 @@ def test_an_unwritable_folder_is_reported(tmp_path: Path, town: Town) -> None:
         export_town(town, tmp_path / "file" / "out", "kitti360", camera=False, progress=False)
 
 
+@pytest.mark.slow
 def test_several_processes_write_the_same_files_as_one(tmp_path: Path, town: Town) -> None:
     for jobs in (1, 2):
         export_town(town, tmp_path / str(jobs), "kitti360", camera=False, jobs=jobs, progress=False)
@@ -198,6 +199,7 @@ def test_work_is_grouped_by_stretch() -> None:
     assert _groups([19, 20], 1) == [[19], [20]]
 
 
+@pytest.mark.slow
 def test_the_command_writes_camera_images_and_accepts_sensors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

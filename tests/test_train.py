@@ -141,6 +141,7 @@ def test_every_epoch_is_a_permutation_of_all_scans(batches: Batches, epoch: int)
     assert sorted(batches.scans_at(range(epoch * 5, epoch * 5 + 5))) == list(range(5))
 
 
+@pytest.mark.slow
 def test_augmentation_turns_and_mirrors_whole_columns(batches: Batches) -> None:
     plain = Batches(batches.cache, TENSORS, seed=3)
     seen = set()
@@ -204,6 +205,7 @@ def test_the_schedules_have_their_shape() -> None:
 # the loop
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(batches: Batches, accelerator: Accelerator) -> None:
     training = new_training(iterations=60, clip=10.0)
     records = list(steps(training, teacher_task(), batches, accelerator))
@@ -247,6 +249,7 @@ def transformer() -> nn.Module:
     return build_network("hdit", {"resolution": SENSOR.shape, "channels": TENSORS.size, "angles": angles} | arguments)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
 def test_a_saved_run_goes_on_with_the_very_same_losses(
     optimizer: str, batches: Batches, accelerator: Accelerator, tmp_path: Path

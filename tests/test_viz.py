@@ -233,6 +233,7 @@ def test_a_sheet_of_a_range_image_shows_its_cells() -> None:
     np.testing.assert_array_equal(axes.images[0].get_array(), picture(image, "label"))
 
 
+@pytest.mark.slow
 def test_a_contact_sheet_shows_every_scan() -> None:
     scans = [replace(random_scan(SMALL, seed=i), domain=i % 2) for i in range(5)]
     figure = contact_sheet(scans, title="five")
@@ -252,6 +253,7 @@ def test_a_contact_sheet_shows_every_scan() -> None:
         contact_sheet([])
 
 
+@pytest.mark.slow
 def test_pictures_and_pages_are_written_to_files(tmp_path: Path) -> None:
     scans = [random_scan(SMALL, seed=i) for i in range(2)]
     write_view(tmp_path / "one.png", scans[:1])
