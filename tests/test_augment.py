@@ -174,6 +174,7 @@ def test_jitter_is_along_the_ray() -> None:
     assert np.array_equal(noisy.reflectance, scan.reflectance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rings", [True, False])
 def test_beams_go_as_wholes(rings: bool) -> None:
     scan = cast()

@@ -96,6 +96,7 @@ def test_what_leaves_the_codec_is_what_was_said() -> None:
     assert torch.allclose(fields["confidence"][seen], likely[seen].clamp(max=0.9999), atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lattice", LATTICES)
 def test_chance_draws_what_was_said(lattice: tuple[int, int]) -> None:
     """Over many draws, coarser lattices being as they are: as many returns as the logit says, the medians and the

@@ -97,6 +97,7 @@ def write_conditioned(path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
     real = tmp_path / "real"
     write_all("npz", real, [some_scan(i) for i in range(3)])
@@ -293,6 +294,7 @@ def test_published_configurations_load(path: Path) -> None:
     assert validated(BakeJob, read_values(path, BakeJob), str(path)).count >= 1000
 
 
+@pytest.mark.slow
 def test_a_dry_run_writes_nothing_and_estimates_the_size(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "bank"
     call = ["bake", str(out), "--model", str(model), "--count", "50", "--shard-size", "20", "--dry-run"]

@@ -188,6 +188,7 @@ def test_temporary_files_of_killed_processes_are_removed(plan: BakePlan, expecte
 SHARES = {"all": [()] * 3, "shares": [("--shard-index", str(k), "--num-shards", "3") for k in range(3)]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shares", ["all", pytest.param("shares", marks=pytest.mark.slow)])
 def test_three_concurrent_bakes_write_the_same_bytes(model: Path, tmp_path: Path, shares: str) -> None:
     """Three processes; none removes a file that another one is writing."""
@@ -350,6 +351,7 @@ def test_a_folder_that_becomes_read_only(model: Path, expected: dict[str, bytes]
         assert files(plan.out) == expected
 
 
+@pytest.mark.slow
 def test_a_folder_that_vanishes(plan: BakePlan, expected: dict[str, bytes]) -> None:
     for scans in (3, 4):  # at the end of a shard, and within one
         with pytest.raises(FileError, match=r"bank.*(has vanished or lost its .bake.json|No such file)"):

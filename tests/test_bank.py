@@ -64,6 +64,7 @@ def test_plain_hdf5_reads_a_shard(tmp_path: Path) -> None:
             assert np.array_equal(dataset[:], expected)
 
 
+@pytest.mark.slow
 def test_the_same_scans_give_the_same_bytes(tmp_path: Path) -> None:
     images = [some_image(i) for i in range(3)]
     first = [path.read_bytes() for path in write_bank(tmp_path / "a", images)]

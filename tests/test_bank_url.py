@@ -33,6 +33,7 @@ def served(tmp_path: Path) -> Iterator[Served]:
         yield found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["plain", "paged", "before"])
 def test_random_access_transfers_little_more_than_the_scans(
     tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch
@@ -74,6 +75,7 @@ def test_a_url_gives_the_same_scans_as_the_folder(served: Served, tmp_path: Path
         assert a.id == b.id and np.array_equal(a.points, b.points) and np.array_equal(a.label, b.label)
 
 
+@pytest.mark.slow
 def test_forked_workers_read_from_a_url(served: Served) -> None:
     bank = Bank(f"{served.url}/bank")
     expected = sum(len(scan) for scan in bank)  # the parent process has open connections

@@ -67,6 +67,7 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("condition", [SEMANTIC, CAMERA, SIGHT], ids=["semantic", "camera", "sight"])
 def test_a_latent_transformer(condition: dict[str, Any], scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
     """Any velocity network lives on latents, which look where their cells look."""
@@ -133,6 +134,7 @@ def test_the_camera_of_another_focal_length_is_refused(scans: Path, kitti: Path,
             conditions_for(generator, str(other))
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_together(scans: Path, codec: Path, teacher: Path, tmp_path: Path) -> None:
     def refuse(message: str, *overrides: str, **values: Any) -> None:
         with pytest.raises(ConfigError, match=message):

@@ -29,6 +29,7 @@ def files(root: Path) -> dict[str, bytes]:
     return {p.relative_to(root).as_posix(): p.read_bytes() for p in paths}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", WRITERS)
 @pytest.mark.parametrize("layout", READERS)
 def test_every_layout_becomes_every_format(tmp_path: Path, layout: str, to: str) -> None:

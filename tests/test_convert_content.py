@@ -30,6 +30,7 @@ def rings_of(seed: int) -> Scan:
     return replace(scan[np.lexsort((azimuth, row))], sensor=sensor)
 
 
+@pytest.mark.slow
 def test_conversion_unfolds_scans(tmp_path: Path) -> None:
     scans = [rings_of(i) for i in range(3)]
     write_all("kitti", tmp_path / "in", scans)

@@ -183,6 +183,7 @@ def bank(tmp_path: Path) -> Path:
     return tmp_path / "bank"
 
 
+@pytest.mark.slow
 def test_the_command_lists_plots_and_drops(bank: Path, tmp_path: Path) -> None:
     out, picture = tmp_path / "good", tmp_path / "scores.png"
     status, output = call("curate", bank, "--sort", "duplicate", "--limit", 1, "--plot", picture)
@@ -203,6 +204,7 @@ def test_the_command_lists_plots_and_drops(bank: Path, tmp_path: Path) -> None:
     assert len(read_scores(out / FILE).twin) == 19
 
 
+@pytest.mark.slow
 def test_the_plot_counts_every_scan_and_marks_some() -> None:
     rng = np.random.default_rng(0)
     values, marked = {name: rng.random(50) for name in MEANINGS}, rng.random(50) < 0.2

@@ -210,6 +210,7 @@ def test_a_bank_records_the_training_data_of_its_model(kitti360: Path, tmp_path:
     assert "2013_05_28_drive_0002_sync" in str(refused(judge(kitti360, bank, "--split", "r2flow/test")))
 
 
+@pytest.mark.slow
 def test_a_run_records_the_frames_that_it_saw(kitti360: Path, fake: Path, tmp_path: Path) -> None:
     """Its own and its start's; other frames of the same drive are not refused."""
     sensor = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0).to_dict()

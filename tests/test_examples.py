@@ -89,6 +89,7 @@ def test_every_new_name_of_the_package_needs_an_example(monkeypatch: pytest.Monk
     assert "lidar_synth.Noise" in public_names()
 
 
+@pytest.mark.slow
 def test_every_name_of_the_readme_has_an_example() -> None:
     named = named_in((ROOT / "README.md").read_text())
     assert {"MixedScans", "solve", "Taxonomy"} <= named

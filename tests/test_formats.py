@@ -43,6 +43,7 @@ def test_every_reader_and_writer_is_tested() -> None:
     assert set(WRITTEN_AS) == set(WRITERS) and set(MAKERS) == set(READERS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", POINT_LAYOUTS)
 def test_points_are_read_back_bit_for_bit(tmp_path: Path, to: str) -> None:
     scans = [some_scan(i) for i in range(3)]

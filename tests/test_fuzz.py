@@ -54,6 +54,7 @@ def test_every_reader_is_fuzzed() -> None:
     assert {f".{name}" for name in TARGETS} >= set(SUFFIXES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_number_gives_the_same_case(tmp_path: Path, name: str) -> None:
     def contents(cases: Cases, number: int) -> dict[str, bytes]:
@@ -194,6 +195,7 @@ def test_checks_see_what_is_unsound() -> None:
         assert fingerprint(changed) != fingerprint(scan), name
 
 
+@pytest.mark.slow
 def test_the_tool_prints_a_table_and_keeps_what_is_wrong(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

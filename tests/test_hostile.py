@@ -107,6 +107,7 @@ FALSE_PLY = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @needs_limits
 @pytest.mark.parametrize(
     ("suffix", "name"), [(".pcd", name) for name in FALSE_PCD] + [(".ply", name) for name in FALSE_PLY]
@@ -165,6 +166,7 @@ def damaged_streams() -> None:
         assert -1 <= written <= len(target) - 8 and (target[-8:] == 123).all()
 
 
+@pytest.mark.slow
 @needs_limits
 def test_compressed_points_that_are_damaged_stay_within_their_arrays() -> None:
     assert in_limits(damaged_streams) == ""
@@ -280,6 +282,7 @@ def table_of_numbers(root: Path) -> Path:
     return root
 
 
+@pytest.mark.slow
 @needs_limits
 @pytest.mark.parametrize(
     "make",

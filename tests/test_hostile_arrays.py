@@ -20,6 +20,7 @@ from lidar_synth.formats import open_scans
 from lidar_synth.labels.bank import ObjectBank
 
 
+@pytest.mark.slow
 @needs_limits
 @pytest.mark.parametrize("name", HOSTILE_NPY)
 def test_hostile_arrays_are_refused(tmp_path: Path, name: str) -> None:
@@ -117,6 +118,7 @@ NPZ = ["a bomb", "a bomb of many", "a bomb that says it is small", "stored, and 
        "nothing"]  # fmt: skip
 
 
+@pytest.mark.slow
 @needs_limits
 @pytest.mark.parametrize("name", NPZ)
 def test_hostile_archives_are_refused(tmp_path: Path, name: str) -> None:

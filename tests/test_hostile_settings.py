@@ -98,6 +98,7 @@ def open_yaml(path: Path) -> None:
         assert len(str(caught.value)) < 2000
 
 
+@pytest.mark.slow
 @needs_limits
 @pytest.mark.parametrize("name", HOSTILE_YAML)
 def test_hostile_yaml_is_refused(tmp_path: Path, name: str) -> None:
@@ -119,6 +120,7 @@ def test_anchors_in_reason_stay_possible() -> None:
         assert parse_yaml(path.read_text(), path.name) == yaml.safe_load(path.read_text())
 
 
+@pytest.mark.slow
 @given(st.text(max_size=60) | st.text(st.sampled_from("&*ab:- []{}!\n?|>'\"%0x_1."), max_size=60))
 def test_any_text_is_yaml_or_refused(text: str) -> None:
     with suppress(ConfigError):

@@ -79,6 +79,7 @@ def test_every_policy_and_kind_is_called_here() -> None:
     assert {"objects", *(c["kind"] for c in CALLS.values() if "kind" in c)} == set(KINDS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CALLS)
 def test_a_policy_is_a_function_of_scan_and_generator(name: str, synthetic: Scan, real: list[Scan]) -> None:
     policy_name, options = call(name)
@@ -334,6 +335,7 @@ def test_a_policy_of_ones_own_is_taken_as_it_is(synthetic: Scan) -> None:
         make_policy(own, threshold=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_real_scans_as_the_labelled_side(kind: str, real_scans: Path, synthetic: Scan) -> None:
     source: Source = SemanticKITTI(real_scans / "semantic_kitti", split="train")

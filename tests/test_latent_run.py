@@ -31,6 +31,7 @@ STILL = ("stem", "encode", "merge", "to_latent", "shift", "scale")
 """Parts of names in an autoencoder that belong to its encoder, or to both sides."""
 
 
+@pytest.mark.slow
 def test_an_autoencoder_is_a_checkpoint_without_a_flow(codec: Path) -> None:
     header, networks, _ = load_checkpoint(codec)
     assert set(networks) == {CODEC}
@@ -40,6 +41,7 @@ def test_an_autoencoder_is_a_checkpoint_without_a_flow(codec: Path) -> None:
         load_generator(codec)
 
 
+@pytest.mark.slow
 def test_a_latent_model_of_label_maps_generates(codec: Path, teacher: Path) -> None:
     header, networks, _ = load_checkpoint(teacher)
     assert set(networks) == {VELOCITY, CODEC, ENCODER}
@@ -62,6 +64,7 @@ def test_a_latent_model_of_label_maps_generates(codec: Path, teacher: Path) -> N
     assert torch.allclose(together[1], alone[0], atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guidance", [1.0, 2.0])
 def test_it_is_distilled_on_timesteps_selected_with_its_conditions(
     guidance: float, scans: Path, teacher: Path, tmp_path: Path
@@ -135,6 +138,7 @@ def test_guidance_of_an_unconditional_teacher_asks_for_a_weaker_one(scans: Path,
         call("distill", config)
 
 
+@pytest.mark.slow
 def test_runs_go_on_as_if_nothing_had_happened(scans: Path, codec: Path, tmp_path: Path) -> None:
     """A codebook of moving averages, a discriminator and a condition's encoder are part of what is saved."""
     kinds = {

@@ -156,6 +156,7 @@ def test_maximum_mean_discrepancy_by_its_definition(monkeypatch: pytest.MonkeyPa
     assert r2flow.maximum_mean_discrepancy(real, fake) == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_each_protocol_tells_near_from_far(name: str) -> None:
     real = scans(8, 0)

@@ -59,6 +59,7 @@ def test_random_numbers_of_a_sample_depend_only_on_seed_epoch_and_position() -> 
     assert drawn == [keyed_rng(5, 2, 4).random(), keyed_rng(5, 2, 0).random()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("persistent", [False, True])
 @pytest.mark.parametrize("workers", WORKERS)
 def test_the_number_of_workers_does_not_change_batches(workers: int, persistent: bool) -> None:
@@ -71,6 +72,7 @@ def test_the_number_of_workers_does_not_change_batches(workers: int, persistent:
         assert [plain(batch) for batch in load] == [plain(batch) for batch in expected]
 
 
+@pytest.mark.slow
 def test_persistent_workers_that_were_spawned_see_the_epoch() -> None:
     train, alone = mixed(), mixed()
     load = loader(train, 1, batch_size=15, persistent_workers=True, multiprocessing_context="spawn")
@@ -121,6 +123,7 @@ def free_port() -> int:
         return int(s.getsockname()[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ranks", [1, 2, 3])
 @pytest.mark.parametrize("done", range(5))
 def test_resuming_with_other_ranks_and_workers_yields_the_remaining_samples(ranks: int, done: int) -> None:

@@ -30,6 +30,7 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Generator:
     return load_generator(write(tmp_path_factory.mktemp("mixing") / "tiny.safetensors"))
 
 
+@pytest.mark.slow
 def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> None:
     real = Scans("r", 4, GENERATED_SENSOR)
     train = MixedScans(real, generator, 0.5, seed=11)
@@ -45,6 +46,7 @@ def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> 
     assert train.mixture.synthetic[0].identity.startswith(f"generated:{generator.hash}:11:")
 
 
+@pytest.mark.slow
 def test_a_cache_keeps_the_latest(generator: Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
     scans = Generator.scans

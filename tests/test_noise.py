@@ -99,6 +99,7 @@ def test_cpu_and_cuda_agree() -> None:
         assert (cpu - cuda.cpu()).abs().max() <= 1e-6
 
 
+@pytest.mark.slow
 def test_gaussian_numbers_are_normal_and_independent() -> None:
     x = gaussian(11, range(100), (2, 16, 64)).double().numpy().reshape(100, -1)
     assert stats.kstest(x.ravel(), "norm").pvalue > 0.001

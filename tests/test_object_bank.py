@@ -37,6 +37,7 @@ def bank(scans: list[Scan]) -> ObjectBank:
     return ObjectBank.from_scans(scans, least=8)
 
 
+@pytest.mark.slow
 def test_objects_are_their_instances(scans: list[Scan], bank: ObjectBank) -> None:
     """The town's boxes are so tight that noise sticks out of them: they grow by a little, and hold nearly all of it."""
     assert len(bank) > 20 and (bank.counts >= 8).all()
@@ -133,6 +134,7 @@ def test_town_objects_in_a_town_scan(town: Town, bank: ObjectBank, bare: bool) -
         assert ground is not None and abs(box[2] - box[5] / 2 - ground.height) < 0.35
 
 
+@pytest.mark.slow
 def test_real_objects_in_town_scans(real_scans: Path, town: Town) -> None:
     bank = ObjectBank.from_scans(KITTIObject(real_scans / "kitti_object", "trainval"))
     assert set(bank.boxes.names) >= {"Car", "Pedestrian", "Cyclist", "Van", "Truck"}

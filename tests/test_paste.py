@@ -219,6 +219,7 @@ def test_fields_of_a_scan_with_pasted_objects() -> None:
     assert (about.truncation[0], about.alpha[0]) == (-1, -10)  # in another direction the camera saw nothing of it
 
 
+@pytest.mark.slow
 def test_nothing_that_is_given_is_changed() -> None:
     host, candidate = cast([car(20, 0)]), seen(car(8, 5))
     for array in (host.points, *host.fields().values(), host.boxes.values, candidate.scan.points, candidate.box):

@@ -146,6 +146,7 @@ def test_running_indices(real: int, ratio: float, size: str | int) -> None:
         assert max(given_reals.values()) - min(given_reals.values()) <= 1
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(
     st.integers(2, 5), st.integers(1, 30), st.sampled_from([0.1, 0.25, 1 / 3, 0.5]), WEIGHTS, st.booleans(),
@@ -342,6 +343,7 @@ def test_synthetic_only_and_real_only() -> None:
     assert plan(Mixture((PlannedSource(4),), (), make_schedule(0)), 0).domain.tolist() == [False] * 4
 
 
+@pytest.mark.slow
 def test_a_plan_of_any_length_takes_the_same_memory() -> None:
     tracemalloc.start()
     try:

@@ -42,6 +42,7 @@ def image_of(sensor: Sensor, seed: int, share: float = 0.7) -> RangeImage:
     return RangeImage(distance.astype(np.float32), sensor, {"label": label})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beams", [False, True])
 def test_unprojecting_and_projecting_keeps_every_cell(sensor: Sensor, beams: bool) -> None:
     sensor = sensor.by_beams() if beams else sensor

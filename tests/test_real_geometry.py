@@ -32,6 +32,7 @@ def elevation(points: np.ndarray) -> np.ndarray:
     return np.arcsin(points[:, 2].astype(np.float64) / np.linalg.norm(points.astype(np.float64), axis=1))
 
 
+@pytest.mark.slow
 def test_unprojecting_and_projecting_keeps_every_cell(scans: list[Scan]) -> None:
     full = [s for s in scans if len(s) > FULL_TURN]
     assert len(full) >= 29
@@ -76,6 +77,7 @@ def test_halves_have_the_rings_of_the_complete_scan(scans: list[Scan]) -> None:
             assert unfold(scan[kept]).mask.any(1).sum() == expected.max() + 1, scan.id
 
 
+@pytest.mark.slow
 def test_the_beam_table_matches_the_rings_of_real_scans(scans: list[Scan]) -> None:
     """Compares the median elevation of each ring over full scans with the preset's ``beams``."""
     sensor: Sensor = load_sensor("hdl64e_kitti360")

@@ -209,6 +209,7 @@ def teacher(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run" / "run.safetensors"
 
 
+@pytest.mark.slow
 def test_fine_tuning_starts_from_a_checkpoint(scans: Path, teacher: Path, tmp_path: Path) -> None:
     config = write_config(scans, tmp_path, recipe={"iterations": 1, "rate": 1e-9})
     call("train", config, f"init={teacher}")
@@ -272,6 +273,7 @@ def strip_settings(path: Path) -> None:
     np.savez(path, **held)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("old", [False, True], ids=["", "of version 0.1.0"])
 @pytest.mark.parametrize(
     ("override", "named"),

@@ -19,6 +19,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("generator") / "small.safetensors")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [name for name in WRITERS if name != "kitti_object"])  # no model gives boxes
 def test_sample_writes_every_format_and_resumes(form: str, path: Path, tmp_path: Path) -> None:
     from lidar_synth.cli import app
@@ -52,6 +53,7 @@ def test_sample_refuses_a_folder_that_holds_samples_of_another_seed(path: Path, 
     assert (tmp_path / "out" / "000000.npz").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_sample_takes_its_conditions_from_a_dataset(tmp_path: Path) -> None:
     from lidar_synth.cli import app
 

@@ -54,6 +54,7 @@ def test_ious_by_hand() -> None:
     assert mean_iou(table) == (6 / 8 + 3 / 6) / 2, "a class that is said but never labelled counts by its mistakes"
 
 
+@pytest.mark.slow
 def test_what_cannot_be_trained_on_is_refused() -> None:
     network = RangeSegmenter(widths=(8, 8, 8))
     empty = [{**b, "label": torch.full_like(b["label"], IGNORE)} for b in batches(1)]
@@ -88,6 +89,7 @@ def test_a_judge_sees_a_scan_as_the_network_sees_its_image(judge: Judge) -> None
     assert np.trace(table) == (said == label)[label != IGNORE].sum()
 
 
+@pytest.mark.slow
 def test_a_judge_is_kept_whole(judge: Judge, tmp_path: Path) -> None:
     judge.save(tmp_path / "a.safetensors")
     again = load_judge(tmp_path / "a.safetensors")

@@ -148,18 +148,21 @@ def test_threads_read_it(bank: RollingBank) -> None:
     assert {pid for pid, _ in bank._client._connections} == {os.getpid()}
 
 
-def test_announced_scans_are_made_before_they_are_requested(bank: RollingBank) -> None:
-    before = bank.counts()
-    bank.expect([100, 102, 101])
-    wait_until(lambda: bank.counts()["made"] >= before["made"] + 3)
-    assert [bank[n].id for n in (102, 100, 101)] == [f"small/{SEED}/{n}" for n in (102, 100, 101)]
-    after = bank.counts()
-    assert (after["served"] - before["served"], after["waited"] - before["waited"]) == (3, 0)
-    many = list(range(200, 20_200))
-    bank.expect(many)  # more than one message
-    wait_until(lambda: bank.counts()["made"] >= after["made"] + 6)
-    assert bank[200].id == f"small/{SEED}/200"
-    assert bank.counts()["waited"] == after["waited"]
+def test_announced_scans_are_made_before_they_are_requested(path: Path) -> None:
+    with RollingBank(
+        path, seed=SEED, slots=6, threads=1, timeout=60
+    ) as bank:  # of its own: nothing else is announced to it
+        before = bank.counts()
+        bank.expect([100, 102, 101])
+        wait_until(lambda: bank.counts()["made"] >= before["made"] + 3)
+        assert [bank[n].id for n in (102, 100, 101)] == [f"small/{SEED}/{n}" for n in (102, 100, 101)]
+        after = bank.counts()
+        assert (after["served"] - before["served"], after["waited"] - before["waited"]) == (3, 0)
+        many = list(range(200, 20_200))
+        bank.expect(many)  # more than one message
+        wait_until(lambda: bank.counts()["made"] >= after["made"] + 6)
+        assert bank[200].id == f"small/{SEED}/200"
+        assert bank.counts()["waited"] == after["waited"]
 
 
 def wait_until(what: Callable[[], bool], seconds: float = 60) -> None:
@@ -226,6 +229,7 @@ def test_invalid_options_and_requests_are_refused(path: Path, bank: RollingBank,
         pickle.dumps(bank)
 
 
+@pytest.mark.slow
 def test_the_error_names_why_the_process_did_not_start(path: Path) -> None:
     with pytest.raises(ProcessError, match=r"died \(process \d+, exit code 1; .*device 'nowhere'|nowhere"):
         RollingBank(path, device="nowhere", timeout=60)
@@ -252,6 +256,7 @@ def mixed(synth: Any) -> MixedScans:
     )
 
 
+@pytest.mark.slow
 def test_all_ways_of_loading_give_the_same_scans_for_the_same_plan(bank: RollingBank, generator: Generator) -> None:
     inside, rolling = mixed(generator), mixed(bank)
     mixer = BatchMixer(mixed(generator), batch_size=5, num_workers=1)

@@ -63,6 +63,7 @@ def gone(pid: int, seconds: float = 20) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_a_bank_outlives_a_worker_and_names_a_dead_generator(bank: RollingBank) -> None:
     loader = DataLoader(Ids(bank), batch_size=2, num_workers=2, multiprocessing_context="fork")
     batches: Any = iter(loader)
@@ -83,6 +84,7 @@ def test_a_bank_outlives_a_worker_and_names_a_dead_generator(bank: RollingBank) 
             bank[0]
 
 
+@pytest.mark.slow
 def test_a_generator_that_hangs_is_not_waited_for_longer_than_stated(bank: RollingBank) -> None:
     bank[0]
     os.kill(bank.pid, signal.SIGSTOP)

@@ -68,6 +68,7 @@ def sure(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     return np.full(len(scan), 8, np.uint8), (np.arange(len(scan)) % 2).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bank", "rolling", "list"])
 def test_every_source_gives_the_same_scan(kind: str, sources: dict[str, Any], generator: Generator) -> None:
     encoding = Encoding(generator.sensor, FIELDS)
@@ -81,6 +82,7 @@ def test_every_source_gives_the_same_scan(kind: str, sources: dict[str, Any], ge
             assert (abs(given[name].astype(int) - values.astype(int)) <= 1).mean() > 0.9999, (number, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("kind", ["generator", "bank", "rolling", "list"])
 def test_every_source_and_label_policy_mixes_with_real_scans(

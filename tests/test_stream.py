@@ -97,6 +97,7 @@ def test_the_remainder_is_a_batch_of_its_own() -> None:
     assert given[0].state_dict(2) == state(1, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("endless", [False, True])
 @pytest.mark.parametrize("done", range(5))
 @pytest.mark.parametrize(("before", "after"), [((1, 0), (2, 1)), ((2, 2), (1, 0)), ((2, 1), (3, 2)), ((3, 0), (1, 2))])

@@ -42,6 +42,7 @@ def test_dynamic_programming_equals_brute_force(data: st.DataObject, candidates:
         assert tuple(paths[index]) == by_brute_force(costs[index], intervals)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", METRICS)
 @pytest.mark.parametrize("knots", [(1.0, 0.86, 0.58, 0.22, 0.0), (1.0, 0.42, 0.2, 0.08, 0.0), (1.0, 0.5, 0.0)])
 def test_the_knots_of_a_piecewise_linear_flow_are_found(metric: str, knots: tuple[float, ...]) -> None:
@@ -94,6 +95,7 @@ def test_the_selection_minimises_the_mean_cost_of_a_curved_flow() -> None:
     assert found.candidates == uniform_grid(40) and found.grid[0] == 1 and found.grid[-1] == 0
 
 
+@pytest.mark.slow
 def test_the_batch_size_changes_only_rounding() -> None:
     one, three = (select_timesteps(gaussian_velocity, SHAPE, 3, 20, 8, batch=b, progress=False) for b in (1, 3))
     assert one.grid == three.grid

@@ -64,6 +64,7 @@ def test_a_scan_is_the_same_in_any_order_and_process(scans: dict[int, Scan]) -> 
         assert elsewhere.result() == as_bytes(scans[444])
 
 
+@pytest.mark.slow
 def test_different_seeds_and_indices_give_different_scans(town: Town, scans: dict[int, Scan]) -> None:
     assert as_bytes(scans[4])[0] != as_bytes(scans[5])[0]
     other = Town(seed=1, scans=5)
@@ -195,6 +196,7 @@ def test_image_boxes_and_truncation_match_the_boxes(scans: dict[int, Scan]) -> N
     assert seen > 10
 
 
+@pytest.mark.slow
 def test_no_ray_passes_through_walls_or_cars(town: Town, scans: dict[int, Scan]) -> None:
     """A ray returns from the first surface that it hits, except for glass, wire and leaves."""
     mover_points = 0

@@ -36,6 +36,7 @@ def written(request: pytest.FixtureRequest, town: Town, tmp_path_factory: pytest
     return request.param, root
 
 
+@pytest.mark.slow
 def test_points_are_read_back_bit_for_bit(written: tuple[str, Path], scans: list[Scan]) -> None:
     layout, root = written
     read = open_scans(root, split="train" if layout == "semantic_kitti" else None)
@@ -144,6 +145,7 @@ def test_splits_and_times_of_each_layout_are_written(written: tuple[str, Path]) 
         assert np.allclose(times, [0, 0.4, 0.8])
 
 
+@pytest.mark.slow
 def test_an_interrupted_export_resumes(tmp_path: Path, town: Town) -> None:
     assert export_town(town, tmp_path, "semantic_kitti", camera=False, progress=False) == (COUNT, 0)
     scan = tmp_path / "sequences" / "00" / "velodyne" / "000001.bin"

@@ -215,6 +215,7 @@ def test_training_lowers_the_loss(batches: Batches, accelerator: Accelerator) ->
     assert all(r.gradient > 0 and r.teacher_evaluations == 0 for r in records)
 
 
+@pytest.mark.slow
 def test_the_first_loss_is_that_of_the_metric_on_the_batch(batches: Batches, accelerator: Accelerator) -> None:
     for metric in METRICS:
         training = new_training(metric=metric)
@@ -234,6 +235,7 @@ def test_weights_of_channels_are_those_of_their_squared_errors(batches: Batches,
     assert next(steps(training, teacher_task(), batches, accelerator)).loss == pytest.approx(expected.item(), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_accumulation_changes_rounding_only(batches: Batches, accelerator: Accelerator) -> None:
     one, two = (
         [r.loss for r in steps(new_training(accumulate=n), teacher_task(), batches, accelerator)] for n in (1, 2)

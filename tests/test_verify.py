@@ -141,6 +141,7 @@ SIDE_DAMAGE: dict[str, Callable[[Path, np.random.Generator], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SIDE)
 @pytest.mark.parametrize("kind", SIDE_DAMAGE)
 def test_damage_of_other_files_is_found_and_repaired(root: Path, original: Path, name: str, kind: str) -> None:

@@ -190,6 +190,7 @@ def test_real_and_synthetic_differ_in_colour() -> None:
     assert np.abs(real[32, 32].astype(int) - synthetic[32, 32]).max() > 100
 
 
+@pytest.mark.slow
 def test_an_empty_scan_can_be_shown() -> None:
     empty = few_points(label=[])
     assert (render(empty, "height", size=(32, 18), rings=False) == EMPTY).all()
@@ -202,6 +203,7 @@ def rgb(figure: Any) -> np.ndarray:
     return np.asarray(figure.canvas.buffer_rgba())[..., :3]
 
 
+@pytest.mark.slow
 def test_a_sheet_shows_its_scan_its_views_and_its_classes() -> None:
     scan = replace(random_scan(SMALL), boxes=Boxes(np.array([(5, 0, 0, 4, 2, 1.5, 0)], np.float32), ("Car",)))
     assert scan.label is not None

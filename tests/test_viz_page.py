@@ -41,6 +41,7 @@ def page(scans: list[Scan]) -> str:
     return html_page(scans, title="A <title> & more", notes="First.\n\nSecond & <last>. @data@")
 
 
+@pytest.mark.slow
 def test_the_page_contains_all_points(page: str, scans: list[Scan]) -> None:
     for scan, packed in zip(scans, page_data(page)["scans"], strict=True):
         points = np.frombuffer(base64.b64decode(packed["points"]), POINT)

@@ -55,6 +55,7 @@ def test_view_writes_a_page_where_there_is_no_screen(view: View) -> None:
     assert scan["count"] == 400
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("args", "ids"), [
     (["--index", "-1"], ["000002"]), (["--index", "-3", "--count", "2"], ["000000", "000001"]),
     (["--count", "9"], ["000000", "000001", "000002"]),
@@ -65,6 +66,7 @@ def test_view_shows_the_selected_scans(view: View, args: list[str], ids: list[st
     assert [scan["id"][-6:] for scan in shown] == ids
 
 
+@pytest.mark.slow
 def test_view_accepts_a_sensor_and_writes_a_sheet(view: View) -> None:
     assert view("--sensor", "os1_128", "--out", "one.html").exit_code == 0
     [scan] = page_data(Path("one.html").read_text(encoding="utf-8"))["scans"]

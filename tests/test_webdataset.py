@@ -86,6 +86,7 @@ def test_names_with_dots(tmp_path: Path) -> None:
     assert list(open_scans(tmp_path).ids) == names and len(samples(tmp_path / "scans-000000.tar")) == 3
 
 
+@pytest.mark.slow
 def test_bytes_repeat_in_any_order_and_by_any_number_of_processes(tmp_path: Path) -> None:
     write_bank(tmp_path / "bank", [some_image(i) for i in range(5)])
     bank = open_scans(tmp_path / "bank")
