@@ -149,12 +149,11 @@ def test_threads_read_it(bank: RollingBank) -> None:
 
 
 def test_announced_scans_are_made_before_they_are_requested(path: Path) -> None:
-    with RollingBank(
-        path, seed=SEED, slots=6, threads=1, timeout=60
-    ) as bank:  # of its own: nothing else is announced to it
+    with RollingBank(path, seed=SEED, slots=6, threads=1, timeout=60) as bank:  # nothing else is announced to it
+        wait_until(lambda: bank.counts()["made"] == 6)  # what it made ahead by itself
         before = bank.counts()
         bank.expect([100, 102, 101])
-        wait_until(lambda: bank.counts()["made"] >= before["made"] + 3)
+        wait_until(lambda: bank.counts()["made"] == before["made"] + 3)
         assert [bank[n].id for n in (102, 100, 101)] == [f"small/{SEED}/{n}" for n in (102, 100, 101)]
         after = bank.counts()
         assert (after["served"] - before["served"], after["waited"] - before["waited"]) == (3, 0)
