@@ -9,12 +9,17 @@ import typer
 
 if TYPE_CHECKING:
     from lidar_synth.datasets.recordings import Recordings
+    from lidar_synth.geometry.scan import Source
 
 
 def evaluate(
     real: Annotated[Path, typer.Argument(metavar="REAL", help="reference scans: root of a dataset, or a folder")],
     fake: Annotated[Path, typer.Argument(metavar="FAKE", help="scans to evaluate: root of a dataset, or a folder")],
-    protocol: Annotated[str, typer.Option(help="definitions of the metrics: r2flow | lidm | town")],
+    protocol: Annotated[str | None, typer.Option(help="definitions of the metrics: r2flow | lidm | town")] = None,
+    judge: Annotated[
+        Path | None, typer.Option(help="archive of lidar-bonnetal: how well its network recognises both sets")
+    ] = None,
+    columns: Annotated[int | None, typer.Option(help="width of the judge's grid; its own by default")] = None,
     split: Annotated[str | None, typer.Option(help="split of REAL, for instance r2flow/test")] = None,
     sensor: Annotated[str | None, typer.Option(help="sensor of both sets: a preset or a YAML file")] = None,
     segmenter: Annotated[bool, typer.Option(help="add metrics on features of the town's segmenter")] = False,
@@ -22,6 +27,9 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Compares two sets of scans: Jensen-Shannon distance and MMD of bird's-eye views; feature metrics on request.
+
+    With --judge, a segmentation network that was trained on real streets predicts the classes of both sets: accuracy,
+    IoU by class, the most frequent confusions and feature distances.
 
     Papers define metrics of the same name differently: scores of two protocols are not comparable. A reference that
     shares frames with the model's training data is refused, because it flatters the model; the training data of its
@@ -31,6 +39,7 @@ def evaluate(
     Examples:
       lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test
       lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
+      lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
     """
     from lidar_synth.evaluate import PROTOCOLS
     from lidar_synth.evaluate import evaluate as compare
@@ -38,17 +47,30 @@ def evaluate(
     from lidar_synth.evaluate.segmentation import load_judge
     from lidar_synth.formats import layout_of, open_scans
 
-    if protocol not in PROTOCOLS:
+    if (protocol is None) == (judge is None):
+        raise typer.BadParameter("give --protocol or --judge, one of them", param_hint="--protocol")
+    if judge is None and protocol not in PROTOCOLS:
         raise typer.BadParameter(f"{protocol!r} is none of {', '.join(PROTOCOLS)}", param_hint="--protocol")
     sources = open_scans(real, sensor=sensor, split=split), open_scans(fake, sensor=sensor)
     if not training_data:
         _refuse_training_data(measured(sources[0], layout_of(real), real, split), real, fake)
+    if judge is not None:
+        _recognition(judge, columns, sources, as_json)
+        return
     extractors = {"the town segmenter": load_judge().features} if segmenter else {}
-    scores = compare(*sources, protocol, extractors, progress=not as_json)
-    if as_json:
-        typer.echo(json.dumps([asdict(score) for score in scores], indent=2))
-    else:
-        typer.echo("\n".join(map(str, scores)))
+    scores = compare(*sources, str(protocol), extractors, progress=not as_json)
+    typer.echo(json.dumps([asdict(s) for s in scores], indent=2) if as_json else "\n".join(map(str, scores)))
+
+
+def _recognition(folder: Path, columns: int | None, sources: "tuple[Source, Source]", as_json: bool) -> None:
+    """Print how well the network of an archive recognises both sets."""
+    from lidar_synth.evaluate.recognition import as_text, compare, recognise
+    from lidar_synth.evaluate.street_judge import load_archive
+
+    judge = load_archive(folder, columns)
+    real, fake = (recognise(judge, s, name, not as_json) for s, name in zip(sources, ("real", "fake"), strict=True))
+    figures = compare(real, fake)
+    typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
 
 
 def _refuse_training_data(reference: "Recordings", real: Path, fake: Path) -> None:

@@ -21,12 +21,14 @@ def load_pickle(path: Path, peer: str) -> Any:
         FileError: if the file cannot be read.
         DataError: on a truncated file, one of another format, or one that contains code.
     """
+    kind = path.suffix or "weight"
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        file = path.open("rb")
     except OSError as error:
-        raise FileError(
-            f"{path} cannot be read ({error.strerror or error})", f"a {path.suffix} file of {peer}"
-        ) from error
+        raise FileError(f"{path} cannot be read ({error.strerror or error})", f"a {kind} file of {peer}") from error
+    try:
+        with file:
+            return torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle can raise anything
         if code := re.search(r"GLOBAL ([\w.]+)", str(error)):
             raise DataError(
@@ -35,7 +37,7 @@ def load_pickle(path: Path, peer: str) -> Any:
                 f"A pickle that contains code can do anything: get the file from {peer}'s own release page.",
             ) from error
         raise DataError(
-            f"{path} is truncated, damaged or no {path.suffix} file", f"an intact file of {peer}'s release"
+            f"{path} is truncated, damaged or no {kind} file", f"an intact file of {peer}'s release"
         ) from error
 
 
