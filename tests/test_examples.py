@@ -25,8 +25,8 @@ FURTHER = {
     "lidar_synth.train": ("TrainConfig", "load_config", "run"),
     "lidar_synth.viz": ("write_view",),
 }
-"""What the documents name besides ``lidar_synth.__all__``. A dictionary such as ``NORMALISATIONS`` has no docstring that
-Python keeps: the example of its values' class shows it."""
+"""What the documents name besides ``lidar_synth.__all__``. Python keeps no docstring of a dictionary such as
+``NORMALISATIONS``: the example of its values' class shows it."""
 
 PACKAGE = Path(lidar_synth.__file__).parent
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
