@@ -20,20 +20,21 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import NEAR
 from numpy.typing import NDArray
 from PIL import Image
 
 from lidar_synth import Scan, load_generator, project
 from lidar_synth.labels import ObjectBank, make_policy
 from lidar_synth.town import STRETCH_FRAMES, Town
-from lidar_synth.viz import picture, render, write_view
+from lidar_synth.viz import Orbit, picture, render, write_view
 
 Picture = NDArray[np.uint8]
 """(height, width, 3) uint8."""
 
 UNSEEN = 1
 """Seed of a town that no model was trained on."""
+NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)).camera()
+"""A camera from which cars and poles are distinguishable."""
 SIZE = (760, 400)
 """Width and height of one scan, in pixels."""
 WIDTH = 1200
@@ -47,7 +48,7 @@ def street(index: int, **options: object) -> Scan:
 
 
 def near(scan: Scan, boxes: bool = False) -> Picture:
-    """A scan, coloured by label, from a camera close enough to see cars and poles."""
+    """A scan seen by ``NEAR``, coloured by label."""
     return render(scan, "label", camera=NEAR, size=SIZE, boxes=boxes)
 
 
