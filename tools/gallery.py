@@ -117,7 +117,7 @@ PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
 
 def draw(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
     """Rows of images with their titles, all rows of the same width."""
-    title = 0.26  # inches
+    title = 0.36  # inches
     heights = [12 / sum(image.shape[1] / image.shape[0] for _, image in row) + title for row in rows]
     figure = Figure(figsize=(12, sum(heights)), facecolor="#101218", dpi=150)
     FigureCanvasAgg(figure)
@@ -128,7 +128,7 @@ def draw(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
         part.subplots_adjust(left=0.003, right=0.997, bottom=0, top=1 - title / height, wspace=0.01)
         for axes, (name, image) in zip(grid[0], row, strict=True):
             axes.imshow(image, interpolation="lanczos")
-            axes.set_title(name, color="#9aa0ad", fontsize=9, loc="left", pad=3)
+            axes.set_title(name, color="#9aa0ad", fontsize=14, loc="left", pad=4)
             axes.set_axis_off()
     figure.canvas.draw()
     pixels: Picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
