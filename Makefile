@@ -10,7 +10,7 @@ TYPES := $(VENV)/types
 DEMO_OUT ?= demo_out
 SCANS ?= 24
 
-.PHONY: demo test quick test-lowest lint bench clean
+.PHONY: demo test quick test-lowest lint docs bench clean
 
 demo: $(READY)  ## a small town as a user's dataset: write, read, project, convert, look
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
@@ -31,11 +31,14 @@ lint: $(READY)  ## style and types
 	ln -s $(CURDIR)/lidar_synth/* $(CURDIR)/integrations $(TYPES)/lidar_synth
 	cd $(TYPES) && $(CURDIR)/$(BIN)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache
 
+docs: $(READY)  ## the site, in site/; a broken link fails
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 bench: $(READY)  ## every table of tools/bench
 	for script in tools/bench/*.py; do case $$script in */timing.py) ;; *) $(BIN)/python $$script || exit 1;; esac; done
 
 clean:
-	rm -rf $(VENV) $(VENV)-lowest $(DEMO_OUT) build dist *.egg-info
+	rm -rf $(VENV) $(VENV)-lowest $(DEMO_OUT) site build dist *.egg-info
 
 # Python 3.10 has no wheels of some pinned versions: there the newest that fit are taken.
 PINS = $(shell $(PYTHON) -c 'import sys; print("--constraint constraints.txt" * (sys.version_info >= (3, 11)))')

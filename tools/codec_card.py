@@ -1,4 +1,4 @@
-"""Measure what the autoencoder of a latent model preserves of a scan, by class: the figures of docs/models.md.
+"""Measure what the autoencoder of a latent model preserves of a scan, by class: the figures of docs/research/models.md.
 
     python tools/codec_card.py NAME=MODEL ... [--count 24]
 

@@ -1,4 +1,4 @@
-"""Does a model follow its condition? The figures and images of conditional models in docs/models.md.
+"""Does a model follow its condition? The figures and images of conditional models in docs/research/models.md.
 
     python tools/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64] [--picture OUT.png]
 

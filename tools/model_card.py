@@ -1,4 +1,4 @@
-"""The figures and images of docs/models.md: how close generated scans are to scans of the town.
+"""The figures and images of docs/research/models.md: how close generated scans are to scans of the town.
 
     python tools/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ... [--count 512] [--pictures OUT]
 

@@ -1,7 +1,7 @@
 # ruff: noqa: C408
 # FRNet on SemanticKITTI, real and synthetic: only the data of the stock configuration changes.
 # FRNET_ROOT is a checkout of FRNet's repository, which has to be on PYTHONPATH too.
-# The list is written by lidar_synth.integrations.mmdet3d_infos.write_infos; see docs/trainers.md.
+# The list is written by lidar_synth.integrations.mmdet3d_infos.write_infos; see docs/how-to/trainers/mmdetection3d.md.
 _base_ = ["{{$FRNET_ROOT:.}}/configs/frnet/frnet-semantickitti_seg.py"]
 
 custom_imports = dict(

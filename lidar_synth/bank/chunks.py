@@ -1,7 +1,7 @@
 """Compression of scans to the chunks of an HDF5 dataset, in the format of HDF5's own filters.
 
 HDF5 does not compress the chunks itself because it holds one global lock. libdeflate compresses and decompresses in
-half of zlib's time (docs/benchmarks.md).
+half of zlib's time (docs/research/benchmarks.md).
 """
 
 import math

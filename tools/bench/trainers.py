@@ -83,7 +83,7 @@ def main() -> None:
         if os.environ.get(VARIABLES[trainer]) if trainer in VARIABLES else find_spec(trainer):
             subprocess.run([sys.executable, __file__, trainer], check=True)
         else:
-            print(f"{trainer} is not installed (docs/trainers.md): not measured")
+            print(f"{trainer} is not installed (docs/how-to/trainers/): not measured")
 
 
 if __name__ == "__main__":
