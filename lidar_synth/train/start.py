@@ -18,6 +18,7 @@ from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.formats import BankScans, ScanFiles, layout_of
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, NetworkSpec, load_checkpoint
 from lidar_synth.generate.codec import make_codec
+from lidar_synth.generate.generator import find_model
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.models import build_network, network_class
 from lidar_synth.train.config import Data, Network, Run, TrainConfig
@@ -54,7 +55,7 @@ def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
 def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     """The networks of ``config.init``, and its header for the new run."""
     assert config.init is not None
-    start = load_checkpoint(config.init)
+    start = load_checkpoint(find_model(config.init))
     wanted = {CODEC, VELOCITY} if config.decoder else {CODEC if config.autoencodes else VELOCITY}
     if not wanted <= set(start.networks) or config.codec is not None:
         raise ConfigError(f"init {config.init} with parts {sorted(start.networks)}", "a checkpoint of the same kind")

@@ -1,37 +1,145 @@
 """Hook of mkdocs: text that follows from the code is generated when the site is built.
 
 A page has a line ``<!-- generated: NAME -->``; the function of that name in ``GENERATED`` returns what replaces it.
+mkdocstrings then replaces ``::: NAME`` by the documentation of a name.
 """
 
+import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
-import typer
+import griffe
+from typer import Context
+from typer.core import TyperGroup
+from typer.main import get_command
 
+import lidar_synth
 from lidar_synth.cli import COMMANDS, app
-from lidar_synth.train.config import published
+from lidar_synth.train.autoencoder import Losses
+from lidar_synth.train.config import (
+    Condition,
+    Data,
+    DistillConfig,
+    Network,
+    Run,
+    Samples,
+    SelectionSettings,
+    TrainConfig,
+    published,
+)
+from lidar_synth.train.state import Recipe
+
+TOPICS = {
+    "geometry": "Scans and range images",
+    "formats": "Reading",
+    "bank": "Banks",
+    "generate": "Generating",
+    "mixing": "Mixing",
+    "labels": "Labels",
+    "town": "The town",
+    "errors": "Errors",
+}
+"""Headings of the API by the package's folder in which a name lies."""
+
+FURTHER = (
+    "lidar_synth.geometry.projection.batch.project_batch",
+    "lidar_synth.mixing.synthetic.Generated",
+    "lidar_synth.mixing.items.to_item",
+    "lidar_synth.mixing.collate.Collate",
+    "lidar_synth.labels.augment",
+    "lidar_synth.datasets.classes.Taxonomy",
+    "lidar_synth.train.runs.run",
+    "lidar_synth.train.config.load.load_config",
+    "lidar_synth.viz.write_view",
+)
+"""Names that pages use besides those of ``lidar_synth``."""
+
+SECTIONS: dict[str, tuple[type, ...]] = {
+    "": (Run, TrainConfig),
+    "data": (Data,),
+    "network": (Network,),
+    "condition": (Condition,),
+    "recipe": (Recipe,),
+    "losses": (Losses,),
+    "samples": (Samples,),
+    "distill": (DistillConfig,),
+    "selection": (SelectionSettings,),
+}
+"""Keys of a recipe that hold further keys; "" = the keys on top, "distill" = those of a student besides."""
+
+
+def api() -> str:
+    """Every public name under the heading of its topic."""
+    topics: dict[str, list[str]] = {heading: [] for heading in TOPICS.values()}
+    for name, home in lidar_synth._HOME.items():
+        given = getattr(lidar_synth, name)
+        topics[TOPICS[home.partition(".")[0]]].append(f"{given.__module__}.{given.__qualname__}")
+    topics["Further names"] = list(FURTHER)
+    return "\n".join(f"## {topic}\n\n" + "\n".join(f"::: {n}\n" for n in names) for topic, names in topics.items())
 
 
 def command_line() -> str:
     """The help of every command, in the order of the program's own help."""
-    group = typer.main.get_command(app)
-    context = typer.Context(group, info_name="lidar-synth")
-    parts = []
-    for name in COMMANDS:
-        command = group.get_command(context, name)  # type: ignore[attr-defined]
-        text = command.get_help(typer.Context(command, info_name=name, parent=context))
-        parts.append(f"## {name}\n\n```text\n{text.strip()}\n```\n")
-    return "\n".join(parts)
+    group = get_command(app)
+    assert isinstance(group, TyperGroup)
+    return "\n".join(_helps(group, Context(group, info_name="lidar-synth"), [*COMMANDS, "bank"]))
+
+
+def _helps(group: TyperGroup, above: Context, names: list[str]) -> Iterator[str]:
+    for name in names:
+        command = group.commands[name]
+        context = Context(command, info_name=name, parent=above)
+        if isinstance(command, TyperGroup):
+            yield from _helps(command, context, list(command.commands))
+        else:
+            title = context.command_path.removeprefix("lidar-synth ")
+            yield f"## {title}\n\n```text\n{command.get_help(context)}\n```\n"
 
 
 def recipes() -> str:
-    """The table of ``lidar-synth recipes``."""
-    rows = [f"| `{one.name}` | {one.command} | {one.data} | {one.size} | {one.time} |" for one in published()]
-    return "\n".join(["| recipe | command | data | parameters | time |", "|---|---|---|---|---|", *rows])
+    """The table of ``lidar-synth recipes``, with the first sentence of each recipe's file."""
+    head = "| command | data | parameters | time | what |\n|---|---|---:|---|---|\n"
+    return head + "\n".join(
+        f"| `{one.command} {one.name}` | {one.data} | {one.size} | {one.time} | {one.summary} |" for one in published()
+    )
 
 
-GENERATED: dict[str, Callable[[], str]] = {"command-line": command_line, "recipes": recipes}
+def recipe_keys() -> str:
+    """A table of the keys of each section of a recipe."""
+    titles = {"": "Keys of every recipe", "distill": "Keys of a student's recipe"}
+    parts = []
+    for name, models in SECTIONS.items():
+        rows = [row for model in models for row in _keys(model)]
+        parts.append(
+            f"## {titles.get(name, f'`{name}`')}\n\n| key | default | meaning |\n|---|---|---|\n" + "\n".join(rows)
+        )
+    return "\n\n".join(parts)
+
+
+def _keys(model: type) -> Iterator[str]:
+    """A row for each key that the docstring of a model explains."""
+    fields = getattr(model, "model_fields", None) or model.__dataclass_fields__  # type: ignore[attr-defined]
+    docstring = griffe.Docstring(inspect.getdoc(model) or "").parse("google", warnings=False)
+    for section in docstring:
+        if section.kind is griffe.DocstringSectionKind.parameters:
+            for one in section.value:
+                yield f"| `{one.name}` | {_default(fields, one.name)} | {' '.join(one.description.split())} |"
+
+
+def _default(fields: Any, names: str) -> str:
+    """The defaults of one or several keys; those of a section are shown in its own table."""
+    plain = (str, int, float, tuple, type(None))
+    given = [fields[name].default for name in names.split(", ")]
+    return ", ".join("none" if v is None else f"`{v}`" for v in given if isinstance(v, plain))
+
+
+GENERATED: dict[str, Callable[[], str]] = {
+    "api": api,
+    "command-line": command_line,
+    "recipes": recipes,
+    "recipe-keys": recipe_keys,
+}
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

@@ -28,18 +28,17 @@ class Data(Section):
     """Where the scans come from: the town, or a path.
 
     Args:
-        licence: of the scans; it will stand in the checkpoint.
-        town: so many scans of the embedded town.
-        seed: of the town.
-        interval: seconds between neighbouring scans of the town.
-        path: a dataset's root, a folder or a file; environment variables are filled in.
-        layout, split: of the path, as ``open_scans`` takes them.
+        licence: licence of the scans, which is stored in the checkpoint.
+        town: number of scans of the procedural town, if they are the data.
+        seed: seed of the town.
+        interval: seconds between consecutive scans of the town.
+        path: a dataset's root, a folder or a file; environment variables are expanded.
+        layout, split: as for ``open_scans``.
         on_bad: "error", or "skip" to leave out scans that cannot be read.
-        cache: folder of the projected scans; by default ``cache`` beside the run's output.
+        cache: folder of the projected scans; by default ``cache`` in the output folder.
         flip: mirror every other sample.
-        roll: turn every sample by a random number of columns.
-        latents: keep what an autoencoder makes of the scans in the cache too: where it takes longer than a look at
-            the disk, and scans are not turned.
+        roll: rotate every sample by a random number of columns.
+        latents: cache the latents of the autoencoder too; not with ``roll``.
     """
 
     licence: str
@@ -75,11 +74,11 @@ class Data(Section):
 
 
 class Samples(Section):
-    """Pictures while a run goes on.
+    """Pictures of samples during a run.
 
     Args:
-        every: iterations between two; 0 = none.
-        count: scans in each, always from the same noise.
+        every: iterations between two pictures; 0 = none.
+        count: scans in a picture, always from the same noise.
     """
 
     every: Annotated[int, Field(ge=0)] = 5000
@@ -87,19 +86,19 @@ class Samples(Section):
 
 
 class Run(Section):
-    """What teacher and student have in common.
+    """The keys that teachers, autoencoders and students share.
 
     Args:
-        output: folder of the run; its last part names the checkpoint.
-        licence: of the weights; it will stand in the checkpoint.
+        output: folder of the run, whose name is that of the checkpoint; by default ``runs/NAME``.
+        licence: licence of the weights, which is stored in the checkpoint.
         data: the scans.
-        recipe: how the weights are moved.
-        seed: of the data's order, the noise and the times.
-        precision: "no" = float32 (to YAML that word is false), or "bf16".
-        compile: by ``torch.compile``.
-        gradient_checkpointing: less memory, more time.
+        recipe: the optimisation.
+        seed: seed of the order of the data, the noise and the timesteps.
+        precision: "no" = float32, or "bf16".
+        compile: whether to use ``torch.compile``.
+        gradient_checkpointing: whether to save memory at the cost of time.
         save_every: iterations between two saves.
-        samples: pictures.
+        samples: pictures of samples.
     """
 
     output: Path
@@ -115,23 +114,28 @@ class Run(Section):
 
 
 class Network(Section):
-    """Architecture (a name of ``NETWORKS``) and its arguments, without resolution and channels, which follow."""
+    """The network to train.
+
+    Args:
+        architecture: a name of ``NETWORKS``.
+        arguments: its arguments, without resolution and channels, which follow from the data.
+    """
 
     architecture: str = "hdit"
     arguments: dict[str, Any] = {}
 
 
 class Condition(Section):
-    """What a model is conditioned on.
+    """The condition of a model.
 
     Args:
-        kind: a name of ``CONDITIONS``.
-        encoder: one of the architectures that take it; by default the first.
-        arguments: of the encoder, without the sizes, which follow.
-        dropout: share of blank conditions in training; above 0 the model can be guided.
-        view_dropout: share of camera images of which one view is left.
-        image: rows and columns that camera images have to have: those of one camera.
-        focal: focal length in pixels that this camera's calibration has to tell.
+        kind: a name of ``CONDITIONS``: "semantic" or "camera".
+        encoder: architecture of the encoder; by default the first one for this kind.
+        arguments: arguments of the encoder, without sizes, which follow from the data.
+        dropout: share of blank conditions in training; above 0, classifier-free guidance is possible.
+        view_dropout: share of camera images of which only one view is kept.
+        image: rows and columns of the camera's images.
+        focal: focal length of the camera in pixels, which the dataset's calibration has to confirm.
     """
 
     kind: Literal["semantic", "camera"]

@@ -20,17 +20,18 @@ class TrainConfig(Run):
 
     Args:
         sensor: a preset's name or a YAML file.
-        channels: of the tensor, in order.
+        channels: channels of the range image, in order.
         normalisation: a name of ``NORMALISATIONS``.
-        rays: through the cells' centres or, as the peers have it, their corners: the angles that the network sees.
-        network: what to train.
-        codec: checkpoint of an autoencoder, for a latent model; sensor, channels and normalisation are its own then.
-        condition: what the model is conditioned on.
-        decoder: train the decoder of ``init``, a latent model, alone: on what its flow leaves.
-        init: checkpoint to start from; its networks, sensor, channels and normalisation are those of the run then.
+        rays: the point of a cell whose angles the network sees: "centre", or "corner" as in R2Flow and LiDM.
+        network: the network to train.
+        codec: checkpoint of an autoencoder, for a latent model; it determines sensor, channels and normalisation.
+        condition: the condition of the model.
+        decoder: whether to train only the decoder of ``init``, a latent model, on the latents of its last step.
+        init: checkpoint, or name of a shipped model, to start from; it determines networks, sensor, channels and
+            normalisation.
         timesteps: a name of ``TIMESTEPS``.
-        steps: of the uniform time grid that the checkpoint names.
-        losses: of an autoencoder.
+        steps: number of steps of the uniform time grid with which the checkpoint samples.
+        losses: weights of an autoencoder's losses.
     """
 
     sensor: str = "hdl64e_kitti360"
@@ -94,7 +95,14 @@ def _checked(part: NetworkSpec) -> nn.Module:
 
 
 class SelectionSettings(Section):
-    """How timesteps are selected: see ``timesteps.select_timesteps``."""
+    """The selection of timesteps by ``timesteps.select_timesteps``.
+
+    Args:
+        candidates: M, the number of candidate times.
+        trajectories: number of the teacher's trajectories.
+        batch: trajectories in a batch.
+        seed: seed of their noise.
+    """
 
     candidates: Count = 100
     trajectories: Count = 256
@@ -108,15 +116,14 @@ class DistillConfig(Run):
     Args:
         teacher: checkpoint; its network, sensor, channels and normalisation are the student's.
         strategy: a name of ``STRATEGIES``.
-        steps: Euler steps of the teacher per piece.
-        guidance: scale of guidance of the teacher, which the student learns; 1 = none.
-        weaker: checkpoint of a smaller teacher, or one trained for less, which guidance leads away from (autoguidance);
-            without it, from the blank condition (classifier-free guidance).
-        within: least and greatest time at which ``weaker`` is led away from.
-        intervals: N, steps of the student.
+        steps: Euler steps of the teacher in each interval.
+        guidance: guidance scale of the teacher, which the student learns; 1 = none.
+        weaker: checkpoint of a weaker teacher for autoguidance; without it, guidance is classifier-free.
+        within: interval of the times at which autoguidance applies.
+        intervals: N, the number of steps of the student.
         grid: N + 1 descending times from 1 to 0; without it, ``adaptive_piecewise`` selects them and the other
             strategies take uniform ones.
-        selection: how.
+        selection: the selection of these times.
     """
 
     teacher: Path
