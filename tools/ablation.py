@@ -4,8 +4,9 @@
 
 Every strategy trains a student from the same teacher, with the same noise and data and the same number of network
 evaluations: each sample costs the teacher's steps and one evaluation of the student. KEY=VALUE changes the recipe
-town_student for all of them. Students of an earlier call are reused. The figures are those of tools/model_card.py. The
-time grid is the selected one for adaptive_piecewise and uniform for the others.
+town_student for all of them. Students of an earlier call are reused. The figures are those of tools/model_card.py, and
+the table is that of docs/research/strategies.md. The time grid is the selected one for adaptive_piecewise and uniform
+for the others.
 """
 
 import argparse

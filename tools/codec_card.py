@@ -1,4 +1,4 @@
-"""Measure what the autoencoder of a latent model preserves of a scan, by class: the figures of docs/research/models.md.
+"""Measure what an autoencoder preserves of a scan, by class: the figures of docs/research/autoencoder.md.
 
     python tools/codec_card.py NAME=MODEL ... [--count 24]
 
@@ -22,7 +22,7 @@ from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.train import reconstruct
 
 SEED = 7
-"""Of the town."""
+"""Seed of the town."""
 CLASSES = ("road", "building", "fence", "vegetation", "car", "pole")
 
 

@@ -1,4 +1,4 @@
-"""Does a model follow its condition? The figures and images of conditional models in docs/research/models.md.
+"""Does a model follow its condition? The figures and images of conditional models in docs/research/conditions.md.
 
     python tools/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64] [--picture OUT.png]
 
@@ -34,10 +34,12 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.viz import picture, render
 
 FIELD, REACH = np.radians(50.0), 40
-"""To either side of straight ahead (the town's and KITTI-360's cameras see 52 degrees), and metres."""
+"""The compared area: angle to either side of straight ahead (the cameras of the town and KITTI-360 see 52 degrees), and
+distance in metres."""
 SENSOR_HEIGHT, ABOVE = 1.73, 0.5
-"""Of the LiDAR above the ground, and from where on something counts; metres."""
+"""Height of the LiDAR above the ground, and of the lowest returns that count above the ground; metres."""
 SHOWN = 8
+"""Examples in the picture."""
 
 
 def map_agreement(scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> float:
@@ -67,7 +69,7 @@ AGREEMENTS: dict[str, tuple[str, Callable[[Sequence[Scan], Sequence[Scan], Judge
 
 
 def verdict(name: str, kind: str, scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> str:
-    """A line of the second table."""
+    """A line of the second table: the agreement with the own condition, and with another one."""
     measure, agreement = AGREEMENTS[kind]
     other = [*real[len(real) // 2 :], *real[: len(real) // 2]]
     values = [f"{100 * agreement(scans, some, judge):.1f}" for some in (real, other)]
@@ -87,7 +89,7 @@ def generate(model: str, steps: int | None, real: Sequence[Scan]) -> tuple[str, 
 
 
 def seen(kind: str, scan: Scan, sensor: Sensor) -> NDArray[np.uint8]:
-    """An image of a scan's condition."""
+    """The condition of a scan, as an image."""
     if kind == "camera":
         assert scan.image_path is not None
         return np.asarray(Image.open(scan.image_path).convert("RGB").resize((704, 188)))
@@ -96,14 +98,14 @@ def seen(kind: str, scan: Scan, sensor: Sensor) -> NDArray[np.uint8]:
 
 
 def draw(path: Path, kind: str, made: Sequence[Scan], real: Sequence[Scan]) -> None:
-    """Condition, generated and real, side by side."""
+    """Write conditions, generated scans and the scans of the conditions side by side."""
     figure = Figure(figsize=(15, 3.05 * len(made)), facecolor="#1e1014", layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(made), 3, squeeze=False, width_ratios=[1.25, 1, 1])
     for axes, a, b in zip(grid, made, real, strict=True):
         assert a.sensor is not None
         images = (seen(kind, b, a.sensor), render(a, "label", size=(900, 540)), render(b, "label", size=(900, 540)))
-        for axis, image, title in zip(axes, images, ("condition", "generated", "real"), strict=True):
+        for axis, image, title in zip(axes, images, ("condition", "generated", "scan of the condition"), strict=True):
             axis.imshow(image, aspect="equal" if kind == "camera" or title != "condition" else "auto")
             axis.set_title(title, color="#9aa0ad", fontsize=9, loc="left")
             axis.set_axis_off()

@@ -6,7 +6,7 @@
 A case is a function of reader, seed and number (and of the versions of the libraries that write the valid files).
 Reading it has to give a correct result or one of the package's errors. All other cases are listed below the table, and
 their files are kept. With ``--case`` one case is written to the folder and read in this process, without limits, to
-inspect its error. The exit status is 1 if any case has a flaw. Linux only.
+inspect its error. The exit status is 1 if any case has a flaw. Linux only. docs/research/reliability.md has the table.
 """
 
 import argparse

@@ -34,7 +34,7 @@ ROOT = Path(__file__).parents[1]
 PLATEAU = 0.75
 """Share of the steps at a constant rate; what the schedule "trapezoid" leaves."""
 LIMIT = 16e6
-"""Bytes that weights in the package may have."""
+"""Largest size of shipped weights in bytes."""
 
 CAMERA_SCANS, CAMERA_INTERVAL = 800, 2.0
 """Scans with images, and the seconds between them; an image takes a second and a half."""
@@ -44,8 +44,8 @@ class Stage(NamedTuple):
     """A run of the recipe.
 
     Args:
-        config: of its file in configs/.
-        minutes: by default.
+        config: class of its configuration in configs/.
+        minutes: default budget.
         needs: {key of the configuration: the stage whose checkpoint it names}.
     """
 

@@ -1,4 +1,4 @@
-"""The figures and images of docs/research/models.md: how close generated scans are to scans of the town.
+"""The figures and images of docs/research/quality.md: how close generated scans are to scans of the town.
 
     python tools/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ... [--count 512] [--pictures OUT]
 
@@ -36,19 +36,17 @@ from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.noise import uniform
 from lidar_synth.town import STRETCH_FRAMES, Town
-from lidar_synth.viz import Orbit, render, write_view
+from lidar_synth.viz import write_view
 
 REFERENCE, OTHER = 1, 2
-"""Seeds of the towns to compare with."""
+"""Seeds of the two towns that generated scans are compared with."""
 SEED = 1
-"""Of the noise."""
+"""Seed of the noise."""
 CLASSES = ("road", "sidewalk", "terrain", "car", "building", "fence", "vegetation", "trunk", "pole")
 SPAN = 8
-"""Columns to either side in which a wall shall be straight."""
+"""Columns to either side over which the bend of a wall is measured."""
 TILES = 16
-CLOSE = 4
-NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)).camera()
-"""A camera from which cars and poles are distinguishable."""
+"""Scans on a sheet."""
 
 
 class Autoguided(nn.Module):
@@ -77,7 +75,7 @@ def open_codec(model: str) -> Latent:
     """The autoencoder of a checkpoint.
 
     Raises:
-        ConfigError: on one without.
+        ConfigError: on a checkpoint without an autoencoder.
     """
     checkpoint = load_checkpoint(find_model(model))
     if CODEC not in checkpoint.networks:
@@ -85,8 +83,8 @@ def open_codec(model: str) -> Latent:
     return Latent(checkpoint.networks[CODEC].eval(), checkpoint.header.tensors)
 
 
-def drawn_again(model: str, scans: Sequence[Scan]) -> list[Scan]:
-    """Scans encoded by the autoencoder of a model, and sampled from its predicted distributions."""
+def resampled(model: str, scans: Sequence[Scan]) -> list[Scan]:
+    """Scans after encoding and decoding: sampled from the distributions that a model's autoencoder predicts."""
     codec, made = open_codec(model), []
     for i, scan in enumerate(tqdm(scans, desc=f"{Path(model).stem}, autoencoder", unit="scan")):
         image = project(scan, channels=["reflectance", "label"])
@@ -97,14 +95,14 @@ def drawn_again(model: str, scans: Sequence[Scan]) -> list[Scan]:
 
 
 def relabelled(scan: Scan, other: Scan) -> Scan:
-    """A scan on the grid, each return with the label of the same cell in another scan."""
+    """A scan on its sensor's grid; each return gets the label of the same cell in another scan."""
     image, labels = project(scan, scan.sensor), project(other, scan.sensor, ["label"]).channels["label"]
     image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(np.uint8)
     return replace(unproject(image), id=scan.id, domain=scan.domain)
 
 
 def town(seed: int, count: int) -> list[Scan]:
-    """Scans of one town, each on another street: neighbouring scans would show only three or four streets."""
+    """Scans of one town, each on a different street: neighbouring scans would show only three or four streets."""
     source = Town(seed, scans=count * STRETCH_FRAMES, interval=1.0)
     return [source[i * STRETCH_FRAMES] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
 
@@ -155,14 +153,6 @@ def picture(path: Path, scans: Sequence[Scan], title: str) -> None:
     shrink(path)
 
 
-def near(path: Path, scans: Sequence[Scan], reference: Sequence[Scan]) -> None:
-    """Write an enlarged sheet of fewer scans: generated ones on the left, the town's on the right."""
-    pairs = zip(scans, reference, strict=True)
-    seen = [[render(scan, "label", camera=NEAR, size=(900, 480), boxes=False) for scan in pair] for pair in pairs]
-    Image.fromarray(np.vstack([np.hstack(pair) for pair in seen])).save(path)
-    shrink(path)
-
-
 def shrink(path: Path) -> None:
     """Reduce the pixels and colours of a PNG."""
     image = Image.open(path).convert("RGB")
@@ -188,7 +178,7 @@ def main() -> None:
         name, spec = text.split("=", 1)
         model, steps, *guidance = spec.split(":") if ":" in spec else (spec, "")
         if steps == "0":
-            scans = drawn_again(model, other)
+            scans = resampled(model, other)
         else:
             scans = generate(model, int(steps) if steps else None, given.count, *guidance)
         lines.append(rows(name, reference, scans, judge))
@@ -196,7 +186,6 @@ def main() -> None:
             apart = np.linspace(0, given.count - 1, TILES).astype(int)
             picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans, not selected")
             picture(given.pictures / "town.png", [reference[k] for k in apart], f"{TILES} scans of the town")
-            near(given.pictures / "near.png", scans[:CLOSE], [reference[k] for k in apart[:CLOSE]])
     print(f"{given.count} scans per row, {given.count} of the town\n\n{header(reference, judge)}")
     print("\n".join(line for line, _ in lines))
     columns = (*CLASSES, "bend of walls, %")

@@ -5,7 +5,8 @@
 Every epoch has a few labelled scans of the town (or of ROOT, SemanticKITTI for instance). Synthetic scans are added up
 to 10, 25 and 50 % of the samples, so these runs have more iterations. "real, as long" trains on the real scans alone
 for as many iterations as the longest of them. Every row is run with several seeds of the weights, the order and the
-synthetic scans. Another town (or the split val of ROOT) is held out.
+synthetic scans. Another town (or the split val of ROOT) is held out. The table is that of
+docs/research/help-a-trainer.md.
 """
 
 import argparse

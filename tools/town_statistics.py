@@ -3,7 +3,7 @@
     LIDAR_SYNTH_REAL_SCANS=FOLDER python tools/town_statistics.py [--scans 120] [--seed 0]
 
 FOLDER contains ``kitti360`` in the dataset's own layout. Without the variable the table has the town only. Every figure
-is a mean over scans; both sides are projected onto the same 64 x 1024 range image.
+is a mean over scans; both sides are projected onto the same 64 x 1024 range image. docs/research/town.md has the table.
 """
 
 import argparse

@@ -1,0 +1,170 @@
+"""Make the pictures of docs/gallery.md: scans of the shipped models beside scans of the town.
+
+    python tools/gallery.py [NAME ...] [--out docs/gallery]
+
+    pairs     generated scans on the left, scans of the town on the right
+    channels  all channels of one generated scan
+    map       scans generated from one label map
+    camera    scans generated from camera images
+    paste     a generated scan before and after the town's objects replaced its own
+    sensors   one street as three sensors see it
+
+All scans are the first ones of their seed: none is selected. Each picture takes less than a minute on one core.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from lidar_synth import Scan, load_generator, project
+from lidar_synth.labels import ObjectBank, make_policy
+from lidar_synth.town import STRETCH_FRAMES, Town
+from lidar_synth.viz import Orbit, picture, render, write_view
+
+Picture = NDArray[np.uint8]
+"""(height, width, 3) uint8."""
+
+UNSEEN = 1
+"""Seed of a town that no model was trained on."""
+NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)).camera()
+"""A camera from which cars and poles are distinguishable."""
+SIZE = (760, 400)
+"""Width and height of one scan, in pixels."""
+WIDTH = 1200
+"""Width of a picture, in pixels."""
+
+
+def street(index: int, **options: object) -> Scan:
+    """The first scan of a street of the unseen town."""
+    town = Town(UNSEEN, scans=(index + 1) * STRETCH_FRAMES, **options)  # type: ignore[arg-type]
+    return town[index * STRETCH_FRAMES]
+
+
+def near(scan: Scan, boxes: bool = False) -> Picture:
+    """A scan seen by ``NEAR``, coloured by label."""
+    return render(scan, "label", camera=NEAR, size=SIZE, boxes=boxes)
+
+
+def pairs() -> list[list[tuple[str, Picture]]]:
+    """Generated scans and the town's."""
+    made = load_generator("town").scans(0, range(3))
+    return [
+        [(f"generated, 4 steps: town/0/{i}", near(scan)), (f"the town, street {i}", near(street(i)))]
+        for i, scan in enumerate(made)
+    ]
+
+
+def from_map() -> list[list[tuple[str, Picture]]]:
+    """The map of one scan, two scans generated from it, and the scan itself."""
+    scan, generator = street(0), load_generator("town-semantic")
+    labels = picture(project(scan, generator.sensor, ["label"]), "label")
+    made = generator.scans(0, range(3), condition=scan)
+    return [
+        [("condition: a label map", np.repeat(labels, 4, axis=0))],
+        [("the town's scan with this map", near(scan)), ("generated", near(made[0]))],
+        [("generated, other noise", near(made[1])), ("generated, other noise", near(made[2]))],
+    ]
+
+
+def from_camera() -> list[list[tuple[str, Picture]]]:
+    """Images of the camera, the scans generated from them, and the scans taken with them."""
+    generator, rows = load_generator("town-camera"), []
+    for i in range(2):
+        town = Town(UNSEEN, scans=(i + 1) * STRETCH_FRAMES)
+        image = town.image(i * STRETCH_FRAMES)
+        small = Image.fromarray(image).resize((320, 96), Image.Resampling.BICUBIC)  # as its encoder takes it
+        [made] = generator.scans(0, [i], condition=np.array(small).transpose(2, 0, 1))
+        rows += [
+            [("condition: a camera image", image)],
+            [("generated", near(made)), ("the town's scan taken with the image", near(town[i * STRETCH_FRAMES]))],
+        ]
+    return rows
+
+
+def pasted() -> list[list[tuple[str, Picture]]]:
+    """A generated scan, and the same with objects of the town in place of its own (the label policy ``mix``)."""
+    generator = load_generator("town")
+    scans = Town(0, scans=5 * STRETCH_FRAMES)
+    bank = ObjectBank.from_scans([scans[i] for i in range(0, len(scans), STRETCH_FRAMES // 2)])
+    policy = make_policy("mix", fields=generator.fields, objects=bank, count=12, clear=True)
+    [scan] = generator.scans(0, [0])
+    mixed = policy(scan, np.random.default_rng(0))
+    return [[("generated", near(scan)), ("its objects replaced by pasted ones, with boxes", near(mixed, boxes=True))]]
+
+
+def sensors() -> list[list[tuple[str, Picture]]]:
+    """One street as three sensors see it."""
+    names = {"town": "HDL-64E", "os1_128": "Ouster OS1-128", "hdl32e_nuscenes": "HDL-32E"}
+    return [[(f"{title}: {name}", near(street(1, sensor=name))) for name, title in names.items()]]
+
+
+PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
+    "pairs": pairs,
+    "map": from_map,
+    "camera": from_camera,
+    "paste": pasted,
+    "sensors": sensors,
+}
+"""Rows of titled images."""
+
+
+def draw(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
+    """Rows of images with their titles, all rows of the same width."""
+    title = 0.26  # inches
+    heights = [12 / sum(image.shape[1] / image.shape[0] for _, image in row) + title for row in rows]
+    figure = Figure(figsize=(12, sum(heights)), facecolor="#101218", dpi=150)
+    FigureCanvasAgg(figure)
+    parts = np.atleast_1d(figure.subfigures(len(rows), 1, height_ratios=heights))
+    for part, row, height in zip(parts, rows, heights, strict=True):
+        part.set_facecolor("#101218")
+        grid = part.subplots(1, len(row), squeeze=False, width_ratios=[i.shape[1] / i.shape[0] for _, i in row])
+        part.subplots_adjust(left=0.003, right=0.997, bottom=0, top=1 - title / height, wspace=0.01)
+        for axes, (name, image) in zip(grid[0], row, strict=True):
+            axes.imshow(image, interpolation="lanczos")
+            axes.set_title(name, color="#9aa0ad", fontsize=9, loc="left", pad=3)
+            axes.set_axis_off()
+    figure.canvas.draw()
+    pixels: Picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
+    return pixels
+
+
+def channels() -> Picture:
+    """The sheet that ``lidar-synth view`` writes of a generated scan."""
+    with TemporaryDirectory() as folder:
+        sheet = Path(folder) / "scan.png"
+        write_view(sheet, load_generator("town").scans(0, [0]))
+        return np.asarray(Image.open(sheet).convert("RGB"))
+
+
+def save(path: Path, pixels: Picture) -> None:
+    """Write a PNG with few colours, small enough for a repository."""
+    image = Image.fromarray(pixels)
+    image = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
+    # Few pixels are cars or poles: a palette by number of pixels would lose their colours.
+    image = image.quantize(96, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.save(path, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = ["channels", *PICTURES]
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"pictures to make: {', '.join(names)} [all]")
+    parser.add_argument("--out", type=Path, default=Path("docs/gallery"))
+    given = parser.parse_args()
+    if unknown := set(given.names) - set(names):
+        parser.error(f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(names)}")
+    for name in given.names or names:
+        save(given.out / f"{name}.png", channels() if name == "channels" else draw(PICTURES[name]()))
+        print(given.out / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()
