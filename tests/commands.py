@@ -26,7 +26,10 @@ from lidar_synth.formats import WRITERS
 from lidar_synth.train import DistillConfig, TrainConfig, load_config
 from lidar_synth.train.config import read_values, validated
 
-PLAIN = ("cd", "export", "git", "ls", "cat", "mkdir", "source", ".", "apt-get", "sudo", "docker", "unzip", "wget")
+PLAIN = (
+    ".", "apt-get", "cat", "cd", "cp", "docker", "export", "git", "ln", "ls", "mkdir", "printf", "source", "sudo",
+    "unzip", "wget",
+)  # fmt: skip
 """Commands of the shell and of the system, whose arguments are not checked."""
 
 
@@ -81,7 +84,7 @@ def lidar_synth(words: list[str], folder: Path | None) -> None:
         for name, values in given.items():
             VALUES.get(name, lambda values, folder: None)(values, folder)
     except Exception as error:
-        said = getattr(error, "format_message", lambda: error)()
+        said = error.format_message() if hasattr(error, "format_message") else error
         raise WrongCommand(f"lidar-synth {shlex.join(words)}: {said}") from error
 
 
@@ -201,7 +204,7 @@ def pip(words: list[str], folder: Path | None) -> None:
     """``pip install ...``, the extras of this package against pyproject.toml."""
     if words[0] != "install":
         raise WrongCommand(f"pip {words[0]}: not known to the test")
-    own = [found for word in words if (found := re.match(r"(?:\.|lidar[-_]synth)(?:\[(.*)\])?", word))]
+    own = [found for word in words if (found := re.fullmatch(r"(?:\./)?(?:\.|lidar[-_]synth)(?:\[(.*)\])?", word))]
     extras = {extra.strip() for found in own for extra in (found[1] or "").split(",")} - {""}
     if unknown := extras - set(PYPROJECT["project"]["optional-dependencies"]):
         raise WrongCommand(f"pip install: extras {sorted(unknown)} are not in pyproject.toml")

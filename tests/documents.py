@@ -33,6 +33,9 @@ LANGUAGES = {"python": "python", "py": "python", "sh": "shell", "bash": "shell",
              "yaml": "yaml", "text": "text", "bibtex": "text", "json": "text"}  # fmt: skip
 """Kinds of blocks by the language of the fence. Whatever is neither code nor settings is ``text``."""
 
+STARTS = ("lidar-synth ", "make ", "python tools/", "python -m lidar_synth", "pip install ", "bash tools/", "torchrun ")
+"""How a command in the text begins."""
+
 _PARTS = re.compile(
     r"<!--\s*(?P<mark>not run|slow|setup):\s*(?P<said>.*?)\s*-->"
     r"|^(?P<indent>[ \t]*)(?P<fence>```+)(?P<info>[^\n`]*)\n(?P<code>.*?)^[ \t]*(?P=fence)[ \t]*$",
@@ -63,7 +66,7 @@ def reduced(block: Block) -> str:
     for replacement in (block.slow or "").split(";"):
         new, given, old = replacement.partition(" for ")
         if not given or old.strip() not in code:
-            raise ValueError(f"line {block.line}: slow: {block.slow!r}, but expected NEW for OLD, with OLD in the block")
+            raise ValueError(f"line {block.line}: slow: {block.slow!r}, expected NEW for OLD, with OLD in the block")
         code = code.replace(old.strip(), new.strip())
     return code
 
@@ -105,7 +108,7 @@ def _block(part: re.Match[str], line: int, marks: dict[str, str]) -> Block:
 
 def commands_of(code: str) -> list[str]:
     """The commands of a shell block: lines without comments, joined where a line ends in a backslash."""
-    lines = re.sub(r"\\\n\s*", " ", code).splitlines()
+    lines = re.sub(r"\s*\\\n\s*", " ", code).splitlines()
     return [line for line in (re.sub(r"(^|\s+)#.*", "", line).strip() for line in lines) if line]
 
 
@@ -113,8 +116,7 @@ def spans_of(text: str) -> list[tuple[int, str]]:
     """(line, command) of every command that stands in the text as `code`."""
     prose = _PARTS.sub(lambda part: "\n" * part[0].count("\n"), text)
     spans = ((prose.count("\n", 0, found.start()) + 1, found[1]) for found in re.finditer(r"`([^`]+)`", prose))
-    starts = ("lidar-synth ", "make ", "python tools/", "python -m lidar_synth", "pip install", "bash tools/", "torchrun ")
-    return [(line, " ".join(said.split())) for line, said in spans if said.startswith(starts)]
+    return [(line, " ".join(said.split())) for line, said in spans if said.startswith(STARTS)]
 
 
 def words_of(command: str) -> list[str]:
