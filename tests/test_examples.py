@@ -22,10 +22,11 @@ FURTHER = {
     "lidar_synth.labels.augment": ("compose",),
     "lidar_synth.mixing": ("Generated", "MixedScans.batches", "MixedScans.domain", "MixedScans.wrap"),
     "lidar_synth.noise": ("gaussian",),
-    "lidar_synth.train": ("run",),
+    "lidar_synth.train": ("TrainConfig", "load_config", "run"),
+    "lidar_synth.viz": ("write_view",),
 }
-"""What the README names besides ``lidar_synth.__all__``. A dictionary such as ``NORMALISATIONS`` has no docstring that
-Python keeps: the example of its values' class shows it."""
+"""What the documents name besides ``lidar_synth.__all__``. Python keeps no docstring of a dictionary such as
+``NORMALISATIONS``: the example of its values' class shows it."""
 
 PACKAGE = Path(lidar_synth.__file__).parent
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
@@ -90,9 +91,10 @@ def test_every_new_name_of_the_package_needs_an_example(monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_every_name_of_the_readme_has_an_example() -> None:
-    named = named_in((ROOT / "README.md").read_text())
-    assert {"MixedScans", "solve", "Taxonomy"} <= named
+def test_every_name_of_the_documents_has_an_example() -> None:
+    pages = [ROOT / "README.md", *ROOT.glob("docs/start/*.md"), *ROOT.glob("docs/how-to/**/*.md")]
+    named = set().union(*(named_in(page.read_text()) for page in pages))
+    assert {"MixedScans", "load_config", "Taxonomy"} <= named
     assert named <= {name.rsplit(".", 1)[1] for name in public_names()[2:]}
 
 

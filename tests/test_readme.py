@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from project import ROOT
 
-from lidar_synth.cli import COMMANDS
 from lidar_synth.town import Town, export_town
 
 README = (ROOT / "README.md").read_text()
@@ -20,19 +19,14 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("code", "printed"), list(zip(blocks("python"), ("torch.Size", "dict_keys"), strict=True)))
-def test_the_python_blocks_run(code: str, printed: str, tmp_path: Path) -> None:
+def test_the_ten_lines_run(tmp_path: Path) -> None:
     pytest.importorskip("embreex")
+    [code] = blocks("python")
     export_town(Town(0, scans=3), tmp_path / "demo_out" / "town", "semantic_kitti", camera=False, progress=False)
     assert len([line for line in code.splitlines() if line.strip()]) <= 10
     run = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
-    assert printed in run.stdout
-
-
-def test_the_named_commands_exist() -> None:
-    named = set(re.findall(r"^lidar-synth +(\S+)", "\n".join(blocks("sh")), re.M))
-    assert named and named <= set(COMMANDS)
+    assert "torch.Size" in run.stdout
 
 
 def anchors(text: str) -> set[str]:

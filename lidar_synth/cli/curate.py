@@ -50,6 +50,7 @@ def curate(
       speckle     share of neighbouring returns on one surface with different labels
       confidence  mean confidence of the returns
       duplicate   similarity to the most similar earlier scan, 0 to 1
+
     \b
     Examples:
       lidar-synth curate bank --plot scores.png

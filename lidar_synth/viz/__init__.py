@@ -76,6 +76,13 @@ def write_view(
     Raises:
         ConfigError: on another suffix, or without scans.
         FileError: if the file cannot be written.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.viz import write_view
+        >>> write_view("scan.html", [Town(seed=0, scans=1)[0]], title="One scan")
+        >>> open("scan.html").read(15)
+        '<!doctype html>'
     """
     path = Path(path)
     if not given:

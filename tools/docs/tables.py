@@ -98,11 +98,12 @@ def _helps(group: TyperGroup, above: Context, names: list[str]) -> Iterator[str]
 
 
 def recipes() -> str:
-    """The table of ``lidar-synth recipes``, with the first sentence of each recipe's file."""
-    head = "| command | data | parameters | time | what |\n|---|---|---:|---|---|\n"
-    return head + "\n".join(
-        f"| `{one.command} {one.name}` | {one.data} | {one.size} | {one.time} | {one.summary} |" for one in published()
-    )
+    """The table of ``lidar-synth recipes``."""
+    rows = ["| command | data | parameters | time |", "|---|---|---:|---|"]
+    for one in published():
+        command = "bake OUT --config" if one.command == "bake" else one.command
+        rows.append(f"| `{command} {one.name}` | {one.data} | {one.size} | {one.time} |")
+    return "\n".join(rows)
 
 
 def recipe_keys() -> str:

@@ -26,10 +26,19 @@ def load_config(kind: type[Config], recipe: str | Path, overrides: Sequence[str]
         recipe: a published recipe's name, such as ``town_teacher``, or a YAML file.
         overrides: ``key=value`` with dots between levels and values in YAML, such as ``recipe.batch=4``.
 
+    Returns:
+        The checked configuration, for ``run``.
+
     Raises:
         FileError: where the file cannot be read.
-        ConfigError: on what is no YAML, an unknown key, a value that does not fit or a resolution that the network
+        ConfigError: on a file that is not YAML, an unknown key, an invalid value or a resolution that the network
             cannot have.
+
+    Example:
+        >>> from lidar_synth.train import TrainConfig, load_config
+        >>> config = load_config(TrainConfig, "town_tiny", ["recipe.batch=4", "output=runs/mine"])
+        >>> config.recipe.batch, config.recipe.iterations, config.output.as_posix()
+        (4, 200, 'runs/mine')
     """
     values = read_values(recipe, kind)
     for override in overrides:

@@ -32,6 +32,12 @@ class TrainConfig(Run):
         timesteps: a name of ``TIMESTEPS``.
         steps: number of steps of the uniform time grid with which the checkpoint samples.
         losses: weights of an autoencoder's losses.
+
+    Example:
+        >>> from lidar_synth.train import TrainConfig, load_config
+        >>> teacher = load_config(TrainConfig, "kitti360_teacher", ["data.path=KITTI-360"])
+        >>> teacher.sensor, teacher.network.architecture, teacher.recipe.iterations
+        ('hdl64e_kitti360', 'hdit', 320000)
     """
 
     sensor: str = "hdl64e_kitti360"

@@ -1,0 +1,73 @@
+"""Documents stay short: every page has a limit of words, counted as ``wc -w`` does, and so has their sum."""
+
+import re
+from pathlib import Path
+
+import pytest
+from project import ROOT
+
+LIMITS = {
+    "README.md": 900,
+    "docs/index.md": 150,
+    "docs/start/install.md": 200,
+    "docs/start/tutorial.md": 550,
+    "docs/how-to/mix.md": 600,
+    "docs/how-to/trainers/index.md": 300,
+    "docs/how-to/trainers/mmdetection3d.md": 350,
+    "docs/how-to/trainers/openpcdet.md": 250,
+    "docs/how-to/trainers/pointcept.md": 220,
+    "docs/how-to/trainers/range-view.md": 200,
+    "docs/how-to/trainers/cylinder3d.md": 120,
+    "docs/how-to/trainers/open3d-ml.md": 130,
+    "docs/how-to/trainers/waffleiron.md": 100,
+    "docs/how-to/trainers/lightning.md": 130,
+    "docs/how-to/trainers/reader.md": 180,
+    "docs/how-to/trainers/other.md": 100,
+    "docs/how-to/your-sensor.md": 250,
+    "docs/how-to/your-dataset.md": 300,
+    "docs/how-to/train-a-generator.md": 450,
+    "docs/how-to/bake.md": 400,
+    "docs/how-to/look.md": 150,
+    "docs/reference/api.md": 80,
+    "docs/reference/command-line.md": 60,
+    "docs/reference/recipes.md": 200,
+    "docs/bank-format.md": 500,
+    "docs/reliability.md": 300,
+    "docs/explanation/method.md": 450,
+    "docs/explanation/determinism.md": 250,
+    "docs/town.md": 400,
+    "docs/models/town.md": 200,
+    "docs/models/town-semantic.md": 200,
+    "docs/models/town-camera.md": 200,
+    "docs/gallery.md": 100,
+}
+"""The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
+
+MAIN_PATH = 8000
+"""Words of all pages of docs/ on the main path."""
+
+PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if not {"research", "notebooks"} & set(p.parts)]
+
+
+def words(page: Path) -> int:
+    return len(page.read_text(encoding="utf-8").split())
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_a_page_keeps_to_its_limit(name: str) -> None:
+    assert words(ROOT / name) <= LIMITS[name]
+
+
+def test_every_page_has_a_limit() -> None:
+    assert {page.relative_to(ROOT).as_posix() for page in PAGES} == set(LIMITS) - {"README.md"}
+
+
+def test_the_main_path_is_short() -> None:
+    assert sum(map(words, PAGES)) <= MAIN_PATH
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_begins_with_what_the_reader_can_do(page: Path) -> None:
+    lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line and not line.startswith("<!--")]
+    title, first, *_ = [*lines, ""]
+    assert title.startswith("# ") and re.match(r"[\w`*\[]", first), "a title, and then a sentence"
