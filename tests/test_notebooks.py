@@ -1,9 +1,10 @@
 """The notebooks of docs/notebooks run from top to bottom; what they show was made by their code."""
 
 import base64
+import runpy
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from commands import check
@@ -84,3 +85,21 @@ def test_the_commands_in_the_text_of_a_notebook_are_right(notebook: Path) -> Non
             assert blocks_of(cell.source) == [], "code belongs into cells"
             for _, command in spans_of(cell.source):
                 check(command)
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=name_of)
+def test_the_page_of_a_notebook_has_all_of_it(notebook: Path) -> None:
+    pytest.importorskip("mkdocs")
+    text, pictures = runpy.run_path(str(ROOT / "tools/docs/notebook_pages.py"))["page_of"](notebook)
+    assert text.startswith("# ") and f"]({notebook.name})" in text.split("##")[0]
+    assert all(cell.source.partition("\n")[2] in text for cell in nbformat.read(notebook, 4).cells)
+    assert pictures and all(f"]({name})" in text for name in pictures)
+    assert all(data.startswith((b"\xff\xd8", b"\x89PNG")) for data in pictures.values())
+
+
+def test_a_link_to_a_notebook_leads_to_its_page() -> None:
+    pytest.importorskip("mkdocs")
+    rewrite = runpy.run_path(str(ROOT / "tools/docs/notebook_pages.py"))["on_page_markdown"]
+    text = "[a](../notebooks/mix_and_look.ipynb), [b](x.ipynb)"
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="how-to/mix.md"))
+    assert rewrite(text, page) == "[a](../notebooks/mix_and_look.md), [b](x.ipynb)"

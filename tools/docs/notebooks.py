@@ -25,15 +25,18 @@ def code_hash(book: nbformat.NotebookNode) -> str:
 
 
 def execute(path: Path, folder: Path) -> nbformat.NotebookNode:
-    """Run a notebook in a folder, without progress bars.
+    """Run a notebook in a folder; progress bars are left out of its outputs.
 
     Raises:
         CellExecutionError: where a cell fails.
     """
     book = nbformat.read(path, as_version=4)
-    environment = os.environ | {"TQDM_DISABLE": "1", "IPYTHONDIR": str(folder / ".ipython")}
+    environment = os.environ | {"IPYTHONDIR": str(folder / ".ipython")}
     client = NotebookClient(book, timeout=600, record_timing=False, resources={"metadata": {"path": str(folder)}})
     client.execute(env=environment)
+    for cell in book.cells:
+        if cell.cell_type == "code":
+            cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
     return book
 
 
