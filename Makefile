@@ -10,7 +10,7 @@ TYPES := $(VENV)/types
 DEMO_OUT ?= demo_out
 SCANS ?= 24
 
-.PHONY: demo test quick test-lowest lint docs bench clean
+.PHONY: demo test quick test-lowest lint docs notebooks bench clean
 
 demo: $(READY)  ## a small town as a user's dataset: write, read, project, convert, look
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
@@ -33,6 +33,9 @@ lint: $(READY)  ## style and types
 
 docs: $(READY)  ## the site, in site/; a broken link fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+notebooks: $(READY)  ## runs the notebooks of docs/notebooks and keeps their outputs, which the site shows
+	$(BIN)/python tools/docs/notebooks.py
 
 bench: $(READY)  ## every table of tools/bench
 	for script in tools/bench/*.py; do case $$script in */timing.py) ;; *) $(BIN)/python $$script || exit 1;; esac; done

@@ -1,9 +1,7 @@
 """What is generated when the site is built: equations, the API, the command line, recipes and their keys."""
 
-import json
 import re
 import runpy
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,12 +13,10 @@ from lidar_synth.train.config import published
 
 markdown = pytest.importorskip("markdown")
 pytest.importorskip("latex2mathml")
-pytest.importorskip("mkdocs")
 pytest.importorskip("griffe")
 
 TABLES: dict[str, Any] = runpy.run_path(str(ROOT / "tools/docs/tables.py"))
 EQUATIONS: dict[str, Any] = runpy.run_path(str(ROOT / "tools/docs/equations.py"))
-NOTEBOOKS: dict[str, Any] = runpy.run_path(str(ROOT / "tools/docs/notebook_pages.py"))
 
 
 def rendered(text: str) -> str:
@@ -70,20 +66,3 @@ def test_every_key_of_a_recipe_is_explained(section: str) -> None:
 def test_generated_text_takes_the_place_of_its_mark() -> None:
     page = TABLES["on_page_markdown"]("# Recipes\n\n<!-- generated: recipes -->\n\nAfter.\n")
     assert "town_tiny" in page and "<!--" not in page and page.endswith("After.\n")
-
-
-def test_a_notebook_becomes_a_page_with_its_outputs(tmp_path: Path) -> None:
-    outputs = [
-        {"output_type": "stream", "text": ["12 scans\n"]},
-        {"output_type": "display_data", "data": {"image/png": "iVBO\nRw==", "text/plain": "<Figure>"}},
-        {"output_type": "execute_result", "data": {"text/plain": ["42"]}},
-    ]
-    cells = [
-        {"cell_type": "markdown", "source": ["# Mix\n", "and look"]},
-        {"cell_type": "code", "source": "print(12)", "outputs": outputs},
-    ]
-    (tmp_path / "mix.ipynb").write_text(json.dumps({"cells": cells}))
-    page = NOTEBOOKS["markdown_of"](tmp_path / "mix.ipynb")
-    assert page.startswith("# Mix\nand look\n\n```python\nprint(12)\n```\n\n```text\n12 scans\n```\n")
-    assert "data:image/png;base64,iVBORw==)" in page and "<Figure>" not in page
-    assert "```text\n42\n```" in page and "(mix.ipynb)" in page

@@ -1,14 +1,10 @@
-"""The README's code runs as printed; the documents' links and file names lead somewhere."""
+"""The README's example is short; the documents' links and file names lead somewhere."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from project import ROOT
-
-from lidar_synth.town import Town, export_town
 
 README = (ROOT / "README.md").read_text()
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/**/*.md")), ROOT / "tests/golden/README.md"]
@@ -18,15 +14,9 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, re.S)
 
 
-@pytest.mark.slow
-def test_the_ten_lines_run(tmp_path: Path) -> None:
-    pytest.importorskip("embreex")
-    [code] = blocks("python")
-    export_town(Town(0, scans=3), tmp_path / "demo_out" / "town", "semantic_kitti", camera=False, progress=False)
+def test_the_ten_lines_are_ten() -> None:
+    [code] = blocks("python")  # test_docs_blocks.py runs it
     assert len([line for line in code.splitlines() if line.strip()]) <= 10
-    run = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    assert "torch.Size" in run.stdout
 
 
 def anchors(text: str) -> set[str]:

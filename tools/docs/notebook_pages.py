@@ -1,58 +1,54 @@
-"""Hook of mkdocs: every notebook of docs/notebooks becomes a page with its stored outputs, under "Start".
+"""Hook of mkdocs: each notebook of docs/notebooks becomes a page, as it was executed, without a script.
 
-The notebook itself is copied to the site too, and its page links to it.
+A link to a notebook in another page leads to that page; the notebook itself is a file beside it.
 """
 
-import json
-from collections.abc import Iterator
+import base64
+import re
 from pathlib import Path
 from typing import Any
 
+import nbformat
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-
-def notebooks(config: MkDocsConfig) -> list[Path]:
-    return sorted(Path(config.docs_dir).glob("notebooks/*.ipynb"))
+SUFFIXES = {"image/jpeg": "jpg", "image/png": "png"}
 
 
-def markdown_of(notebook: Path) -> str:
-    """A notebook as Markdown: its text, its code, and what the code printed and drew."""
-    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
-    parts = [part for cell in cells for part in _parts(cell)]
-    return "\n\n".join([*parts, f"[Download this notebook]({notebook.name}){{: download }}"]) + "\n"
+def page_of(path: Path) -> tuple[str, dict[str, bytes]]:
+    """The Markdown of a notebook's page, and the pictures beside it by name."""
+    parts: list[str] = []
+    pictures: dict[str, bytes] = {}
+    for cell in nbformat.read(path, as_version=4).cells:
+        if cell.cell_type == "markdown":
+            parts.append(cell.source)
+            continue
+        parts.append(f"```python\n{cell.source}\n```")
+        for output in cell.outputs:
+            data = output.get("data", {})
+            kind = next((kind for kind in SUFFIXES if kind in data), None)
+            if kind:
+                name = f"{path.stem}-{len(pictures)}.{SUFFIXES[kind]}"
+                pictures[name] = base64.b64decode(data[kind])
+                parts.append(f"![Output of the cell above]({name})")
+            else:
+                parts.append(f"```text\n{(output.get('text') or data['text/plain']).rstrip()}\n```")
+    title, _, rest = "\n\n".join(parts).partition("\n")
+    return f"{title}\n\n[Download the notebook]({path.name}){{ download }}\n{rest}\n", pictures
 
 
-def _parts(cell: dict[str, Any]) -> Iterator[str]:
-    source = _text(cell["source"])
-    if cell["cell_type"] == "markdown":
-        yield source
-    elif cell["cell_type"] == "code":
-        yield f"```python\n{source}\n```"
-        for output in cell["outputs"]:
-            yield from _output(output)
-
-
-def _output(output: dict[str, Any]) -> Iterator[str]:
-    data = output.get("data", {})
-    if "image/png" in data:
-        yield f"![Output](data:image/png;base64,{''.join(_text(data['image/png']).split())})"
-    elif text := _text(output.get("text", data.get("text/plain", ""))).strip():
-        yield f"```text\n{text}\n```"
-
-
-def _text(lines: str | list[str]) -> str:
-    return lines if isinstance(lines, str) else "".join(lines)
-
-
-def on_config(config: MkDocsConfig) -> None:
-    """Called by mkdocs before it reads the navigation."""
-    if found := notebooks(config):
-        start = next(entry["Start"] for entry in config.nav or [] if "Start" in entry)
-        start.append({"Notebooks": [f"notebooks/{path.stem}.md" for path in found]})
-
-
-def on_files(files: Files, config: MkDocsConfig) -> None:
+def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Called by mkdocs with the files of the site."""
-    for path in notebooks(config):
-        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=markdown_of(path)))
+    for path in sorted(Path(config.docs_dir, "notebooks").glob("*.ipynb")):
+        text, pictures = page_of(path)
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=text))
+        for name, content in pictures.items():
+            files.append(File.generated(config, f"notebooks/{name}", content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Called by mkdocs with the Markdown of a page."""
+    if page.file.src_uri.startswith("notebooks/"):
+        return markdown
+    return re.sub(r"(\]\([\w./-]*notebooks/\w+)\.ipynb\)", r"\1.md)", markdown)
