@@ -1,7 +1,6 @@
 """Headless Chromium for the tests of the HTML page, driven by selenium."""
 
 import importlib.util
-import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -125,13 +124,13 @@ class Page:
 
     def situation(self) -> dict[str, Any]:
         """Everything that a key could change."""
-        return {
-            "camera": json.dumps(self.camera()),
-            "captions": self.texts(".caption"),
-            "pressed": [b.get_attribute("aria-pressed") for b in self.all("button")],
-            "size": self.run("return state.size"),
-            "picked": self.texts(".picked"),
-        }
+        situation: dict[str, Any] = self.run("""
+            const texts = (selector) => [...document.querySelectorAll(selector)].map((e) => e.textContent);
+            const pressed = [...document.querySelectorAll("button")].map((e) => e.getAttribute("aria-pressed"));
+            return { camera: JSON.stringify(state.camera), captions: texts(".caption"), pressed, size: state.size,
+                     picked: [...document.querySelectorAll(".picked")].map((e) => e.hidden ? "" : e.textContent) };
+        """)
+        return situation
 
     def pixels(self, view: int) -> Any:
         """(H, W, 3) the picture of a view, without its caption."""

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
+from typing import Any
 
 import numpy as np
 import torch
@@ -51,17 +52,15 @@ class Protocol:
     batch: int = 2
     seeds: int = 3
 
-    def mixture(self, ratio: float, seed: int) -> MixedScans:
-        """The training set of an arm; its labelled scans are the same for every ratio."""
-        return MixedScans(
-            self.real, self.synthetic if ratio else None, ratio, labels="generated", seed=seed,
-            augment=AUGMENT, augment_real=True, collate="range",
-        )  # fmt: skip
+    def mixture(self, ratio: float, seed: int, **options: Any) -> MixedScans:
+        """The training set of an arm; ``options`` are further arguments of ``MixedScans``."""
+        return MixedScans(self.real, self.synthetic if ratio else None, ratio, seed=seed, **options)
 
     def train(self, ratio: float, seed: int) -> NDArray[np.int64]:
         """(19, 19) confusion matrix on the held-out scans after a training with this share of synthetic samples."""
         torch.manual_seed(seed)
-        mixed, held_out = self.mixture(ratio, seed), MixedScans(self.held_out, ratio=0, collate="range")
+        mixed = self.mixture(ratio, seed, augment=AUGMENT, augment_real=True, collate="range")
+        held_out = MixedScans(self.held_out, ratio=0, collate="range")
         height = torch.from_numpy(np.sin(mixed.collate.sensor.ray_angles()[0]))
         network = RangeSegmenter(widths=WIDTHS)
         train_segmenter(network, endless_batches(mixed, self.batch), height, self.steps, progress=False)

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
@@ -27,13 +27,19 @@ import numpy as np
 from comparison import AUGMENTATION, Protocol, Result, compare
 from numpy.typing import NDArray
 
-from lidar_synth import Bank, MixedScans, Scan, Source, open_scans
+from lidar_synth import Bank, Scan, Source, open_scans
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.files.disk import write_file
+from lidar_synth.geometry.scan import REAL
 from lidar_synth.viz import classes_panel, html_page, mixture_panel, scores_panel
 
 SHOWN = 4
 """Scans of each kind on the page."""
+
+_TOWN_MODEL = (
+    "The synthetic scans come from a model of a procedural town, which has not seen this dataset: they look like the "
+    "town. For scans like yours, train a model on yours."
+)
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,8 @@ class Data:
     Args:
         real: scans to train on; without labels, nothing is trained.
         held_out: scans of another place.
-        name: the dataset, as the page calls its scans.
+        name: what the page calls one of its scans.
+        kind: the same in one word.
         notes: what else the page says about them.
         place: where the held-out scans are from.
     """
@@ -51,6 +58,7 @@ class Data:
     real: Sequence[Scan]
     held_out: Sequence[Scan]
     name: str
+    kind: str
     notes: str
     place: str = ""
 
@@ -78,12 +86,14 @@ def town(out: Path, scans: int, seed: int) -> Data:
         words = ("--scans", str(scans), "--seed", str(number), "--interval", "1", "--layout", "semantic_kitti", *more)
         command("town", str(out / name), *words, "--jobs", str(os.cpu_count() or 1))
     notes = (
-        "No dataset was given, so nothing here was measured by a real sensor: scans of a procedural town take the place "
-        f"of your real ones (town {seed}). Set SEMANTICKITTI_ROOT to see your own data. The model that generates the "
-        "synthetic scans was trained on town 0."
+        "No real sensor measured these scans: no dataset was given, so scans of a procedural town take the place of "
+        f"your real ones (seed {seed}). Set SEMANTICKITTI_ROOT to see your own data. The synthetic scans come from the "
+        'model that ships with the package, "town"; it was trained on many more scans of the town of seed 0.'
     )
     real, other = list(open_scans(out / "town")), list(open_scans(out / "other_town"))
-    return Data(real, other, "scan of the town, in place of a real one", notes, f"another town (seed {seed + 1})")
+    return Data(
+        real, other, "Scan of the town, in place of a real one", "town", notes, f"another town (seed {seed + 1})"
+    )
 
 
 def semantic_kitti(root: str, scans: int) -> Data:
@@ -95,11 +105,10 @@ def semantic_kitti(root: str, scans: int) -> Data:
     chosen = [i for key, found in sequences.items() if key != held_out for i in found]
     if not chosen:
         sys.exit(f"SEMANTICKITTI_ROOT={root} has one labelled sequence; expected two or more, to hold one out")
-    notes = f"Real scans: SemanticKITTI, sequences {', '.join(k for k in sequences if k != held_out)}."
-    return Data(
-        spread(source, scans, chosen), spread(source, scans, sequences[held_out]), "real scan (SemanticKITTI)", notes,
-        f"sequence {held_out}, on which nothing was trained",
-    )  # fmt: skip
+    notes = f"Real scans: SemanticKITTI, sequences {', '.join(k for k in sequences if k != held_out)}. {_TOWN_MODEL}"
+    real, other = spread(source, scans, chosen), spread(source, scans, sequences[held_out])
+    place = f"sequence {held_out}, on which nothing was trained"
+    return Data(real, other, "Real scan (SemanticKITTI)", "real", notes, place)
 
 
 def kitti360(root: str, scans: int) -> Data:
@@ -129,29 +138,39 @@ def shares(scans: Sequence[Scan]) -> NDArray[np.float64]:
 def protocol_notes(protocol: Protocol, place: str) -> list[str]:
     """What a reader has to know to judge the figures."""
     return [
-        f"Both trainings have the same {len(protocol.real)} labelled scans (the label budget), {protocol.steps} iterations "
-        f"of {protocol.batch} scans, network, seeds and augmentation: {AUGMENTATION}. They differ in "
-        f"the share of synthetic samples: 0 and {100 * protocol.ratio:.0f} %. Measured on {len(protocol.held_out)} "
-        f"scans of {place}. Each dot is a training with another seed; the line is their mean, ± their standard deviation.",
-        "This is a short training of a small network, made to finish in a minute or two: it shows the procedure, and its "
-        "figures are far below those of a full training. tools/ratio_curve.py makes longer comparisons.",
+        f"Both trainings use the same {len(protocol.real)} labelled scans (the label budget), and the same network, "
+        f"seeds, {protocol.steps} iterations of {protocol.batch} scans, and augmentation: {AUGMENTATION}. They differ "
+        f"in the share of synthetic samples: 0 and {100 * protocol.ratio:.0f} %. Each dot is the mIoU of one seed on "
+        f"{len(protocol.held_out)} scans of {place}; the white line is the mean, ± the standard deviation.",
+        "These are short trainings of a small network, made to finish in a minute or two: they show the procedure, and "
+        "the mIoU is far below that of a full training. tools/ratio_curve.py makes longer comparisons.",
     ]
 
 
-def panels(protocol: Protocol, labelled: bool, place: str, epoch: list[Scan], result: Result | None) -> list[str]:
+def panels(protocol: Protocol, data: Data, result: Result | None) -> list[str]:
     """The panels of the page below the viewer."""
-    domains, kinds = [scan.domain for scan in epoch], ("real", "synthetic")
-    made = [
-        mixture_panel(domains, kinds, ["Real samples pass through unchanged; each synthetic one brings its labels."])
-    ]
-    if not labelled or result is None:
+    labels = "none" if result is None else "generated"
+    mixed = protocol.mixture(protocol.ratio, 0, labels=labels, to_sample=lambda scan, rng: scan)
+    epoch = [mixed[i] for i in range(len(mixed))]
+    kinds = (data.kind, "synthetic")
+    made = [mixture_panel([scan.domain for scan in epoch], kinds)]
+    if result is None:
         return made
     without, with_synthetic = result.scores()
-    arms = {"real scans only": without, "real and synthetic scans": with_synthetic}
+    arms = {f"{data.kind} scans only": without, f"{data.kind} and synthetic scans": with_synthetic}
     columns = {f"% of points, {kind}": shares([s for s in epoch if s.domain == d]) for d, kind in enumerate(kinds)}
-    ious = dict(zip(("IoU %, real only", "IoU %, with synthetic"), result.ious(), strict=True))
-    notes = ["– : not in the held-out scans. IoU: mean over the seeds."]
-    return [*made, scores_panel(arms, protocol_notes(protocol, place)), classes_panel(columns | ious, notes)]
+    ious = dict(zip((f"IoU %, {data.kind} only", "IoU %, with synthetic"), result.ious(), strict=True))
+    notes = [f"Points: labelled ones of the first epoch. IoU: on {data.place}, mean of the seeds; – : not there."]
+    return [*made, scores_panel(arms, protocol_notes(protocol, data.place)), classes_panel(columns | ious, notes)]
+
+
+def write_page(path: Path, data: Data, bank: Bank, made: list[str]) -> None:
+    """Write the page, with some scans of each kind."""
+    real = [replace(scan, domain=REAL) for scan in spread(data.real, SHOWN)]  # the town stands in for real scans
+    names = (data.name, "Synthetic scan, generated in 4 steps")
+    shown = real + spread(bank, SHOWN)
+    text = html_page(shown, title="Real and synthetic scans", notes=data.notes, domains=names, panels=made)
+    write_file(path, text.encode())
 
 
 def main() -> None:
@@ -173,17 +192,10 @@ def main() -> None:
     protocol = Protocol(data.real, list(bank), data.held_out, steps=40 if few else 120, seeds=2 if few else 3)
     result = None
     if data.labelled:
-        print(f"\nTraining with and without synthetic scans: {2 * protocol.seeds} times {protocol.steps} iterations")
+        print(f"\nTraining without and with synthetic scans: {protocol.seeds} seeds, {protocol.steps} iterations each")
         result = compare(protocol)
-    labels = "generated" if data.labelled else "none"
-    mixed = MixedScans(data.real, bank, protocol.ratio, labels=labels, balanced=True, to_sample=lambda scan, rng: scan)
-    epoch = [mixed[i] for i in range(len(mixed))]
-    made = panels(protocol, data.labelled, data.place, epoch, result)
-    shown = [scan for d in (0, 1) for scan in spread([s for s in epoch if s.domain == d], SHOWN)]
     page = given.out / "index.html"
-    names = (data.name, "synthetic scan, generated in 4 steps")
-    text = html_page(shown, title="Real and synthetic scans", notes=data.notes, domains=names, panels=made)
-    write_file(page, text.encode())
+    write_page(page, data, bank, panels(protocol, data, result))
     if result is not None:
         for name, scores in zip(("without", "with"), result.scores(), strict=True):
             print(f"mIoU {name} synthetic scans: {', '.join(f'{100 * score:.1f} %' for score in scores)}")
