@@ -12,7 +12,7 @@ SCANS ?= 24
 
 .PHONY: demo test quick test-lowest lint docs notebooks bench clean
 
-demo: $(READY)  ## a small town as a user's dataset: write, read, project, convert, look
+demo: $(READY)  ## scans mixed with synthetic ones, a comparison of trainings, a page to look at
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
 
 test: $(READY)  ## all tests

@@ -174,11 +174,12 @@ def test_box_segments_connect_the_corners() -> None:
 @pytest.mark.parametrize("by", sorted(VALUES))
 def test_points_can_be_coloured_by_every_quantity(by: str) -> None:
     scan = random_scan(SMALL)
+    scan = replace(scan, confidence=scan.reflectance)
     pixels = render(scan, by, size=(160, 90))
     assert pixels.shape == (90, 160, 3)
     assert pixels.dtype == np.uint8
     assert (pixels != EMPTY).any(-1).mean() > 0.02
-    with pytest.raises(ConfigError, match="one of height, range, reflectance, domain"):
+    with pytest.raises(ConfigError, match="one of height, range, reflectance, confidence, domain"):
         render(replace(scan, label=None), "label", size=(16, 9))
     with pytest.raises(ConfigError, match="colour by 'velocity'"):
         render(scan, "velocity", size=(16, 9))

@@ -3,9 +3,11 @@
 import base64
 import json
 import re
+import zlib
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +25,10 @@ from lidar_synth.viz import (
     scales,
 )
 from lidar_synth.viz.colour import VALUES
-from lidar_synth.viz.page import POINT
+from lidar_synth.viz.page import SCRIPTS
 from lidar_synth.viz.render import box_segments
+
+PANELS = ["<section>one</section>", "<section>two, @data@</section>"]
 
 
 @pytest.fixture(scope="module")
@@ -32,32 +36,38 @@ def scans() -> list[Scan]:
     boxes = Boxes(np.array([(5, 1, -1, 4, 2, 1.5, 0.3)], np.float32), ("Car",))
     return [
         replace(random_scan(load_sensor("town"), 3000), boxes=boxes),
-        replace(random_scan(load_sensor("os1_128"), 500, seed=1), label=None, domain=SYNTHETIC, id="</script>&<b>"),
-    ]
+        replace(
+            random_scan(load_sensor("os1_128"), 500, seed=1),
+            label=None, domain=SYNTHETIC, id="</script>&<b>", confidence=np.linspace(0, 1, 500, dtype=np.float32),
+        ),
+    ]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def page(scans: list[Scan]) -> str:
-    return html_page(scans, title="A <title> & more", notes="First.\n\nSecond & <last>. @data@")
+    return html_page(scans, title="A <title> & more", notes="First.\n\nSecond & <last>. @data@", panels=PANELS)
+
+
+def unpacked(scan: dict[str, Any]) -> list[np.ndarray]:
+    """x, y, z in metres, reflectance and label of a scan of a page, and its confidence if it has it."""
+    content, count = zlib.decompress(base64.b64decode(scan["points"])), scan["count"]
+    steps = np.frombuffer(content, "<i2", 3 * count).reshape(3, count)
+    bytes_ = np.frombuffer(content, np.uint8, offset=6 * count).reshape(-1, count)
+    return [*np.cumsum(steps, axis=1, dtype=np.int16) * scan["metres"], bytes_[0] / 255, bytes_[1], *bytes_[2:] / 255]
 
 
 @pytest.mark.slow
 def test_the_page_contains_all_points(page: str, scans: list[Scan]) -> None:
     for scan, packed in zip(scans, page_data(page)["scans"], strict=True):
-        points = np.frombuffer(base64.b64decode(packed["points"]), POINT)
-        assert len(points) == len(scan) == packed["count"]
+        x, y, z, reflectance, label, *confidence = unpacked(packed)
         step = packed["metres"]
         assert step <= np.abs(scan.points).max() / 32767 * 1.001
-        np.testing.assert_allclose(points["cell"] * step, scan.points, atol=step / 2 * 1.01)
-        np.testing.assert_allclose(points["reflectance"] / 255, scan.reflectance, atol=0.5 / 255 + 1e-6)
-        expected = np.full(len(scan), IGNORE) if scan.label is None else scan.label
-        np.testing.assert_array_equal(points["label"], expected)
-
-
-def test_a_packed_point_is_eight_bytes_without_gaps() -> None:
-    """The viewer reads three int16 at 0 and two uint8 at 6."""
-    assert POINT.itemsize == 8
-    assert {name: place for name, (_, place) in POINT.fields.items()} == {"cell": 0, "reflectance": 6, "label": 7}
+        np.testing.assert_allclose(np.stack([x, y, z], 1), scan.points, atol=step / 2 * 1.01)
+        np.testing.assert_allclose(reflectance, scan.reflectance, atol=0.5 / 255 + 1e-6)
+        np.testing.assert_array_equal(label, np.full(len(scan), IGNORE) if scan.label is None else scan.label)
+        assert len(confidence) == (scan.confidence is not None)
+        if scan.confidence is not None:
+            np.testing.assert_allclose(confidence[0], scan.confidence, atol=0.5 / 255 + 1e-6)
 
 
 def test_the_page_contains_the_facts_of_each_scan(page: str, scans: list[Scan]) -> None:
@@ -83,7 +93,7 @@ def test_the_page_contains_the_range_images(page: str, scans: list[Scan]) -> Non
         assert [p["title"] for p in packed["pictures"]] == [colours[c].title for c in channels]
         for channel, shown in zip(channels, packed["pictures"], strict=True):
             np.testing.assert_array_equal(pixels(shown["uri"]), picture(image, channel, colours[channel]))
-        assert pixels(packed["still"]).shape == (540, 960, 3)
+        assert pixels(packed["still"]).shape == (360, 640, 3)
 
 
 def test_the_page_uses_the_colour_tables_of_the_pictures(page: str, scans: list[Scan]) -> None:
@@ -100,13 +110,13 @@ def test_the_page_uses_the_colour_tables_of_the_pictures(page: str, scans: list[
 def test_the_page_loads_nothing_from_outside(page: str) -> None:
     markup = page.replace(json.dumps(page_data(page)), "")
     assert not re.search(r"https?:|//cdn|@import|import\s*\(|\bfetch\b|XMLHttpRequest|<link|src=[\"'](?!data:)", markup)
-    assert not re.search(r"@(title|notes|draw|script)@", page)
+    assert not re.search(r"@(title|notes|script)@", page)
 
 
 def test_user_text_is_escaped_on_the_page(page: str) -> None:
     assert "<title>A &lt;title&gt; &amp; more</title>" in page
     assert "<p>First.</p><p>Second &amp; &lt;last&gt;. @data@</p>" in page
-    assert page.count("</script>") == 3, "an id cannot end the data"
+    assert page.count("</script>") == 2, "an id cannot end the data"
 
 
 def test_an_existing_camera_image_is_shown_on_the_page(tmp_path: Path) -> None:
@@ -120,16 +130,26 @@ def test_an_existing_camera_image_is_shown_on_the_page(tmp_path: Path) -> None:
     assert "camera" not in [p["title"] for p in page_data(html_page([lost]))["scans"][0]["pictures"]]
 
 
-def test_a_page_with_a_full_scan_is_below_2_4_megabytes() -> None:
-    """120,000 points in 8 bytes each and base64; noise is the worst case for its pictures."""
+def test_panels_stand_on_the_page_as_they_are(page: str) -> None:
+    assert f'<div id="panels">{"".join(PANELS)}</div>' in page
+
+
+def test_domains_can_have_other_names(scans: list[Scan]) -> None:
+    assert page_data(html_page(scans[1:]))["domains"] == ["real", "synthetic"]
+    assert page_data(html_page(scans[1:], domains=("town", "made")))["domains"] == ["town", "made"]
+
+
+def test_a_page_with_a_full_scan_is_below_2_1_megabytes() -> None:
+    """120,000 points; noise is the worst case for its points and pictures."""
     page = html_page([random_scan(load_sensor("hdl64e_kitti360"), 120_000)])
-    assert len(page_data(page)["scans"][0]["points"]) == 120_000 * 8 * 4 / 3
-    assert len(page) < 2.4e6
+    assert page_data(page)["scans"][0]["count"] == 120_000
+    assert len(page) < 2.1e6
 
 
 def test_the_page_has_every_element_that_its_script_uses() -> None:
     folder = files("lidar_synth.viz")
-    asked = set(re.findall(r'\$\("(\w+)"\)', folder.joinpath("page.js").read_text()))
+    scripts = "".join(folder.joinpath(name).read_text() for name in SCRIPTS)
+    asked = set(re.findall(r'\$\("(\w+)"\)', scripts))
     there = set(re.findall(r'id="(\w+)"', folder.joinpath("page.html").read_text()))
     assert len(asked) >= 10
     assert asked <= there

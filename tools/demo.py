@@ -1,14 +1,14 @@
-"""The whole package in a few minutes on one machine: real scans mixed with synthetic ones, a training, a page of scans.
+"""The whole package in a few minutes on one machine: scans mixed with synthetic ones, a comparison, a page to look at.
 
     python tools/demo.py demo_out --scans 24
 
-1. Writes a small procedural town in SemanticKITTI's layout, in place of your own dataset. With SEMANTICKITTI_ROOT set,
-   that dataset is used instead. With KITTI360_ROOT, which has no labels per scan, scans are mixed and shown, but
-   nothing is trained.
-2. Mixes it with 4-step scans that the shipped model generates in two DataLoader workers, one sample in four, and trains
-   a small segmenter for a few steps.
-3. Bakes a bank of synthetic scans, verifies it, and mixes scans of the bank.
-4. Writes one page with real and synthetic samples.
+1. Writes scans of a procedural town in SemanticKITTI's layout, in place of your own labelled dataset, and scans of
+   another town, on which segmenters are measured. With SEMANTICKITTI_ROOT set, that dataset is used instead: sequence
+   08 is held out, or the last sequence if there is no 08. KITTI360_ROOT works too, but has no labels per scan: its
+   scans are mixed and shown, and nothing is trained.
+2. Bakes a bank of scans that the shipped model generates, and verifies it.
+3. Trains a small segmenter on the labelled scans, without and with synthetic ones, with two or three seeds each.
+4. Writes a page: real and synthetic scans side by side, the mixture, and the mIoU of both trainings.
 
 Run it again to resume after a stop.
 """
@@ -18,81 +18,187 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-import torch
+from comparison import AUGMENTATION, Protocol, Result, compare
+from numpy.typing import NDArray
 
-from lidar_synth import Bank, MixedScans, Scan, Source, load_generator, open_scans
-from lidar_synth.models.segmenter import RangeSegmenter
-from lidar_synth.train.segmentation import endless_batches, train_segmenter
-from lidar_synth.viz import write_view
+from lidar_synth import Bank, Scan, Source, open_scans
+from lidar_synth.datasets.classes import NAMES
+from lidar_synth.files.disk import write_file
+from lidar_synth.geometry.scan import REAL
+from lidar_synth.viz import classes_panel, html_page, mixture_panel, scores_panel
 
-RATIO = 0.25
-BATCH = 4
-WORKERS = 2
+SHOWN = 4
+"""Scans of each kind on the page."""
+
+_TOWN_MODEL = (
+    "The synthetic scans come from a model of a procedural town, which has not seen this dataset: they look like the "
+    "town. For scans like yours, train a model on yours."
+)
+
+
+@dataclass(frozen=True)
+class Data:
+    """The user's scans, or what stands in for them.
+
+    Args:
+        real: scans to train on; without labels, nothing is trained.
+        held_out: scans of another place.
+        name: what the page calls one of its scans.
+        kind: the same in one word.
+        notes: what else the page says about them.
+        place: where the held-out scans are from.
+    """
+
+    real: Sequence[Scan]
+    held_out: Sequence[Scan]
+    name: str
+    kind: str
+    notes: str
+    place: str = ""
+
+    @property
+    def labelled(self) -> bool:
+        return all(scan.label is not None for scan in [*self.real, *self.held_out])
 
 
 def command(*words: str) -> None:
-    """Prints a command of ``lidar-synth`` and runs it as a user would."""
+    """Print a command of ``lidar-synth`` and run it as a user would."""
     print(f"\n$ lidar-synth {' '.join(words)}", flush=True)
     subprocess.run([sys.executable, "-m", "lidar_synth", *words], check=True)
 
 
-def dataset(out: Path, scans: int, seed: int) -> tuple[Source, str, bool]:
-    """The user's own scans, a description, and whether they have labels."""
-    if root := os.environ.get("SEMANTICKITTI_ROOT"):
-        return open_scans(root, layout="semantic_kitti", split="train"), "SemanticKITTI", True
-    if root := os.environ.get("KITTI360_ROOT"):
-        return open_scans(root, layout="kitti360", split="r2flow/train"), "KITTI-360", False
-    town = out / "town"
-    wanted = ("--scans", str(scans), "--seed", str(seed), "--layout", "semantic_kitti")
-    command("town", str(town), *wanted, "--jobs", str(os.cpu_count() or 1))
-    return open_scans(town), "the procedural town", True
+def spread(source: Source, count: int, chosen: Sequence[int] | None = None) -> list[Scan]:
+    """At most ``count`` scans, evenly spread over a source or over some of its indices."""
+    indices = list(range(len(source))) if chosen is None else chosen
+    places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
+    return [source[indices[i]] for i in places]
 
 
-def train(real: Source, synthetic: object, steps: int) -> str:
-    """Train briefly on the mixture; returns a sentence about the loss."""
-    mixed = MixedScans(real, synthetic, RATIO, labels="generated", balanced=True, collate="range")
-    height = torch.from_numpy(np.sin(mixed.collate.sensor.ray_angles()[0]))
-    torch.manual_seed(0)
-    losses = train_segmenter(RangeSegmenter(), endless_batches(mixed, BATCH, WORKERS), height, steps)
-    share = sum(mixed.domain(i) for i in range(len(mixed))) / len(mixed)
-    return (
-        f"A segmenter was trained on {steps} batches of {BATCH}, {100 * share:.0f} % of the scans synthetic; "
-        f"its loss went from {losses[0]:.2f} to {np.mean(losses[-5:]):.2f}."
+def town(out: Path, scans: int, seed: int) -> Data:
+    """Scans of two towns; those of the first one take the place of the user's own."""
+    for name, number, more in (("town", seed, ()), ("other_town", seed + 1, ("--no-camera",))):
+        words = ("--scans", str(scans), "--seed", str(number), "--interval", "1", "--layout", "semantic_kitti", *more)
+        command("town", str(out / name), *words, "--jobs", str(os.cpu_count() or 1))
+    notes = (
+        "No real sensor measured these scans: no dataset was given, so scans of a procedural town take the place of "
+        f"your real ones (seed {seed}). Set SEMANTICKITTI_ROOT to see your own data. The synthetic scans come from the "
+        'model that ships with the package, "town"; it was trained on many more scans of the town of seed 0.'
+    )
+    real, other = list(open_scans(out / "town")), list(open_scans(out / "other_town"))
+    return Data(
+        real, other, "Scan of the town, in place of a real one", "town", notes, f"another town (seed {seed + 1})"
     )
 
 
-def samples(real: Source, synthetic: object, labels: str, count: int) -> list[Scan]:
-    """The first samples of a mixture, as scans."""
-    mixed = MixedScans(real, synthetic, 0.5, labels=labels, balanced=True, to_sample=lambda scan, rng: scan)
-    return [mixed[i] for i in range(min(count, len(mixed)))]
+def semantic_kitti(root: str, scans: int) -> Data:
+    """SemanticKITTI, with a sequence held out: 08, or the last one."""
+    source = open_scans(root, layout="semantic_kitti", split="all")
+    labelled = [i for i, name in enumerate(source.ids) if int(name[:2]) < 11]  # the test set has no labels
+    sequences = {key: list(found) for key, found in groupby(labelled, lambda i: source.ids[i][:2])}
+    held_out = "08" if "08" in sequences else max(sequences)
+    chosen = [i for key, found in sequences.items() if key != held_out for i in found]
+    if not chosen:
+        sys.exit(f"SEMANTICKITTI_ROOT={root} has one labelled sequence; expected two or more, to hold one out")
+    notes = f"Real scans: SemanticKITTI, sequences {', '.join(k for k in sequences if k != held_out)}. {_TOWN_MODEL}"
+    real, other = spread(source, scans, chosen), spread(source, scans, sequences[held_out])
+    place = f"sequence {held_out}, on which nothing was trained"
+    return Data(real, other, "Real scan (SemanticKITTI)", "real", notes, place)
+
+
+def kitti360(root: str, scans: int) -> Data:
+    """KITTI-360, which has no labels per scan."""
+    real = spread(open_scans(root, layout="kitti360", split="r2flow/train"), scans)
+    return Data(
+        real, [], "real scan (KITTI-360)", "Real scans: KITTI-360. They have no labels, so nothing was trained."
+    )
+
+
+def dataset(out: Path, scans: int, seed: int) -> Data:
+    """The dataset that an environment variable names, or the town."""
+    if root := os.environ.get("SEMANTICKITTI_ROOT"):
+        return semantic_kitti(root, scans)
+    if root := os.environ.get("KITTI360_ROOT"):
+        return kitti360(root, scans)
+    return town(out, scans, seed)
+
+
+def shares(scans: Sequence[Scan]) -> NDArray[np.float64]:
+    """(19,) share of each class in the labelled points of some scans."""
+    labels = np.concatenate([scan.label for scan in scans if scan.label is not None])
+    counts = np.bincount(labels[labels < len(NAMES)], minlength=len(NAMES))
+    return counts / max(counts.sum(), 1)
+
+
+def protocol_notes(protocol: Protocol, place: str) -> list[str]:
+    """What a reader has to know to judge the figures."""
+    return [
+        f"Both trainings use the same {len(protocol.real)} labelled scans (the label budget), and the same network, "
+        f"seeds, {protocol.steps} iterations of {protocol.batch} scans, and augmentation: {AUGMENTATION}. They differ "
+        f"in the share of synthetic samples: 0 and {100 * protocol.ratio:.0f} %. Each dot is the mIoU of one seed on "
+        f"{len(protocol.held_out)} scans of {place}; the white line is the mean, ± the standard deviation.",
+        "These are short trainings of a small network, made to finish in a minute or two: they show the procedure, and "
+        "the mIoU is far below that of a full training. tools/ratio_curve.py makes longer comparisons.",
+    ]
+
+
+def panels(protocol: Protocol, data: Data, result: Result | None) -> list[str]:
+    """The panels of the page below the viewer."""
+    labels = "none" if result is None else "generated"
+    mixed = protocol.mixture(protocol.ratio, 0, labels=labels, to_sample=lambda scan, rng: scan)
+    epoch = [mixed[i] for i in range(len(mixed))]
+    kinds = (data.kind, "synthetic")
+    made = [mixture_panel([scan.domain for scan in epoch], kinds)]
+    if result is None:
+        return made
+    without, with_synthetic = result.scores()
+    arms = {f"{data.kind} scans only": without, f"{data.kind} and synthetic scans": with_synthetic}
+    columns = {f"% of points, {kind}": shares([s for s in epoch if s.domain == d]) for d, kind in enumerate(kinds)}
+    ious = dict(zip((f"IoU %, {data.kind} only", "IoU %, with synthetic"), result.ious(), strict=True))
+    notes = [f"Points: labelled ones of the first epoch. IoU: on {data.place}, mean of the seeds; – : not there."]
+    return [*made, scores_panel(arms, protocol_notes(protocol, data.place)), classes_panel(columns | ious, notes)]
+
+
+def write_page(path: Path, data: Data, bank: Bank, made: list[str]) -> None:
+    """Write the page, with some scans of each kind."""
+    real = [replace(scan, domain=REAL) for scan in spread(data.real, SHOWN)]  # the town stands in for real scans
+    names = (data.name, "Synthetic scan, generated in 4 steps")
+    shown = real + spread(bank, SHOWN)
+    text = html_page(shown, title="Real and synthetic scans", notes=data.notes, domains=names, panels=made)
+    write_file(path, text.encode())
 
 
 def main() -> None:
     """Runs all steps."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, nargs="?", default=Path("demo_out"), help="folder to write to")
-    parser.add_argument("--scans", type=int, default=24, help="how many scans the town has")
+    parser.add_argument("--scans", type=int, default=24, help="how many scans to train on, and how many to hold out")
     parser.add_argument("--seed", type=int, default=0, help="seed of the town")
     given = parser.parse_args()
     start = time.monotonic()
     command("doctor")
-    real, name, labelled = dataset(given.out, given.scans, given.seed)
-    labels = "generated" if labelled else "none"
-    generator = load_generator("town")
-    result = (
-        train(real, generator, steps=2 * given.scans) if labelled else "Nothing was trained: the scans have no labels."
-    )
-    print(result)
-    bank = given.out / "bank"
-    command("bake", str(bank), "--model", "town", "--count", str(given.scans), "--seed", "1", "--shard-size", "16")
-    command("verify", str(bank), "--deep")
-    shown = samples(real, generator, labels, 6) + samples(real, Bank(bank), labels, 4)[-2:]
+    data = dataset(given.out, given.scans, given.seed)
+    folder = given.out / "bank"
+    command("bake", str(folder), "--model", "town", "--count", str(given.scans), "--seed", "1", "--shard-size", "16")
+    command("verify", str(folder), "--deep")
+    bank = Bank(folder)
+
+    few = given.scans < 12
+    protocol = Protocol(data.real, list(bank), data.held_out, steps=40 if few else 120, seeds=2 if few else 3)
+    result = None
+    if data.labelled:
+        print(f"\nTraining without and with synthetic scans: {protocol.seeds} seeds, {protocol.steps} iterations each")
+        result = compare(protocol)
     page = given.out / "index.html"
-    notes = f"Real scans: {name}. Synthetic scans: the model that comes with the package, in 4 steps.\n\n{result}"
-    write_view(page, shown, title="Real and synthetic scans", notes=notes)
+    write_page(page, data, bank, panels(protocol, data, result))
+    if result is not None:
+        for name, scores in zip(("without", "with"), result.scores(), strict=True):
+            print(f"mIoU {name} synthetic scans: {', '.join(f'{100 * score:.1f} %' for score in scores)}")
     print(f"\n{time.monotonic() - start:.0f} s. The page is {page.resolve()}")
 
 

@@ -85,6 +85,7 @@ VALUES: dict[str, Callable[[Scan], NDArray[Any] | None]] = {
     "range": lambda scan: np.linalg.norm(scan.points, axis=1),
     "reflectance": lambda scan: scan.reflectance,
     "label": lambda scan: scan.label,
+    "confidence": lambda scan: scan.confidence,
     "domain": lambda scan: np.full(len(scan), scan.domain, np.uint8),
 }
 """The quantities that can colour points: (N,) values of a scan, or None if the scan does not have them."""
@@ -106,6 +107,7 @@ def scales(scans: Sequence[Scan]) -> dict[str, Scale]:
         "range": Scale("range (m)", _colour_map("plasma_r", 0.0, 0.97), 0.0, float(reach), 0.5),
         "reflectance": Scale("reflectance", _colour_map("bone", 0.25), 0.0, 1.0, 0.7),
         "label": Scale("label", _class_table(COLOURS), classes=True),
+        "confidence": Scale("confidence of the label", _colour_map("RdYlGn", 0.0), 0.0, 1.0, 3.0),
         "domain": Scale("domain", _class_table(list(DOMAINS.values())), classes=True),
     }
 

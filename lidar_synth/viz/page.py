@@ -1,8 +1,8 @@
-"""A self-contained HTML page that shows scans; it needs no network and no server.
+"""A self-contained HTML page that shows scans, two of them side by side; it needs no network and no server.
 
-The viewer (``draw.js``, ``page.js``) uses WebGL 2 without a library. Points are quantised to 8 bytes (``POINT``): a
-scan of 120,000 points is 1.3 MB of text, with an error of at most 1.3 mm per coordinate if the farthest point is at
-80 m.
+The viewer (``camera.js``, ``draw.js``, ``page.js``) uses WebGL 2 without a library. The points of a scan are quantised
+and compressed (``pack``): the error of a coordinate is at most 1.3 mm if the farthest point is at 80 m, and a scan of
+57,000 points becomes 0.3 MB of text.
 """
 
 import base64
@@ -10,6 +10,7 @@ import html
 import io
 import json
 import re
+import zlib
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -28,28 +29,51 @@ from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, available, scales
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Orbit, box_segments, render, ring_segments
 
-POINT = np.dtype([("cell", "<i2", 3), ("reflectance", "u1"), ("label", "u1")])
-"""A packed point: position = ``cell`` * metres per step; reflectance * 255; train id, 255 = ignore."""
+SCRIPTS = ("camera.js", "draw.js", "page.js")
+"""The scripts of the page, in this order."""
 
 
-def pack(scan: Scan) -> tuple[NDArray[Any], float]:
-    """Pack a scan into (N,) elements of ``POINT``; also returns the size of one step of ``cell`` in metres."""
-    farthest = float(np.abs(scan.points).max(initial=0.0))
-    metres = max(farthest, 1.0) / 32767
-    packed = np.empty(len(scan), POINT)
-    packed["cell"] = np.rint(scan.points / metres)
-    packed["reflectance"] = np.rint(np.clip(scan.reflectance, 0, 1) * 255)
-    packed["label"] = IGNORE if scan.label is None else scan.label
-    return packed, metres
+def pack(scan: Scan) -> tuple[bytes, float]:
+    """Compress the points of a scan by zlib.
+
+    Returns:
+        The compressed bytes of these arrays, one after the other, and the length of a quantisation step in metres:
+        x, y and z, (N,) int16 each, in steps, as differences from the previous point (modulo 2**16);
+        reflectance * 255, (N,) uint8; label, (N,) uint8 train ids, 255 = ignore; and, if the scan has it,
+        confidence * 255, (N,) uint8.
+    """
+    metres = max(float(np.abs(scan.points).max(initial=0.0)), 1.0) / 32767
+    places = np.rint(scan.points / metres).astype("<i2")
+    columns = [np.diff(places[:, axis], prepend=np.int16(0)) for axis in range(3)]
+    columns += [_byte(scan.reflectance), np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label]
+    columns += [] if scan.confidence is None else [_byte(scan.confidence)]
+    return zlib.compress(b"".join(column.tobytes() for column in columns), 9), metres
 
 
-def html_page(given: Sequence[Scan | RangeImage], *, title: str = "LiDAR scans", notes: str = "") -> str:
+def _byte(values: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Values in [0, 1] as 0..255."""
+    return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def html_page(
+    given: Sequence[Scan | RangeImage],
+    *,
+    title: str = "LiDAR scans",
+    notes: str = "",
+    domains: Sequence[str] = tuple(DOMAINS),
+    panels: Sequence[str] = (),
+) -> str:
     """The HTML text of a page with an interactive viewer and the range images of every scan.
+
+    Where there are real and synthetic scans, the viewer shows a real one on the left and a synthetic one on the right;
+    otherwise any two of them. Both are seen through one camera.
 
     Args:
         given: scans, or range images, which are unprojected to points; at least one.
         title: the heading.
         notes: text below the heading; an empty line starts a paragraph.
+        domains: what the page calls real and synthetic scans.
+        panels: HTML below the viewer, inserted as it is; ``panels.py`` makes some.
 
     Raises:
         ConfigError: without scans.
@@ -62,7 +86,7 @@ def html_page(given: Sequence[Scan | RangeImage], *, title: str = "LiDAR scans",
         "by": "label" if any(view.scan.label is not None for view in all_views) else "height",
         "camera": Orbit()._asdict(),
         "empty": EMPTY.tolist(),
-        "domains": list(DOMAINS),
+        "domains": list(domains),
         "classes": [*NAMES, "unlabelled"],
         "scales": {name: _scale_data(scale, row) for row, (name, scale) in enumerate(colours.items())},
         "table": _base64(np.concatenate([scale.table for scale in colours.values()]).tobytes()),
@@ -77,10 +101,10 @@ def html_page(given: Sequence[Scan | RangeImage], *, title: str = "LiDAR scans",
         "notes": "".join(paragraphs),
         # An unescaped "<" in a name could close the script element that contains the data.
         "data": json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-        "draw": _resource("draw.js"),
-        "script": _resource("page.js"),
+        "panels": "".join(panels),
+        "script": "\n".join(_resource(name) for name in SCRIPTS),
     }
-    return re.sub("@(title|notes|data|draw|script)@", lambda mark: parts[mark[1]], _resource("page.html"))
+    return re.sub("@(title|notes|data|panels|script)@", lambda mark: parts[mark[1]], _resource("page.html"))
 
 
 def _resource(name: str) -> str:
@@ -107,12 +131,12 @@ def _scan_data(view: View, colours: dict[str, Scale]) -> dict[str, Any]:
         "domain": scan.domain,
         "count": len(scan),
         "metres": metres,
-        "points": _base64(packed.tobytes()),
+        "points": _base64(packed),
         "colours": list(available(scan)),
         "classes": view.classes.tolist(),
         "boxes": _base64(box_segments(scan.boxes).tobytes()) if scan.boxes is not None else "",
         "rings": _base64(ring_segments(scan).tobytes()),
-        "still": _data_uri(render(scan, by, size=(960, 540), scale=colours[by]), "JPEG"),
+        "still": _data_uri(render(scan, by, size=(640, 360), scale=colours[by]), "JPEG"),
         "pictures": pictures,
     }
 
