@@ -9,6 +9,8 @@ READY := $(VENV)/.ready
 TYPES := $(VENV)/types
 DEMO_OUT ?= demo_out
 SCANS ?= 24
+# Two test processes of one thread each; `make test PARALLEL=` runs all tests in one.
+PARALLEL ?= -n 2 --dist loadfile
 
 .PHONY: demo test quick test-lowest lint docs notebooks bench clean
 
@@ -16,10 +18,10 @@ demo: $(READY)  ## scans mixed with synthetic ones, a comparison of trainings, a
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
 
 test: $(READY)  ## all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
 
 quick: $(READY)  ## the tests that are not marked slow
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
 
 test-lowest: $(READY)  ## tests of files and banks on the lowest versions of the dependencies; installs them
 	$(BIN)/python tools/test_lowest_versions.py
