@@ -18,7 +18,7 @@ import numpy as np
 from lidar_synth.integrations.mixture import mix, read_settings
 from lidar_synth.integrations.reader import PLAN_FORMAT
 
-from lidar_synth.bank import Bank
+from lidar_synth.bank import is_bank
 from lidar_synth.errors import ConfigError, LidarSynthError
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.mixing.plan import VERSION
@@ -53,14 +53,13 @@ def write_plan(settings: Mapping[str, Any], out: str | Path, *, real: int, epoch
         )
     if epochs < 1 or real < 1 or Path(out).suffix != ".npz":
         raise ConfigError(f"{real} real samples and {epochs} epochs in {out}", "at least one of each, in a .npz file")
+    if not is_bank(settings.get("synthetic", "")):
+        raise ConfigError(f"synthetic: {settings.get('synthetic')}", "a bank", "lidar-synth bake OUT writes one.")
     mixed = mix(real, settings, lambda scan, rng: scan)
-    [bank] = mixed.synthetic
-    if not isinstance(bank, Bank):
-        raise ConfigError(f"synthetic: {settings['synthetic']}", "a bank", "lidar-synth bake OUT writes one.")
     plans = [mixed.plan(epoch) for epoch in range(epochs)]
     arrays = {f"epoch-{plan.epoch}": np.stack(plan.at(np.arange(len(plan))), 1) for plan in plans}
     values = {
-        "format": PLAN_FORMAT, "order": VERSION, "real": real, "bank": bank.identity, "labels": labels,
+        "format": PLAN_FORMAT, "order": VERSION, "real": real, "bank": mixed.synthetic[0].identity, "labels": labels,
         "threshold": float(options.get("threshold", 0)), "lengths": [len(plan) for plan in plans],
         "hashes": [plan.hash for plan in plans],
     }  # fmt: skip

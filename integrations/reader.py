@@ -40,8 +40,7 @@ TYPES = {"range": "<u2", "reflectance": "|u1", "label": "|u1", "confidence": "|u
 NUMBERS = {"seed": "<u8", "index": "<u8", "crc": "<u4"}  # one for each scan
 LEVELS = {"reflectance": 255, "confidence": 15}  # steps from 0 to 1
 FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
-REPAIR = "copy it again, or `lidar-synth repair BANK` regenerates what is damaged"
-PLAN = "python -m lidar_synth.integrations.plan makes a plan"
+REPAIR, PLAN = "copy it again, or run lidar-synth repair", "python -m lidar_synth.integrations.plan makes a plan"
 DAMAGE = (AttributeError, ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError,
           ValueError, zipfile.BadZipFile, zlib.error)  # fmt: skip  # raised by h5py, numpy and json on damaged files
 
@@ -108,6 +107,7 @@ class Bank:
             self._sources, self._shards = values["sources"], values["shards"]
             self.sensor, self.fields = self._sources[0]["sensor"], tuple(self._sources[0]["fields"])
             self.shape = _shape(self.sensor)
+            self._directions = _directions(self.sensor, self.shape)
             self._names = [name for name in TYPES if name in {"range", *self.fields}]
             self._scale = self.sensor["range_max"] / 65535
             for facts in self._sources:
@@ -117,7 +117,7 @@ class Bank:
                 values["scans"] == self._ends[-1], f"{values['scans']} scans, but the shards have {self._ends[-1]}"
             )
         self._open: OrderedDict[int, _Shard] = OrderedDict()
-        self._process, self._directions = os.getpid(), _directions(self.sensor, self.shape)
+        self._process = os.getpid()
 
     def __len__(self) -> int:
         return int(self._ends[-1])
@@ -393,6 +393,7 @@ def _directions(sensor: dict[str, Any], shape: tuple[int, int]) -> NDArray[Any]:
     if not len(degrees):
         up, down = float(sensor["fov_up"]), float(sensor["fov_down"])
         degrees = up - (np.arange(rows) + 0.5) / rows * (up - down)
+    _require(degrees.shape == (rows,) and (np.abs(degrees) <= 90).all(), "a sensor with elevations beyond 90 degrees")
     elevation = np.radians(degrees).astype(np.float32).astype(np.float64)[:, None]
     azimuth = ((2 * ((np.arange(columns) + 0.5) / columns) - 1) * np.pi).astype(np.float32).astype(np.float64)[None]
     x, y = np.cos(azimuth) * np.cos(elevation), -np.sin(azimuth) * np.cos(elevation)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, sys.argv[1])
-import reader  # noqa: E402
+import reader
 
 
 def compare(where, found, expected):
@@ -34,8 +34,8 @@ def main():
         bank, found = reader.Bank(folder / "bank"), {}
         bank.verify()
         for number in range(len(bank)):
-            found.update({"%d image %s" % (number, name): v for name, v in bank.image(number).items()})
-            found.update({"%d %s" % (number, name): v for name, v in scan_arrays(bank[number]).items()})
+            found.update({f"{number} image {name}": v for name, v in bank.image(number).items()})
+            found.update({f"{number} {name}": v for name, v in scan_arrays(bank[number]).items()})
         compare(folder.name, found, dict(np.load(str(folder / "expected.npz"))))
         scans += len(bank)
     for folder in sorted((cases / "plans").iterdir()):
@@ -47,16 +47,14 @@ def main():
             for position in range(len(train)):
                 sample = train[position]
                 values = {"real": np.array(sample)} if isinstance(sample, int) else scan_arrays(sample)
-                found.update({"%d %d %s" % (epoch, position, key): value for key, value in values.items()})
+                found.update({f"{epoch} {position} {key}": value for key, value in values.items()})
                 assert train.domain(position) == (not isinstance(sample, int))
                 samples += 1
         compare(folder.name, found, dict(np.load(str(folder / "expected.npz"))))
     heavy = {"torch", "numba", "deflate", "lidar_synth"} & set(sys.modules)
     assert not heavy, heavy
-    print(
-        "Python %d.%d.%d, numpy %s, h5py %s: %d scans and %d samples are equal, bit for bit"
-        % (*sys.version_info[:3], np.__version__, reader.h5py.__version__, scans, samples)
-    )
+    versions = f"Python {sys.version.split()[0]}, numpy {np.__version__}, h5py {reader.h5py.__version__}"
+    print(f"{versions}: {scans} scans and {samples} samples are equal, bit for bit")
 
 
 if __name__ == "__main__":

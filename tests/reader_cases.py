@@ -1,4 +1,4 @@
-"""Banks and plans of every option with the package's own reading of them, for tests of the reader without the package."""
+"""Banks and plans of every option, and the package's own reading of them, for tests of ``integrations/reader.py``."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +24,13 @@ LASERS = Sensor("lasers", 48, 0.9, 120.0, elevations=(15.0, 7.5, 2.0, -1.0, -9.0
 def images(count: int = 5, sensor: Sensor | None = None) -> list[Any]:
     """Random range images."""
     return [some_image(seed, *([sensor] if sensor else [])) for seed in range(count)]
+
+
+def at_limits() -> list[Any]:
+    """A range image with returns at both limits of the sensor."""
+    [image] = images(1)
+    image.range[image.mask] = np.resize([image.sensor.range_min, image.sensor.range_max], image.mask.sum())
+    return [image]
 
 
 def conditional(root: Path) -> None:
@@ -60,6 +67,7 @@ BANKS: dict[str, Any] = {
     "one shard": lambda root: write_bank(root, images(), shard_size=5, fields=ALL),
     "many shards": lambda root: write_bank(root, images(40), shard_size=2, fields=ALL),
     "paged": lambda root: write_bank(root, images(), fields=ALL, layout="paged"),
+    "limits": lambda root: write_bank(root, at_limits(), fields=ALL),
     "lasers": lambda root: write_bank(root, images(2, LASERS), fields=ALL),
     "hdl64e": lambda root: write_bank(root, images(2, load_sensor("hdl64e_kitti")), fields=ALL),
     "conditional": conditional,
@@ -97,7 +105,9 @@ def expected_samples(root: Path, real: int, settings: dict[str, Any]) -> dict[st
     options = {key: value for key, value in settings.items() if key not in ("labels", "label_options")}
     bank = Bank(root)
     policy = make_policy(settings.get("labels", "generated"), fields=bank.fields, **settings.get("label_options", {}))
-    mixed = MixedScans.wrap(range(real), bank, to_sample=lambda scan, rng: scan, compare=False, labels=policy, **options)
+    mixed = MixedScans.wrap(
+        range(real), bank, to_sample=lambda scan, rng: scan, compare=False, labels=policy, **options
+    )
     found: dict[str, Any] = {}
     for epoch in range(EPOCHS):
         for position in range(mixed.length(epoch)):
