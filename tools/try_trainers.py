@@ -12,6 +12,7 @@ import argparse
 import importlib
 import os
 import platform
+import shutil
 import sys
 import traceback
 from pathlib import Path
@@ -61,6 +62,7 @@ def main() -> None:
     parser.add_argument("--reuse-environments", action="store_true", help="keep those of an earlier run, to develop")
     options = parser.parse_args()
     work = options.work.absolute()
+    shutil.rmtree(work / "wheel", ignore_errors=True)  # that of an earlier checkout
     data = Data(work / f"data-{options.scans}", options.scans)
     done = [row for name in options.only for row in attempt(name, work, data, options.reuse_environments)]
     machine = f"Python {platform.python_version()}, {os.cpu_count()} cores, {platform.machine()}"

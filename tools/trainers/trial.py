@@ -81,19 +81,20 @@ class Trial:
         """
         folder = self.folder / "venv"
         python = folder / "bin" / "python"
+        wheel = wheel_of_checkout(self._wheel)
         if self.reuse and python.exists():
+            self.install(python, str(wheel), options=["--force-reinstall", "--no-deps"])
             return python
         venv.create(folder, with_pip=True, clear=True)
         torch = next(line for line in (ROOT / "constraints.txt").read_text().splitlines() if line.startswith("torch=="))
         self.install(python, torch)
-        wheel = wheel_of_checkout(self._wheel)
         self.install(python, f"{wheel}[{','.join(extras)}]" if extras else str(wheel))
         if packages:
             self.install(python, *packages, options=options)
         return python
 
     def install(self, python: Path, *packages: str, options: Sequence[str] = ()) -> None:
-        """``pip install`` into an environment; torch and numpy keep their versions if they are installed."""
+        """``pip install`` into an environment."""
         self.run("install", [python, "-m", "pip", "install", "--disable-pip-version-check", *options, *packages])
 
     def tree(self, variable: str) -> Path:
@@ -170,7 +171,7 @@ class Trial:
 
 
 def wheel_of_checkout(folder: Path) -> Path:
-    """A wheel of this checkout, built from a copy so that the checkout stays clean; built once for each run."""
+    """A wheel of this checkout, built from a copy so that the checkout stays clean, unless the folder has one."""
     if not list(folder.glob("lidar_synth-*.whl")):
         source = folder / "source"
         for name in ("lidar_synth", "integrations", "configs"):
