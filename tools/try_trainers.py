@@ -42,6 +42,7 @@ def attempt(name: str, work: Path, data: Data, reuse: bool) -> list[Row]:
             traceback.print_exc()
         text = " ".join(str(error).split()) or type(error).__name__
         done.append(trial.row("", (), f"**failed**: {text}", failed=True))
+        print(line(done[-1]), file=sys.stderr, flush=True)
     return done
 
 
