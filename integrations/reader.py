@@ -1,0 +1,400 @@
+"""Banks and planned epochs for environments that cannot hold the package: Python 3.8, numpy 1.23 and h5py are enough.
+
+Copy this one file into a trainer's tree; inside the package it is ``lidar_synth.integrations.reader``. Its scans are
+the package's own, bit for bit. The package plans the epochs, the trainer reads them::
+
+    python -m lidar_synth.integrations.plan mix.yaml plan.npz --real 19130 --epochs 50
+
+    from reader import Bank, MixedEpochs
+
+    train = MixedEpochs("plan.npz", trainer_dataset, Bank("/data/bank"), to_sample=lambda scan: ...)
+    train.set_epoch(3)  # before each epoch
+
+It reads banks of the format "lidar-synth-bank/1", curated ones included; those compressed with Blosc2 are refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import re
+import zipfile
+import zlib
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT = "lidar-synth-bank/1"
+PLAN_FORMAT = "lidar-synth-epochs/1"
+IGNORE = 255  # label of points without a known class
+TYPES = {"range": "<u2", "reflectance": "|u1", "label": "|u1", "confidence": "|u1"}  # in the order of a scan's CRC
+NUMBERS = {"seed": "<u8", "index": "<u8", "crc": "<u4"}  # one for each scan
+LEVELS = {"reflectance": 255, "confidence": 15}  # steps from 0 to 1
+FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
+REPAIR, PLAN = "copy it again, or run lidar-synth repair", "python -m lidar_synth.integrations.plan makes a plan"
+DAMAGE = (AttributeError, ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError,
+          ValueError, zipfile.BadZipFile, zlib.error)  # fmt: skip  # raised by h5py, numpy and json on damaged files
+
+
+class ReaderError(ValueError):
+    """A bank or plan that is missing, damaged, of another version, or does not fit; the text says what to do."""
+
+
+@contextmanager
+def _reading(what: object, hint: str) -> Iterator[None]:
+    """Convert errors of damaged files to a ``ReaderError`` that names the file."""
+    try:
+        yield
+    except ReaderError:
+        raise
+    except DAMAGE as error:
+        raise ReaderError(f"{what} cannot be read ({error}); {hint}") from error
+
+
+def _require(condition: object, otherwise: str) -> None:
+    if not condition:
+        raise ValueError(otherwise)
+
+
+class Scan(NamedTuple):
+    """A synthetic scan of N points in the sensor's frame: x forward, y left, z up.
+
+    Attributes:
+        points: (N, 3) float32 metres.
+        reflectance: (N,) float32 in [0, 1]; 0 if the bank has none.
+        label: (N,) uint8, SemanticKITTI's train ids 0..18, 255 = ignore; None if the bank has none.
+        confidence: (N,) float32 in [0, 1], the confidence of ``label``, or None.
+        id: ``<model>/<seed>/<index>``.
+    """
+
+    points: NDArray[Any]
+    reflectance: NDArray[Any]
+    label: NDArray[Any] | None
+    confidence: NDArray[Any] | None
+    id: str
+
+
+class Bank:
+    """The scans of a bank, read on access; every scan is checked against its CRC.
+
+    Args:
+        root: the bank's folder.
+
+    Attributes:
+        fields: what a scan has besides its points: some of "reflectance", "label", "confidence".
+        sensor: the sensor, with the keys of ``sensors.yaml``.
+        shape: (rows, columns) of the range images.
+        identity: the checksum of the index, different for every bank.
+
+    Raises:
+        ReaderError: on a folder without a bank, or a damaged one; the latter also when a scan is read.
+    """
+
+    def __init__(self, root: Any) -> None:
+        self.root = Path(root)
+        values = _read_index(self.root / "index.json")
+        self.identity = _checksum({name: value for name, value in values.items() if name != "files"})
+        with _reading(self.root / "index.json", REPAIR):
+            self._sources, self._shards = values["sources"], values["shards"]
+            self.sensor, self.fields = self._sources[0]["sensor"], tuple(self._sources[0]["fields"])
+            self.shape = _shape(self.sensor)
+            self._directions = _directions(self.sensor, self.shape)
+            self._names = [name for name in TYPES if name in {"range", *self.fields}]
+            self._scale = self.sensor["range_max"] / 65535
+            for facts in self._sources:
+                self._check_facts(facts)
+            self._ends = np.cumsum([self._check_entry(entry) for entry in self._shards]).tolist()
+            _require(
+                values["scans"] == self._ends[-1], f"{values['scans']} scans, but the shards have {self._ends[-1]}"
+            )
+        self._open: OrderedDict[int, _Shard] = OrderedDict()
+        self._process = os.getpid()
+
+    def __len__(self) -> int:
+        return int(self._ends[-1])
+
+    def __getitem__(self, number: int) -> Scan:
+        """The returns of ``image(number)`` through the centres of their cells, row by row."""
+        images, (_, entry, position) = self.image(number), self._place(number)
+        seen = images["range"] > 0
+        points = images["range"][seen][:, None] * self._directions[seen]
+        fields = {field: images[field][seen] for field in self._names[1:]}
+        reflectance = fields.get("reflectance", np.zeros(len(points), np.float32))
+        name = f"{self._sources[entry['source']]['model']}/{entry['seed']}/{entry['first'] + position}"
+        return Scan(points, reflectance, fields.get("label"), fields.get("confidence"), name)
+
+    def image(self, number: int) -> dict[str, NDArray[Any]]:
+        """The range image, {name: (rows, columns)}: ``range`` float32 metres, 0 = no return, and the fields."""
+        shard, entry, position = self._place(number)
+        with _reading(f"{self.root / entry['file']}: scan {position}", REPAIR):
+            arrays = self._shard(shard).read(position)
+        # A millionth away from the sensor's limits, as in the package, so that a projection keeps every return.
+        near, far = self.sensor["range_min"] * (1 + 1e-6), self.sensor["range_max"] * (1 - 1e-6)
+        metres = arrays["range"].astype(np.float32) * np.float32(self._scale)
+        inside = np.minimum(np.maximum(metres, np.float32(near)), np.float32(far))
+        decoded = {**arrays, "range": np.where(arrays["range"] > 0, inside, np.float32(0))}
+        for name in set(LEVELS) & set(arrays):
+            decoded[name] = arrays[name].astype(np.float32) / np.float32(LEVELS[name])
+        return decoded
+
+    def verify(self) -> None:
+        """Compare every shard with its SHA-256 in the index; raises ``ReaderError`` on the first that differs."""
+        for entry in self._shards:
+            if hashlib.sha256((self.root / entry["file"]).read_bytes()).hexdigest() != entry["sha256"]:
+                raise ReaderError(f"{self.root / entry['file']} does not match its SHA-256; copy it again")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_open": OrderedDict()}
+
+    def _place(self, number: int) -> tuple[int, dict[str, Any], int]:
+        """The number of a scan's shard, that shard's entry in the index, and the position in its file."""
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"scan {number} of {len(self)}")
+        shard = bisect_right(self._ends, number % len(self))
+        rank = number % len(self) - (self._ends[shard - 1] if shard else 0)
+        dropped = np.asarray(self._shards[shard].get("dropped", ()), np.int64)
+        earlier = np.searchsorted(dropped - np.arange(len(dropped)), rank, side="right")
+        return shard, self._shards[shard], rank + int(earlier)
+
+    def _shard(self, number: int) -> _Shard:
+        if self._process != os.getpid():  # after a fork the parent's open files are left to the parent
+            self._open, self._process = OrderedDict(), os.getpid()
+        if number not in self._open:
+            entry = self._shards[number]
+            self._open[number] = _Shard(self.root, entry, self._sources[entry["source"]], self._names, self.shape)
+            if len(self._open) > 16:
+                self._open.popitem(last=False)[1].file.close()
+        return self._open[number]
+
+    def _check_facts(self, facts: dict[str, Any]) -> None:
+        if facts["format"] != FORMAT:
+            raise ReaderError(f"{self.root} has scans of format {facts['format']!r}; this file reads {FORMAT!r}")
+        if facts["compression"] != "gzip":
+            raise ReaderError(f"{self.root} is compressed by {facts['compression']!r}; bake it with --compression gzip")
+        same = (
+            facts["sensor"] == self.sensor and tuple(facts["fields"]) == self.fields and facts["scale"] == self._scale
+        )
+        _require(same, "several sensors or fields, or a scale that does not fit the sensor")
+        _require(set(self.fields) <= set(TYPES), f"fields {self.fields}")
+
+    def _check_entry(self, entry: dict[str, Any]) -> int:
+        """The number of scans that a shard contributes."""
+        dropped = entry.get("dropped", [])
+        numbers = [entry[key] for key in ("seed", "first", "scans", "source", "bytes")] + dropped
+        _require(all(type(n) is int and 0 <= n < 1 << 64 for n in numbers), f"numbers of {entry['file']!r}")
+        _require(entry["source"] < len(self._sources), f"the source of {entry['file']!r}")
+        _require(re.fullmatch(r"\w[\w.-]*\.h5", entry["file"]), f"the shard {entry['file']!r}")
+        # A scan takes 20 bytes for its seed, index and CRC alone.
+        _require(20 * entry["scans"] <= entry["bytes"], f"{entry['bytes']} bytes cannot hold {entry['scans']} scans")
+        ascending = np.all(np.diff([-1.0, *dropped, entry["scans"]]) > 0)
+        _require(ascending and len(dropped) < entry["scans"], f"dropped scans of {entry['file']!r}")
+        path = self.root / entry["file"]
+        size = path.stat().st_size if path.is_file() else 0
+        _require(size == entry["bytes"], f"{path} is {size} bytes long, not {entry['bytes']}")
+        return int(entry["scans"] - len(dropped))
+
+
+class _Shard:
+    """An open shard. Everything that it declares is checked before memory is allocated for it."""
+
+    def __init__(self, root: Path, entry: dict[str, Any], facts: dict[str, Any], names: list[str], shape: Any) -> None:
+        self.entry, self.names, self.shape = entry, names, shape
+        with _reading(root / entry["file"], REPAIR):
+            self.file = h5py.File(str(root / entry["file"]), "r")
+            self._check_attributes(facts)
+            extra = ["condition"] if "condition" in self.file else []
+            _require(set(self.file) == {*NUMBERS, *names, *extra}, f"it holds {sorted(self.file)[:9]}")
+            self.numbers = {name: np.asarray(self._dataset(name, kind)[:]) for name, kind in NUMBERS.items()}
+            self.conditions = self._dataset("condition", None)[:] if extra else None
+            self.datasets = {name: self._dataset(name, TYPES[name], shape) for name in names}
+
+    def read(self, position: int) -> dict[str, NDArray[Any]]:
+        """The arrays of one scan, checked against its CRC."""
+        arrays = {name: self._inflate(name, position) for name in self.names}
+        seed, index, crc = (int(self.numbers[name][position]) for name in NUMBERS)
+        condition = b"" if self.conditions is None else bytes(self.conditions[position])
+        found = zlib.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
+        for array in arrays.values():
+            found = zlib.crc32(array.tobytes(), found)
+        _require(found == crc, "its CRC does not match")
+        own = (seed, index) == (self.entry["seed"], self.entry["first"] + position)
+        _require(own, f"it is scan {index} of seed {seed}")
+        label, confidence = arrays.get("label", np.zeros(1)), arrays.get("confidence", np.zeros(1))
+        _require(((label <= 18) | (label == IGNORE)).all(), "it has labels above 18")
+        _require((confidence <= LEVELS["confidence"]).all(), "it has confidences above 1")
+        return arrays
+
+    def _inflate(self, name: str, position: int) -> NDArray[Any]:
+        """One chunk, through the inverse of HDF5's filters fletcher32, deflate and shuffle."""
+        place, stored = (position, 0, 0), self.datasets[name].id
+        info = stored.get_chunk_info_by_coord(place)
+        found = info.byte_offset is not None and info.byte_offset + info.size <= self.entry["bytes"]
+        _require(found and not info.filter_mask, f"its {name} is missing")
+        chunk, dtype = stored.read_direct_chunk(place)[1], np.dtype(TYPES[name])
+        size = self.shape[0] * self.shape[1] * dtype.itemsize
+        plain = zlib.decompressobj().decompress(chunk[:-4], size + 1)  # the scan's CRC covers HDF5's own Fletcher-32
+        _require(len(plain) == size, f"its {name} does not hold {size} bytes")
+        planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
+        return np.ascontiguousarray(planes.T).view(dtype).reshape(self.shape)
+
+    def _check_attributes(self, facts: dict[str, Any]) -> None:
+        """The attributes repeat the index: text and numbers as such, everything else as JSON."""
+        expected = {**facts, **{key: self.entry[key] for key in ("seed", "first", "scans")}}
+        _require(set(self.file.attrs) == set(expected), "its attributes are not those of the bank's index")
+        for name, value in expected.items():
+            attribute = self.file.attrs.get_id(name)
+            kind, text = attribute.get_type(), _is_text(attribute.get_type())
+            number = kind.get_class() in (h5py.h5t.INTEGER, h5py.h5t.FLOAT)
+            _require(attribute.shape == () and (text or number) and kind.get_size() <= 1 << 20, f"its attribute {name}")
+            found = self.file.attrs[name]
+            if text:
+                found = found.decode() if isinstance(found, bytes) else str(found)
+                found = found if isinstance(value, str) else json.loads(found)
+            _require(found == value, f"{name} differs from the bank's index")
+
+    def _dataset(self, name: str, kind: str | None, shape: tuple[int, ...] = ()) -> Any:
+        """A dataset of this file: one value (text if ``kind`` is None) for each scan, or chunks of one scan."""
+        link = self.file.id.links.get_info(name.encode()).type
+        _require(link == h5py.h5l.TYPE_HARD, f"{name} is a link to another object")
+        dataset, scans = self.file[name], self.entry["scans"]
+        # This check comes first: reading the shape of a virtual dataset already opens the files behind it.
+        properties, given = dataset.id.get_create_plist(), dataset.id.get_type()
+        layout, outside = properties.get_layout(), properties.get_external_count()
+        _require(layout != h5py.h5d.VIRTUAL and not outside, f"{name} is stored in another file")
+        fits = _is_text(given) if kind is None else given.equal(h5py.h5t.py_create(np.dtype(kind)))
+        _require(fits and dataset.shape == (scans, *shape), f"{name} has another type or shape")
+        filters = tuple(properties.get_filter(i)[0] for i in range(properties.get_nfilters()))
+        contiguous = layout == h5py.h5d.CONTIGUOUS and dataset.id.get_storage_size() == scans * given.get_size()
+        chunked = layout == h5py.h5d.CHUNKED and properties.get_chunk() == (1, *shape) and filters == FILTERS
+        _require(shape or scans * given.get_size() <= self.entry["bytes"], f"{name} is larger than the file")
+        _require(chunked if shape else contiguous, f"{name} is stored in another way, with filters {filters}")
+        return dataset
+
+
+class MixedEpochs:
+    """A map-style dataset of a trainer's real samples and a bank's scans, in the order of a plan.
+
+    The order is already shuffled; a sampler that shuffles again does no harm. ``set_epoch`` reaches the workers of a
+    ``DataLoader``, persistent ones included. The length may differ by one between epochs.
+
+    Args:
+        plan: file of ``python -m lidar_synth.integrations.plan``.
+        real: the trainer's own dataset, or a function: number of a real sample -> sample.
+        bank: the bank with which the plan was made.
+        to_sample: Scan -> sample in the trainer's form; by default the ``Scan``.
+
+    Raises:
+        ReaderError: on a damaged plan, or one of another bank or of another number of real samples.
+    """
+
+    def __init__(self, plan: Any, real: Any, bank: Bank, to_sample: Any = None) -> None:
+        self.plan, self.real, self.bank, self.to_sample = str(plan), real, bank, to_sample
+        with _reading(plan, PLAN):
+            self.settings = json.loads(self._member("settings").tobytes().decode())
+            form, planned = self.settings["format"], self.settings["real"]
+            _require(form == PLAN_FORMAT, f"format {form!r}, expected {PLAN_FORMAT!r}")
+            _require(self.settings["bank"] == bank.identity, f"it was made with another bank than {bank.root}")
+            given = len(real) if hasattr(real, "__len__") else planned
+            _require(given == planned, f"it is for {planned} real samples, but there are {given}")
+        self._epoch = multiprocessing.Value("q", 0)
+        self._loaded = (-1, np.zeros((0, 2), np.int64))
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch, before a ``DataLoader`` begins to iterate; raises ``ReaderError`` after the plan's last."""
+        planned = len(self.settings["lengths"])
+        if not 0 <= epoch < planned:
+            raise ReaderError(f"epoch {epoch} of a plan of {planned} epochs; make it again with more --epochs")
+        self._epoch.value = epoch
+
+    def __len__(self) -> int:
+        return int(self.settings["lengths"][self._epoch.value])
+
+    def __getitem__(self, index: int) -> Any:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        synthetic, number = self._order()[index].tolist()
+        if not synthetic:
+            return self.real[number] if hasattr(self.real, "__getitem__") else self.real(number)
+        scan = self._labelled(self.bank[number])
+        return scan if self.to_sample is None else self.to_sample(scan)
+
+    def domain(self, index: int) -> int:
+        """The domain of the sample at ``index`` in the current epoch: 0 = real, 1 = synthetic."""
+        return int(self._order()[index, 0])
+
+    def _labelled(self, scan: Scan) -> Scan:
+        """The scan with labels by the plan's label policy: ``generated``, ``condition`` or ``none``."""
+        label, confidence, threshold = scan.label, scan.confidence, self.settings["threshold"]
+        if self.settings["labels"] == "none" or label is None:
+            return scan._replace(label=None, confidence=None)
+        if self.settings["labels"] == "condition" or confidence is None:
+            confidence = (label != IGNORE).astype(np.float32)
+        if threshold > 0:
+            label = np.where(confidence >= threshold, label, np.uint8(IGNORE))
+        return scan._replace(label=label, confidence=confidence)
+
+    def _order(self) -> NDArray[Any]:
+        """(N, 2) of the current epoch: whether the sample is synthetic, and its number."""
+        epoch = self._epoch.value
+        if self._loaded[0] != epoch:
+            order = self._member(f"epoch-{epoch}")
+            with _reading(f"{self.plan}: epoch {epoch}", PLAN):
+                _require(order.shape == (len(self), 2) and order.dtype == np.int64, f"{order.shape}, {order.dtype}")
+                lengths = np.array([self.settings["real"], len(self.bank)])[order[:, 0]]
+                _require(((order >= 0).all(1) & (order[:, 1] < lengths)).all(), "samples that do not exist")
+            self._loaded = (epoch, order)
+        return self._loaded[1]
+
+    def _member(self, name: str) -> NDArray[Any]:
+        with _reading(self.plan, PLAN), np.load(self.plan, allow_pickle=False) as file:
+            return np.asarray(file[name])
+
+
+def _read_index(path: Path) -> dict[str, Any]:
+    """The values of ``index.json`` without their checksum, which has to match."""
+    with _reading(path, f"expected the folder of a finished bank. {REPAIR}"):
+        values: dict[str, Any] = json.loads(path.read_bytes().decode())
+        given, form = values.pop("checksum", None), values.get("format")
+        _require(form == FORMAT, f"format {form!r}, expected {FORMAT!r}")
+        _require(given == _checksum(values), "it does not match its checksum: it was damaged or edited")
+    return values
+
+
+def _checksum(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _is_text(kind: Any) -> bool:
+    return bool(kind.get_class() == h5py.h5t.STRING and not kind.is_variable_str())
+
+
+def _shape(sensor: dict[str, Any]) -> tuple[int, int]:
+    """(rows, columns) of a sensor."""
+    rows, columns = len(sensor["elevations"]) if "elevations" in sensor else sensor["rows"], sensor["columns"]
+    whole = type(rows) is int and type(columns) is int and min(rows, columns) >= 2
+    _require(whole and rows * columns <= 1 << 22, f"a sensor of {rows!r} rows and {columns!r} columns")
+    _require(0 <= sensor["range_min"] < sensor["range_max"] < 1e300, "a sensor without limits of its range")
+    return rows, columns
+
+
+def _directions(sensor: dict[str, Any], shape: tuple[int, int]) -> NDArray[Any]:
+    """(rows, columns, 3) float32 unit vectors x, y, z through the centres of the cells."""
+    rows, columns = shape
+    degrees = np.asarray(sensor.get("elevations", ()), np.float64)
+    if not len(degrees):
+        up, down = float(sensor["fov_up"]), float(sensor["fov_down"])
+        degrees = up - (np.arange(rows) + 0.5) / rows * (up - down)
+    _require(degrees.shape == (rows,) and (np.abs(degrees) <= 90).all(), "a sensor with elevations beyond 90 degrees")
+    elevation = np.radians(degrees).astype(np.float32).astype(np.float64)[:, None]
+    azimuth = ((2 * ((np.arange(columns) + 0.5) / columns) - 1) * np.pi).astype(np.float32).astype(np.float64)[None]
+    x, y = np.cos(azimuth) * np.cos(elevation), -np.sin(azimuth) * np.cos(elevation)
+    return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], -1).astype(np.float32)
