@@ -4,9 +4,12 @@ With ``LIDAR_SYNTH_CPU=1`` what a trainer sends to a GPU stays on the CPU. That 
 one trains so.
 """
 
+import logging
 import os
 import runpy
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -41,22 +44,35 @@ def prepare_script(usage: str, *names: str) -> str:
         raise SystemExit(2)
     sys.argv = sys.argv[1:]
     sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
+    say_epochs()
     provide(*names)
     if os.environ.get(CPU) == "1":
         stay_on_cpu()
     return sys.argv[0]
 
 
-def run(script: str) -> None:
-    """Run a script as ``python SCRIPT`` does, with the arguments that are left.
+def say_epochs() -> None:
+    """Print the package's own messages, one line for each epoch's mixture among them."""
+    handler = logging.StreamHandler(sys.stdout)
+    handler.setFormatter(logging.Formatter("lidar_synth: %(message)s"))
+    log = logging.getLogger("lidar_synth")
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
 
-    Raises:
-        SystemExit: with the message, where our part refuses a configuration.
-    """
-    try:
+
+def run(script: str) -> None:
+    """Run a script as ``python SCRIPT`` does, with the arguments that are left."""
+    with plain_errors():
         runpy.run_path(script, run_name="__main__")
+
+
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """End with the message alone, and exit status 1, where this package refuses a configuration."""
+    try:
+        yield
     except LidarSynthError as error:
-        raise SystemExit(f"lidar_synth: {error}") from error
+        raise SystemExit(f"lidar_synth: {error}") from None
 
 
 def stay_on_cpu() -> None:

@@ -70,6 +70,7 @@ def dataset_class(stock: Any) -> Any:
         def set_epoch(self, epoch: int) -> None:
             """Set the epoch, also for workers."""
             self.mixed.set_epoch(epoch)
+            self.mixed.plan()  # logs it
 
         def __len__(self) -> int:
             return len(self.mixed)
