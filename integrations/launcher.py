@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.nn import functional
-
 from lidar_synth.integrations.removed import provide
+from torch.nn import functional
 
 from lidar_synth.errors import LidarSynthError
 

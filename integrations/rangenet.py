@@ -25,7 +25,9 @@ from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry.scan import Scan
 
-USAGE = "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.rangenet train.py ARGUMENTS, in train/tasks/semantic"
+USAGE = (
+    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.rangenet train.py ARGUMENTS, in train/tasks/semantic"
+)
 TRAINER = "tasks.semantic.modules.trainer"
 STRIPES = 0.25
 """Largest difference of ``gaps`` between real and synthetic images; below, the eye sees images of one density."""
@@ -121,10 +123,11 @@ def dataset_class(stock: Any) -> Any:
             fitting = narrower[0] if narrower else "the columns of the synthetic scans"
             raise ConfigError(
                 f"synthetic scans in images of {self.sensor_img_H} x {width}: {fill:.0%} of the cells are filled, and "
-                f"{holes:.0%} of these have an empty cell to the right; in real scans {real_fill:.0%} and {real_gaps:.0%}",
+                f"{holes:.0%} of these have an empty cell to the right; in real scans {real_fill:.0%} and "
+                f"{real_gaps:.0%}",
                 "images of one density: a network tells these apart by the stripes",
-                f"Set dataset.sensor.img_prop.width: {fitting} in the architecture's YAML. Real and synthetic scans are "
-                "then projected to that width, in training, validation and inference.",
+                f"Set dataset.sensor.img_prop.width: {fitting} in the architecture's YAML. Real and synthetic scans "
+                "are then projected to that width, in training, validation and inference.",
             )
 
     return Mixed

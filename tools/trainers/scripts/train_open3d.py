@@ -1,0 +1,16 @@
+"""The documented lines for Open3D-ML, on few points: ``python train_open3d.py SEMANTICKITTI MIX.yaml``."""
+
+import logging
+import sys
+
+import open3d.ml.torch as ml3d
+from lidar_synth.integrations.open3d_ml import dataset_class
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO)
+    dataset = dataset_class()(dataset_path=sys.argv[1], mixture=sys.argv[2])
+    model = ml3d.models.RandLANet(in_channels=4, num_points=4096)
+    pipeline = ml3d.pipelines.SemanticSegmentation(
+        model, dataset=dataset, batch_size=2, val_batch_size=1, max_epoch=1, save_ckpt_freq=1, device="cpu"
+    )
+    pipeline.run_train()
