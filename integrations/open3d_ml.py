@@ -46,7 +46,7 @@ def dataset_class() -> Any:
     ml3d = _library()
     stock = sys.modules[ml3d.datasets.SemanticKITTI.__module__]
     pipeline = sys.modules[ml3d.pipelines.SemanticSegmentation.__module__]
-    pipeline.DataLoader = EpochLoader  # type: ignore[attr-defined]
+    pipeline.DataLoader = _Loader  # type: ignore[attr-defined]
     mixed_split = _split_class(stock)
 
     class MixedSemanticKITTI(stock.SemanticKITTI):  # type: ignore[misc, name-defined]
@@ -114,6 +114,18 @@ def _split_class(stock: Any) -> Any:
             return {"idx": idx, "name": f"synthetic_{number}", "path": "", "split": self.split}
 
     return MixedSplit
+
+
+class _Loader(EpochLoader):
+    """``EpochLoader`` with the pipeline's arguments; its ``worker_init_fn`` overflows 32 bits with numpy 2."""
+
+    def __init__(self, *args: Any, worker_init_fn: Any = None, **options: Any) -> None:
+        super().__init__(*args, worker_init_fn=_seed if worker_init_fn else None, **options)
+
+
+def _seed(worker: int) -> None:
+    """Seed numpy's global generator, from which Open3D-ML draws, differently in each worker and epoch."""
+    np.random.seed(torch.initial_seed() % 2**32)  # noqa: NPY002
 
 
 def _library() -> Any:

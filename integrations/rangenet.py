@@ -204,7 +204,7 @@ def register() -> None:
 
 def main() -> None:
     """Run one of the trainer's scripts; ``train.py`` trains on the mixture."""
-    script = prepare_script(USAGE, "numpy.float", "imp", "tensorflow.summary", "torchvision")
+    script = prepare_script(USAGE, "numpy.float", "imp", "tensorflow.summary", "torchvision", "torch.load")
     import_module("__init__")  # the trainer's own, which its scripts import first: it puts ../.. on the path
     register()
     run(script)

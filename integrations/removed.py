@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import torch
 
 from lidar_synth.errors import LibraryError
 
@@ -126,12 +127,22 @@ def _spconv() -> bool:
     return True
 
 
+def _torch_load() -> bool:
+    """Numpy's numbers in a checkpoint: ``torch.load`` reads them again, and still runs no code."""
+    scalar = np.float64(0).__reduce__()[0]
+    kinds = [type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int32, np.int64)]
+    missing = scalar not in torch.serialization.get_safe_globals()
+    torch.serialization.add_safe_globals([scalar, np.dtype, *kinds])
+    return missing
+
+
 NAMES: dict[str, tuple[str, Callable[[], bool]]] = {
     "numpy.float": ("removed in numpy 1.24", lambda: _numpy("float", float)),
     "numpy.int": ("removed in numpy 1.24", lambda: _numpy("int", int)),
     "imp": ("removed in Python 3.12", _imp),
     "tensorflow.summary": ("of TensorFlow 1, written by TensorBoard", _tensorflow),
     "torchvision": ("imported without use; empty here", _torchvision),
+    "torch.load": ("of numpy's numbers, refused since torch 2.6", _torch_load),
     "spconv": ("of spconv 1, by spconv 2", _spconv),
 }
 """Name: (since when or how, the function that sets it and returns whether it was missing)."""

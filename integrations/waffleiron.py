@@ -2,7 +2,7 @@
 
     cd WaffleIron
     LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.waffleiron launch_train.py \\
-        --dataset semantic_kitti_mixed --path_dataset KITTI --log_path LOG --config configs/WaffleIron-48-256__kitti.yaml
+        --dataset semantic_kitti_mixed --path_dataset KITTI --log_path LOG --config CONFIG.yaml
 
 Its instances for CutMix are extracted from the real scans only; PolarMix then takes partners of both kinds.
 """
