@@ -119,8 +119,8 @@ def _split_class(stock: Any) -> Any:
 class _Loader(EpochLoader):
     """``EpochLoader`` with the pipeline's arguments; its ``worker_init_fn`` overflows 32 bits with numpy 2."""
 
-    def __init__(self, *args: Any, worker_init_fn: Any = None, **options: Any) -> None:
-        super().__init__(*args, worker_init_fn=_seed if worker_init_fn else None, **options)
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options | ({"worker_init_fn": _seed} if options.get("worker_init_fn") else {}))
 
 
 def _seed(worker: int) -> None:

@@ -167,6 +167,7 @@ def test_missing_and_unlabelled_mixtures_are_refused(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> None:
     """The stock network on a small grid: ``train_cylinder_asym.py`` as a user types it, with validation."""
     for library in ("spconv", "torch_scatter", "strictyaml"):

@@ -122,6 +122,7 @@ def configure(made: Path, out: Path, last: int) -> list[str | Path]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_its_own_script_trains_and_resumes_from_our_launcher(made: Path, tmp_path: Path, mixed: Any) -> None:
     """``launch_train.py`` as a user types it, with validation; the resumed run sees the samples of its epoch."""
     for number, more in enumerate(([], ["--restart"])):
