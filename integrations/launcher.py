@@ -89,7 +89,10 @@ def stay_on_cpu() -> None:
     for (owner, name), new in changed.items():
         setattr(owner, name, new)
     if "spconv.pytorch" in sys.modules:
-        sys.modules["spconv.pytorch"].ops.get_current_stream = lambda: 0  # a CPU has no stream
+        sparse = sys.modules["spconv.pytorch"]
+        sparse.ops.get_current_stream = lambda: 0  # a CPU has no stream
+        layer = sparse.conv.SparseConvolution
+        layer._conv_forward = _bias_after(layer._conv_forward)
 
 
 def _on_gpu(device: Any) -> bool:
@@ -100,6 +103,16 @@ def _int64(loss: Any) -> Any:
     @wraps(loss)
     def changed(values: Any, target: Any, *args: Any, **options: Any) -> Any:
         return loss(values, target.long(), *args, **options)
+
+    return changed
+
+
+def _bias_after(forward: Any) -> Any:
+    """spconv adds a bias after the convolution in training, and within it, which needs a GPU, in evaluation."""
+
+    @wraps(forward)
+    def changed(self: Any, training: bool, *args: Any, **options: Any) -> Any:
+        return forward(self, True, *args, **options)
 
     return changed
 

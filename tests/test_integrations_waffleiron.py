@@ -115,7 +115,7 @@ def configure(made: Path, out: Path, last: int) -> list[str | Path]:
     config = CONFIG | {"dataloader": {"batch_size": BATCH, "num_workers": 1, "max_points": 2000}}
     config["waffleiron"] = config["waffleiron"] | {"depth": 3, "nb_channels": 16}
     config["augmentations"] = config["augmentations"] | {"instance_cutmix": False}
-    config["scheduler"] = config["scheduler"] | {"max_epoch": last, "epoch_warmup": 1}
+    config["scheduler"] = config["scheduler"] | {"max_epoch": last, "epoch_warmup": 0.5}
     (out / "config.yaml").write_text(yaml.safe_dump(config))
     arguments = ["launch_train.py", "--dataset", NAME, "--path_dataset", made / "sk", "--gpu", "0"]
     return [*arguments, "--config", out / "config.yaml", "--log_path", out / "log"]

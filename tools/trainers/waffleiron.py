@@ -26,7 +26,7 @@ def rows(trial: Trial) -> Iterator[Row]:
 
     def train(log: str, epochs: int, *more: str) -> str:
         config = trial.folder / f"{log}-{epochs}.yaml"
-        own["scheduler"] |= {"max_epoch": epochs, "epoch_warmup": 1}
+        own["scheduler"] |= {"max_epoch": epochs, "epoch_warmup": 0.5}
         config.write_text(yaml.safe_dump(own))
         command = [python, "-m", "lidar_synth.integrations.waffleiron", "launch_train.py", "--dataset", NAME]
         files = ["--path_dataset", dataset, "--config", config, "--log_path", trial.folder / log, "--gpu", "0"]
