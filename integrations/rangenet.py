@@ -200,6 +200,22 @@ def register() -> None:
 
     module.imp = SimpleNamespace(load_source=load_source)  # type: ignore[attr-defined]
     module.Trainer.train_epoch = train_epoch
+    _plain_state(module.warmupLR)
+
+
+def _plain_state(scheduler: Any) -> None:
+    """Checkpoints hold numbers of the inner scheduler, not the object, which ``torch.load`` refuses since 2.6."""
+    state_dict, load_state_dict = scheduler.state_dict, scheduler.load_state_dict
+
+    def plain(self: Any) -> dict[str, Any]:
+        inner: dict[str, Any] = self.initial_scheduler.state_dict()
+        return state_dict(self) | {"initial_scheduler": inner}
+
+    def load(self: Any, state: dict[str, Any]) -> None:
+        self.initial_scheduler.load_state_dict(state["initial_scheduler"])
+        load_state_dict(self, state | {"initial_scheduler": self.initial_scheduler})
+
+    scheduler.state_dict, scheduler.load_state_dict = plain, load
 
 
 def main() -> None:

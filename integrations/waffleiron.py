@@ -24,6 +24,7 @@ from lidar_synth.integrations.mixture import (
     refuse_unlabelled,
     require_ids,
 )
+from lidar_synth.integrations.removed import provide
 
 from lidar_synth.errors import LibraryError
 from lidar_synth.geometry.scan import Scan
@@ -116,7 +117,7 @@ def main() -> None:
     The script is imported, not run as a file: so the processes of ``--multiprocessing-distributed`` import this module,
     and register the dataset as well.
     """
-    script = prepare_script(USAGE)
+    script = prepare_script(USAGE, "torch.load")
     with plain_errors():
         register()
         training = import_module(Path(script).stem)
@@ -127,4 +128,5 @@ def main() -> None:
 if __name__ == "__main__":
     main()
 elif __name__ == "__mp_main__":
+    provide("torch.load")
     register()
