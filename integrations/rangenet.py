@@ -208,8 +208,8 @@ def _plain_state(scheduler: Any) -> None:
     state_dict, load_state_dict = scheduler.state_dict, scheduler.load_state_dict
 
     def plain(self: Any) -> dict[str, Any]:
-        inner: dict[str, Any] = self.initial_scheduler.state_dict()
-        return state_dict(self) | {"initial_scheduler": inner}
+        state: dict[str, Any] = state_dict(self)
+        return state | {"initial_scheduler": self.initial_scheduler.state_dict()}
 
     def load(self: Any, state: dict[str, Any]) -> None:
         self.initial_scheduler.load_state_dict(state["initial_scheduler"])
