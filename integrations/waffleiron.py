@@ -7,6 +7,7 @@
 Its instances for CutMix are extracted from the real scans only; PolarMix then takes partners of both kinds.
 """
 
+import os
 from copy import copy
 from functools import cache, wraps
 from importlib import import_module
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.launcher import plain_errors, prepare_script
+from lidar_synth.integrations.launcher import CPU, plain_errors, prepare_script
 from lidar_synth.integrations.mixture import (
     class_ids,
     id_table,
@@ -107,7 +108,18 @@ def register() -> Any:
             dataset.set_epoch(self.current_epoch)
         return train(self, training)
 
-    datasets.LIST_DATASETS[NAME], manager.one_epoch = Mixed, one_epoch
+    load = manager.load_state
+
+    @wraps(load)
+    def load_state(self: Any, *args: Any, **options: Any) -> None:
+        try:
+            load(self, *args, **options)
+        except RuntimeError as error:  # its last line, when all is loaded, names a GPU; a CPU has none
+            if os.environ.get(CPU) != "1" or "accelerator device" not in str(error):
+                raise
+
+    datasets.LIST_DATASETS[NAME] = Mixed
+    manager.one_epoch, manager.load_state = one_epoch, load_state
     return Mixed
 
 
