@@ -5,16 +5,15 @@
         --config_path config/mixed.yaml
 
 with ``pc_dataset_type: "SemKITTI_mixed"`` in that configuration. Cylinder3D rotates points in place, so that every
-sample is a copy. It does not call ``set_epoch``, so that the launcher replaces its loader by one that does.
+sample is a copy. It does not call ``set_epoch``, so that the launcher replaces its loader by one that does. It counts
+epochs from 0 also when it starts from saved weights.
 """
 
-import runpy
-import sys
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lidar_synth.integrations.launcher import prepare_script, run
 from lidar_synth.integrations.mixture import (
     EpochLoader,
     class_ids,
@@ -30,6 +29,7 @@ from lidar_synth.errors import LibraryError
 from lidar_synth.geometry.scan import Scan
 
 NAME = "SemKITTI_mixed"
+USAGE = "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py ARGUMENTS"
 _IDS = id_table(1, 0, np.uint8)
 
 
@@ -63,6 +63,7 @@ def register() -> Any:
             """Set the epoch, also for workers."""
             if self.mixed is not None:
                 self.mixed.set_epoch(epoch)
+                self.mixed.plan()  # logs it
 
         def __len__(self) -> int:
             return super().__len__() if self.mixed is None else len(self.mixed)
@@ -82,15 +83,10 @@ def main() -> None:
     """Run Cylinder3D's training script with the dataset registered."""
     import torch.utils.data
 
-    if len(sys.argv) < 2 or not Path(sys.argv[1]).is_file():
-        raise SystemExit(
-            "usage, in Cylinder3D: python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py ARGUMENTS"
-        )
-    sys.argv = sys.argv[1:]
-    sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
+    script = prepare_script(USAGE, "numpy.int", "spconv")
     register()
     torch.utils.data.DataLoader = EpochLoader  # type: ignore[misc]
-    runpy.run_path(sys.argv[0], run_name="__main__")
+    run(script)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,21 @@
 """Open3D-ML: SemanticKITTI with synthetic scans in its training split::
 
-    from lidar_synth.integrations.open3d_ml import dataset_class, tell_epochs
-    tell_epochs()
+    import open3d.ml.torch as ml3d
+    from lidar_synth.integrations.open3d_ml import dataset_class
     dataset = dataset_class()(dataset_path="/data/SemanticKitti", mixture={"synthetic": "bank/", "ratio": 0.25})
     pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, ...)
 
 Its cache identifies samples by name and would keep the synthetic scans of one epoch for ever: ``use_cache`` is refused.
 """
 
+import sys
 from functools import cache
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import torch
 from lidar_synth.integrations.mixture import (
     EpochLoader,
     class_ids,
@@ -31,22 +34,19 @@ _IDS = id_table(1, 0, np.int32)
 
 
 @cache
-def dataset_class(package: str = "open3d.ml.datasets") -> Any:
+def dataset_class() -> Any:
     """The class ``MixedSemanticKITTI``, registered with Open3D-ML under that name.
 
-    Args:
-        package: the module of its datasets: that in Open3D, or ``"ml3d.datasets"`` in a checkout of Open3D-ML.
+    Open3D-ML's segmentation pipeline sets the epoch of its training split from then on. With ``OPEN3D_ML_ROOT`` set,
+    Open3D takes its ML part from that checkout.
 
     Raises:
-        LibraryError: if it cannot be imported.
+        LibraryError: if Open3D's ML part cannot be imported.
     """
-    try:
-        stock = import_module(f"{package}.semantickitti")
-    except ImportError as error:
-        raise LibraryError(
-            f"{package} cannot be imported ({error})", "Open3D with its ML part", "pip install open3d"
-        ) from error
-
+    ml3d = _library()
+    stock = sys.modules[ml3d.datasets.SemanticKITTI.__module__]
+    pipeline = sys.modules[ml3d.pipelines.SemanticSegmentation.__module__]
+    pipeline.DataLoader = _Loader  # type: ignore[attr-defined]
     mixed_split = _split_class(stock)
 
     class MixedSemanticKITTI(stock.SemanticKITTI):  # type: ignore[misc, name-defined]
@@ -91,6 +91,7 @@ def _split_class(stock: Any) -> Any:
         def set_epoch(self, epoch: int) -> None:
             """Set the epoch, also for workers."""
             self.mixed.set_epoch(epoch)
+            self.mixed.plan()  # logs it
 
         def __len__(self) -> int:
             return len(self.mixed)
@@ -115,19 +116,32 @@ def _split_class(stock: Any) -> Any:
     return MixedSplit
 
 
-def tell_epochs(pipeline: str = "open3d.ml.torch.pipelines") -> None:
-    """Make Open3D-ML's segmentation pipeline set the epoch of its training split.
+class _Loader(EpochLoader):
+    """``EpochLoader`` with the pipeline's arguments; its ``worker_init_fn`` overflows 32 bits with numpy 2."""
 
-    Args:
-        pipeline: the module of its pipelines; ``"ml3d.torch.pipelines"`` in a checkout.
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options | ({"worker_init_fn": _seed} if options.get("worker_init_fn") else {}))
 
-    Raises:
-        LibraryError: if they cannot be imported.
-    """
+
+def _seed(worker: int) -> None:
+    """Seed numpy's global generator, from which Open3D-ML draws, differently in each worker and epoch."""
+    np.random.seed(torch.initial_seed() % 2**32)  # noqa: NPY002
+
+
+def _library() -> Any:
+    """``open3d.ml.torch``, or an error that says which of its parts is missing."""
     try:
-        module = import_module(f"{pipeline}.semantic_segmentation")
-    except ImportError as error:
+        ml3d = import_module("open3d.ml.torch")
+        return SimpleNamespace(datasets=ml3d.datasets, pipelines=ml3d.pipelines)  # they are imported when first used
+    except (ImportError, OSError, RuntimeError) as error:
+        if isinstance(error, ImportError):
+            hint = "pip install 'open3d[ml]'; lidar-synth doctor lists the system libraries that it needs."
+        elif isinstance(error, RuntimeError):
+            hint = "Each release of Open3D has operators for one release of torch: install that one."
+        else:
+            hint = "Open3D's operators for CUDA do not load with a torch for CPUs: pip install 'open3d-cpu[ml]'."
         raise LibraryError(
-            f"{pipeline} cannot be imported ({error})", "Open3D with its ML part", "pip install open3d"
+            f"open3d.ml.torch cannot be imported with torch {torch.__version__} ({error})",
+            "Open3D with its ML part, built for this torch",
+            hint,
         ) from error
-    module.DataLoader = EpochLoader  # type: ignore[attr-defined]

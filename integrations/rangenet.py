@@ -1,55 +1,60 @@
-"""RangeNet++ (lidar-bonnetal) and SalsaNext: a ``parser.py`` that they load by the name in their data configuration::
+"""RangeNet++ (lidar-bonnetal) and SalsaNext: a launcher that runs their own training script on a mixture::
 
-    python -m lidar_synth.integrations.rangenet mix.yaml train/tasks/semantic/dataset/mixed
+    cd train/tasks/semantic
+    LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.rangenet train.py -d DATASET -ac ARCH.yaml ...
 
-writes that folder with two lines that name the settings; ``name: "mixed"`` in the data YAML selects it. The trainer's
-own parser reads every scan: a synthetic one is passed through a temporary file in memory (``/dev/shm`` on Linux).
+The trainer's own parser reads every scan: a synthetic one is passed through a temporary file in memory (``/dev/shm`` on
+Linux). Validation, and scripts other than ``train.py``, see only real scans.
 """
 
-import sys
 import tempfile
-from functools import cache
+from functools import cache, wraps
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.mixture import (
-    EpochLoader,
-    class_ids,
-    id_table,
-    mix,
-    points_of,
-    read_settings,
-    refuse_unlabelled,
-)
+from lidar_synth.integrations.launcher import prepare_script, run
+from lidar_synth.integrations.mixture import class_ids, id_table, mix, points_of, read_settings, refuse_unlabelled
+from numpy.typing import NDArray
+from torch.utils.data import DataLoader
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.files.disk import write_file
 from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry.scan import Scan
 
-STOCK = "tasks.semantic.dataset.kitti.parser"
+USAGE = (
+    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.rangenet train.py ARGUMENTS, in train/tasks/semantic"
+)
+TRAINER = "tasks.semantic.modules.trainer"
+STRIPES = 0.25
+"""Largest difference of ``gaps`` between real and synthetic images; below, the eye sees images of one density."""
+
 _TRAIN_IDS = id_table(0, 255, np.uint8)
 _MEMORY = next((str(folder) for folder in (Path("/dev/shm"),) if folder.is_dir()), None)
 
 
+def filled(mask: NDArray[Any]) -> float:
+    """Share of an image's cells that have a return; ``mask`` (H, W) bool."""
+    return float(mask.mean())
+
+
+def gaps(mask: NDArray[Any]) -> float:
+    """Share of the filled cells whose right neighbour is empty: near 1 for vertical stripes; ``mask`` (H, W) bool."""
+    return float((mask & ~np.roll(mask, -1, 1)).sum() / max(mask.sum(), 1))
+
+
 @cache
-def dataset_class() -> Any:
+def dataset_class(stock: Any) -> Any:
     """Make a subclass of the trainer's ``SemanticKitti`` that mixes real and synthetic scans.
 
-    Raises:
-        LibraryError: if the trainer's own parser cannot be imported.
+    Args:
+        stock: the module of the trainer's parser.
     """
-    try:
-        stock = import_module(STOCK)
-    except ImportError as error:
-        raise LibraryError(
-            f"{STOCK} cannot be imported ({error})", "the trainer's train folder on the path", "cd train/tasks/semantic"
-        ) from error
 
-    class Mixed(stock.SemanticKitti):  # type: ignore[misc, name-defined]
+    class Mixed(stock.SemanticKitti):  # type: ignore[misc]
         """The trainer's dataset, mixed with synthetic scans."""
 
         scan_files: Any
@@ -62,10 +67,12 @@ def dataset_class() -> Any:
                 raise ConfigError("a mixture without labels (gt=False)", "gt=True, for training")
             _check_classes(self.learning_map, self.learning_map_inv)
             self.mixed = mix(len(self.scan_files), settings, lambda scan, rng: scan)
+            self._check_stripes()
 
         def set_epoch(self, epoch: int) -> None:
             """Set the epoch, also for workers."""
             self.mixed.set_epoch(epoch)
+            self.mixed.plan()  # logs it
 
         def __len__(self) -> int:
             return len(self.mixed)
@@ -88,19 +95,60 @@ def dataset_class() -> Any:
                 finally:
                     self.scan_files, self.label_files = files
 
+        def image(self, source: Scan | str, width: int) -> NDArray[Any]:
+            """(H, width) bool, the filled cells of the trainer's own projection of a scan or file."""
+            scan = stock.LaserScan(True, self.sensor_img_H, width, self.sensor_fov_up, self.sensor_fov_down)
+            if isinstance(source, Scan):
+                scan.set_points(source.points, source.reflectance)
+            else:
+                scan.open_scan(source)
+            mask: NDArray[Any] = scan.proj_range >= 0
+            return mask
+
+        def _check_stripes(self) -> None:
+            """Refuse a width at which synthetic images have stripes of empty columns and real ones do not."""
+            synthetic = [self.mixed[int(i)] for i in np.flatnonzero(self.mixed.plan().domain)[:3]]
+            real = list(self.scan_files[:3])
+            if not (synthetic and real):
+                return
+
+            def measure(width: int) -> list[tuple[float, float]]:
+                kinds = [[self.image(source, width) for source in sources] for sources in (real, synthetic)]
+                return [(float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)]))) for k in kinds]
+
+            (real_fill, real_gaps), (fill, holes) = measure(width := self.sensor_img_W)
+            if holes - real_gaps <= STRIPES:
+                return
+            narrower = [w for w in (width // 2, width // 4, width // 8) if (m := measure(w))[1][1] - m[0][1] <= STRIPES]
+            fitting = narrower[0] if narrower else "the columns of the synthetic scans"
+            raise ConfigError(
+                f"synthetic scans in images of {self.sensor_img_H} x {width}: {fill:.0%} of the cells are filled, and "
+                f"{holes:.0%} of these have an empty cell to the right; in real scans {real_fill:.0%} and "
+                f"{real_gaps:.0%}",
+                "images of one density: a network tells these apart by the stripes",
+                f"Set dataset.sensor.img_prop.width: {fitting} in the architecture's YAML. Real and synthetic scans "
+                "are then projected to that width, in training, validation and inference.",
+            )
+
     return Mixed
 
 
-def make_parser(settings: Any) -> Any:
-    """Make the class ``Parser`` for a ``parser.py``: the trainer's own, with a mixed training set.
+def make_parser(stock: Any, settings: Any = None) -> Any:
+    """Make the class ``Parser`` of a trainer with a mixed training set.
 
     Args:
-        settings: settings of the mixture, or a YAML file of them.
-    """
-    settings = read_settings(settings)
-    stock = import_module(STOCK)
+        stock: the module of the trainer's own parser.
+        settings: settings of the mixture, or a YAML file of them; by default the file in ``LIDAR_SYNTH_MIX``.
 
-    class Parser(stock.Parser):  # type: ignore[misc, name-defined]
+    Raises:
+        LibraryError: if the module is not a parser of these trainers.
+    """
+    missing = [name for name in ("Parser", "SemanticKitti", "LaserScan") if not hasattr(stock, name)]
+    if missing:
+        raise LibraryError(f"a parser.py without {missing}", "the parser of lidar-bonnetal or SalsaNext")
+    settings = read_settings(settings)
+
+    class Parser(stock.Parser):  # type: ignore[misc]
         """The trainer's parser; validation and test are its own."""
 
         train_dataset: Any
@@ -116,13 +164,66 @@ def make_parser(settings: Any) -> Any:
             }
             if hasattr(own, "transform"):  # SalsaNext's
                 arguments["transform"] = own.transform
-            self.train_dataset = dataset_class()(settings, self.root, self.train_sequences, **arguments)
-            self.trainloader = EpochLoader(
+            self.train_dataset = dataset_class(stock)(settings, self.root, self.train_sequences, **arguments)
+            self.trainloader = DataLoader(
                 self.train_dataset, batch_size=self.batch_size, shuffle=self.shuffle_train, num_workers=self.workers,
                 pin_memory=loader.pin_memory, drop_last=True, collate_fn=loader.collate_fn,
             )  # fmt: skip
 
     return Parser
+
+
+def register() -> None:
+    """Make the trainer load a mixed parser and set the epoch of its training set, also when it resumes.
+
+    Raises:
+        LibraryError: if the trainer's code cannot be imported, or is not that of RangeNet++ or SalsaNext.
+    """
+    try:
+        module = import_module(TRAINER)
+    except ImportError as error:
+        raise LibraryError(
+            f"{TRAINER} cannot be imported ({error})", "a trainer with all that it imports", "cd train/tasks/semantic"
+        ) from error
+    if not (hasattr(module, "imp") and hasattr(module.Trainer, "train_epoch")):
+        raise LibraryError(f"{module.__file__} without imp or Trainer.train_epoch", "lidar-bonnetal or SalsaNext")
+    load, train = module.imp.load_source, module.Trainer.train_epoch
+
+    def load_source(name: str, path: str) -> Any:
+        loaded = load(name, path)
+        return SimpleNamespace(Parser=make_parser(loaded)) if name == "parserModule" else loaded
+
+    @wraps(train)
+    def train_epoch(self: Any, train_loader: Any, *args: Any, epoch: int, **options: Any) -> Any:
+        train_loader.dataset.set_epoch(epoch)
+        return train(self, train_loader, *args, epoch=epoch, **options)
+
+    module.imp = SimpleNamespace(load_source=load_source)  # type: ignore[attr-defined]
+    module.Trainer.train_epoch = train_epoch
+    _plain_state(module.warmupLR)
+
+
+def _plain_state(scheduler: Any) -> None:
+    """Checkpoints hold numbers of the inner scheduler, not the object, which ``torch.load`` refuses since 2.6."""
+    state_dict, load_state_dict = scheduler.state_dict, scheduler.load_state_dict
+
+    def plain(self: Any) -> dict[str, Any]:
+        state: dict[str, Any] = state_dict(self)
+        return state | {"initial_scheduler": self.initial_scheduler.state_dict()}
+
+    def load(self: Any, state: dict[str, Any]) -> None:
+        self.initial_scheduler.load_state_dict(state["initial_scheduler"])
+        load_state_dict(self, state | {"initial_scheduler": self.initial_scheduler})
+
+    scheduler.state_dict, scheduler.load_state_dict = plain, load
+
+
+def main() -> None:
+    """Run one of the trainer's scripts; ``train.py`` trains on the mixture."""
+    script = prepare_script(USAGE, "numpy.float", "imp", "tensorflow.summary", "torchvision", "torch.load")
+    import_module("__init__")  # the trainer's own, which its scripts import first: it puts ../.. on the path
+    register()
+    run(script)
 
 
 def _write(folder: Path, scan: Scan) -> tuple[str, str]:
@@ -148,20 +249,5 @@ def _check_classes(learning_map: dict[int, int], inverse: dict[int, int]) -> Non
         )
 
 
-def write_parser(settings: str | Path, folder: str | Path) -> Path:
-    """Write a folder with the ``parser.py`` that the trainers load by name.
-
-    Raises:
-        ConfigError, FileError: if the settings cannot be read, or the folder not be written.
-    """
-    read_settings(settings)
-    path = Path(folder) / "parser.py"
-    text = "from lidar_synth.integrations.rangenet import make_parser\n\n"
-    write_file(path, f"{text}Parser = make_parser({str(Path(settings).resolve())!r})\n".encode())
-    return path
-
-
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
-        raise SystemExit("usage: python -m lidar_synth.integrations.rangenet MIX.yaml FOLDER")
-    print(write_parser(sys.argv[1], sys.argv[2]))
+    main()

@@ -1,27 +1,22 @@
-# ruff: noqa: E402, NPY001 - imports wait for their folder; Cylinder3D is of numpy's older days
+# ruff: noqa: E402 - imports wait for their folder
 """Runs a trainer's own training script through our launcher, as a user types it, on a machine without a GPU::
 
     cd OpenPCDet/tools; python /path/to/tests/launch.py openpcdet train.py --cfg_file ...
-    cd Cylinder3D; python /path/to/tests/launch.py cylinder3d train_cylinder_asym.py --config_path ...
 
-What those trainers compile for CUDA is stood in for by ``checkouts`` and ``dense_spconv``, and what they send to a GPU
-stays where it is; everything else is their own code. Prints what each batch (OpenPCDet) or each epoch (Cylinder3D) is
-made of.
+What it compiles for CUDA is stood in for by ``checkouts``, and what it sends to a GPU stays where it is; everything
+else is its own code. Prints what each batch is made of.
 """
 
 import sys
-import time
 from collections import Counter
 from functools import wraps
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-import yaml
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent / "tools" / "stand_ins")]
-from checkouts import openpcdet_stand_ins, stand_in
+from checkouts import openpcdet_stand_ins
 
 
 def without_gpu() -> None:
@@ -64,40 +59,7 @@ def openpcdet() -> None:
     main()
 
 
-class Document(dict[str, Any]):
-    """``strictyaml``'s: a configuration that is not held against its schema."""
-
-    def __init__(self, text: str, schema: Any = None) -> None:
-        super().__init__(yaml.safe_load(text))
-        self.data = self
-
-
-def cylinder3d() -> None:
-    """Cylinder3D's ``train_cylinder_asym.py``."""
-    sys.path.insert(0, str(Path(sys.argv[1]).resolve().parent))
-    np.int = int  # type: ignore[attr-defined]
-    schema = dict.fromkeys(("Map", "Seq", "Bool", "Int", "Float", "Str"), lambda *parts: None)
-    stand_in("strictyaml", load=Document, **schema)
-    import dense_spconv
-
-    sys.modules.setdefault("spconv", dense_spconv)
-    wait = time.sleep
-    time.sleep = lambda seconds: wait(min(seconds, 0.1))  # it waits ten seconds before each epoch
-    from lidar_synth.integrations.cylinder3d import main, register
-
-    mixed = register()
-    tell = mixed.set_epoch
-
-    def told(self: Any, epoch: int) -> None:
-        tell(self, epoch)
-        if self.mixed is not None:
-            print(f"epoch {epoch} of {dict(Counter(self.mixed.domain(i) for i in range(len(self))))}", flush=True)
-
-    mixed.set_epoch = told
-    main()
-
-
 if __name__ == "__main__":
-    trainer = {"openpcdet": openpcdet, "cylinder3d": cylinder3d}[sys.argv.pop(1)]
+    trainer = {"openpcdet": openpcdet}[sys.argv.pop(1)]
     without_gpu()
     trainer()

@@ -1,35 +1,29 @@
-# ruff: noqa: E402 - imports wait for what they need
-"""Open3D-ML's own dataset and loader code on mixed scans: OPEN3D_ML_ROOT is a checkout."""
+"""Open3D's own ML part, as it is installed, on mixed scans: dataset, loader, and its pipeline with RandLANet."""
 
-import sys
-from collections import Counter, defaultdict
+import logging
+from collections import Counter
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from checkouts import bare_package, checkout, stand_in
-from streets import semantic_kitti, synthetic
-
-ROOT = checkout("OPEN3D_ML_ROOT", "Open3D-ML")
-for library in ("sklearn", "addict"):
-    pytest.importorskip(library, reason=f"{library} is not installed")
-sys.path.append(str(ROOT))
-stand_in("open3d", _build_config=defaultdict(bool))
-for name in ("open3d.core", "open3d.ml", "open3d.ml.contrib"):
-    stand_in(name)
-bare_package("ml3d.torch", ROOT / "ml3d" / "torch")
-bare_package("ml3d.torch.dataloaders", ROOT / "ml3d" / "torch" / "dataloaders")
-bare_package("ml3d.datasets", ROOT / "ml3d" / "datasets")
-
+import torch
+from launched import epochs
+from lidar_synth.integrations.launcher import say_epochs
 from lidar_synth.integrations.mixture import EpochLoader
-from lidar_synth.integrations.open3d_ml import dataset_class, tell_epochs
-from ml3d.datasets.samplers import SemSegRandomSampler
-from ml3d.datasets.semantickitti import SemanticKITTI
-from ml3d.torch.dataloaders.torch_dataloader import TorchDataloader
+from lidar_synth.integrations.open3d_ml import dataset_class
+from streets import semantic_kitti, synthetic
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.formats import open_scans
+
+try:
+    dataset_class()
+except LibraryError as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+import open3d.ml.torch as ml3d
 
 REAL, EXTRA = 6, 4
 
@@ -49,19 +43,18 @@ def make(root: Path) -> Path:
 def build(made: Path, **options: Any) -> Any:
     mixture = {"synthetic": str(made / "synthetic"), "ratio": 0.4, "seed": 3}
     given = {"mixture": mixture, "training_split": ["00"], "validation_split": ["00"]} | options
-    return dataset_class("ml3d.datasets")(str(made / "sk"), **given)
+    return dataset_class()(str(made / "sk"), **given)
 
 
 def both(made: Path) -> tuple[Any, Any]:
     """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
-    own = SemanticKITTI(str(made / "sk"), training_split=["00"])
+    own = ml3d.datasets.SemanticKITTI(str(made / "sk"), training_split=["00"])
     return own.get_split("training"), build(made).get_split("training")
 
 
 def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
-    assert SemSegRandomSampler is not None
     split, seen = build(made).get_split("training"), []
-    data = TorchDataloader(dataset=split, use_cache=False)
+    data = ml3d.dataloaders.TorchDataloader(dataset=split, use_cache=False)
     loader = EpochLoader(data, batch_size=2, shuffle=True, num_workers=2, persistent_workers=True, collate_fn=list)
     for epoch in (0, 1):
         names = [sample["attr"]["name"] for batch in loader for sample in batch]
@@ -105,13 +98,57 @@ def test_unlabelled_scans_are_refused(made: Path, tmp_path: Path) -> None:
         build(made, mixture={"synthetic": bare, "labels": "none"})
 
 
-def test_the_pipeline_tells_the_epoch() -> None:
-    stand_in("ml3d.torch.pipelines")
-    pipeline = stand_in("ml3d.torch.pipelines.semantic_segmentation")  # which needs Open3D and its models
-    tell_epochs("ml3d.torch.pipelines")
-    assert pipeline.DataLoader is EpochLoader
-    with pytest.raises(LibraryError, match="nowhere cannot be imported"):
-        tell_epochs("nowhere")
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_its_pipeline_trains_and_validates(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The documented lines: stock RandLANet with fewer points, two epochs, validation after each."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(logging.getLogger("lidar_synth"), "handlers", [])
+    say_epochs()
+    dataset = build(made)
+    resources = Path(import_module(ml3d.datasets.SemanticKITTI.__module__).__file__ or "").parent.parent
+    config = import_module("open3d.ml.utils").Config.load_from_file(
+        str(resources / "configs/randlanet_semantickitti.yml")
+    )
+    model = ml3d.models.RandLANet(**config.model | {"in_channels": 4, "num_points": 4096})
+    own = config.pipeline | {"max_epoch": 1, "save_ckpt_freq": 1, "batch_size": 2, "device": "cpu"}
+    pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, **own)
+    seen: list[list[float]] = []
+    log = pipeline.save_logs
+    monkeypatch.setattr(
+        pipeline, "save_logs", lambda *a: (seen.append([*pipeline.losses, *pipeline.valid_losses]), log(*a))
+    )
+    pipeline.run_train()
+    plan = dataset.get_split("training").mixed.plan
+    said = epochs(capsys.readouterr().out)[:2]
+    assert said == [(e, REAL + EXTRA, EXTRA, plan(e).hash[:16]) for e in (0, 1)]
+    assert [len(losses) for losses in seen] == [(REAL + EXTRA) // 2 + REAL // 2] * 2 and np.isfinite(seen).all()
+    assert list(tmp_path.rglob("ckpt_00001.pth"))
+
+
+ERRORS = {
+    "another torch": (RuntimeError("Version mismatch: Open3D needs PyTorch version 1.8.*"), "one release of torch"),
+    "CUDA's operators": (
+        OSError("Could not load this library: open3d_torch_ops.so"),
+        r"pip install 'open3d-cpu\[ml\]'",
+    ),
+    "no ML part": (ImportError("Open3D-ML requires the 'addict' package"), r"pip install 'open3d\[ml\]'"),
+}
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_a_library_that_cannot_be_used_is_explained(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What ``open3d.ml.torch`` raised in environments with these faults."""
+    error, hint = ERRORS[name]
+
+    def broken(name: str) -> Any:
+        raise error
+
+    monkeypatch.setattr("lidar_synth.integrations.open3d_ml.import_module", broken)
+    with pytest.raises(LibraryError, match=f"torch {torch.__version__.split('+')[0]}.*{hint}"):
+        dataset_class.__wrapped__()
 
 
 def test_validation_is_the_trainers_own(made: Path) -> None:

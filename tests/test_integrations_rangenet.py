@@ -1,31 +1,36 @@
-# ruff: noqa: E402, NPY001, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
-"""RangeNet++'s or SalsaNext's own parser on mixed scans: RANGENET_ROOT is a checkout of lidar-bonnetal or SalsaNext."""
+# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
+"""RangeNet++'s or SalsaNext's own parser and script on mixed scans: RANGENET_ROOT is a checkout of either."""
 
+import os
 import random
+import re
 import sys
 from collections import Counter
-from importlib.util import module_from_spec, spec_from_file_location
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import yaml
-from checkouts import checkout, stand_in
-from streets import semantic_kitti, synthetic
+from checkouts import checkout
+from launched import clone, epochs, launched
+from lidar_synth.integrations.removed import provide
+from streets import SENSOR, semantic_kitti, synthetic
 
 ROOT = checkout("RANGENET_ROOT", "lidar-bonnetal or SalsaNext")
 sys.path.append(str(ROOT / "train"))
-np.float = float  # type: ignore[attr-defined]  # both are written for numpy before 1.24
-stand_in("torchvision")
-stand_in("accimage")
+provide("numpy.float", "imp", "tensorflow.summary", "torchvision")  # as the launcher does
 
-from lidar_synth.integrations.rangenet import write_parser
+from lidar_synth.integrations.rangenet import filled, gaps, make_parser
 from tasks.semantic.dataset.kitti import parser as stock
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.formats import open_scans
+from lidar_synth.generate.generator import load_generator
+from lidar_synth.mixing import Generated
 
 REAL, EXTRA, BATCH = 6, 4, 2
 SALSA = hasattr(stock, "my_collate")
@@ -37,12 +42,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make(root: Path) -> Path:
-    """Real and synthetic scans, and a parser."""
+    """Real and synthetic scans, and the settings of a mixture."""
     semantic_kitti(root / "sk", REAL)
     synthetic(root / "synthetic", 11)
     mixture = {"synthetic": str(root / "synthetic"), "ratio": 0.4, "seed": 3}
     (root / "mix.yaml").write_text(yaml.safe_dump(mixture))
-    write_parser(root / "mix.yaml", root / "mixed")
     return root
 
 
@@ -55,7 +59,7 @@ def arguments(made: Path, **others: Any) -> dict[str, Any]:
     labels = data()
     sensor = {
         "name": "HDL64", "type": "spherical", "fov_up": 3, "fov_down": -25,
-        "img_prop": {"width": 2048, "height": 64},
+        "img_prop": {"width": SENSOR.columns, "height": SENSOR.rows},
         "img_means": [12.12, 10.88, 0.23, -1.04, 0.21], "img_stds": [12.32, 11.47, 6.91, 0.86, 0.16],
     }  # fmt: skip
     return {
@@ -67,12 +71,7 @@ def arguments(made: Path, **others: Any) -> dict[str, Any]:
 
 
 def parser(made: Path, **others: Any) -> Any:
-    """As the trainers load it, by the path of the file."""
-    spec = spec_from_file_location("parserModule", made / "mixed" / "parser.py")
-    assert spec is not None and spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.Parser(**arguments(made, **others))
+    return make_parser(stock, made / "mix.yaml")(**arguments(made, **others))
 
 
 def both(made: Path) -> tuple[Any, Any]:
@@ -89,6 +88,7 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path, monkeypatch: pytes
     if SALSA:  # its batches tell no names
         loader.collate_fn = torch.utils.data.default_collate
     for epoch in (0, 1):
+        loader.dataset.set_epoch(epoch)  # the launcher does
         batches = list(loader)
         names = [(s, n) for batch in batches for s, n in zip(batch[4], batch[5], strict=True)]
         assert Counter(s for s, _ in names) == {"00": REAL, "synthetic": EXTRA}
@@ -103,7 +103,7 @@ def test_the_trainers_own_collate_takes_both_kinds(made: Path) -> None:
     batches = list(parser(made).get_train_set())
     assert len(batches) == (REAL + EXTRA) // BATCH
     for batch in batches:
-        assert batch[0].shape[1:] == (5, 64, 2048) and batch[2].max() <= 19
+        assert batch[0].shape[1:] == (5, SENSOR.rows, SENSOR.columns) and batch[2].max() <= 19
 
 
 def test_real_samples_are_the_trainers_own(made: Path) -> None:
@@ -156,7 +156,102 @@ def test_unlabelled_scans_are_refused(made: Path, tmp_path: Path) -> None:
     bare = synthetic(tmp_path / "bare", 3, labels=False)
     for settings in ({"synthetic": str(bare)}, {"synthetic": str(bare), "labels": "none"}):
         (tmp_path / "mix.yaml").write_text(yaml.safe_dump(settings))
-        write_parser(tmp_path / "mix.yaml", tmp_path / "mixed")
         with pytest.raises(ConfigError, match="labels"):
             (tmp_path / "sk").exists() or (tmp_path / "sk").symlink_to(made / "sk")
             parser(tmp_path)
+
+
+def test_a_parser_of_another_trainer_is_refused() -> None:
+    with pytest.raises(LibraryError, match=r"without \['Parser', 'SemanticKitti', 'LaserScan'\]"):
+        make_parser(ModuleType("parserModule"), {"synthetic": "bank"})
+
+
+@pytest.fixture(scope="module")
+def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Real scans of twice the columns of the synthetic ones."""
+    root = tmp_path_factory.mktemp("dense")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("streets.SENSOR", replace(SENSOR, columns=2 * SENSOR.columns))
+        semantic_kitti(root / "sk", REAL)
+    synthetic(root / "synthetic", 11)
+    (root / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(root / "synthetic"), "ratio": 0.4, "seed": 3}))
+    return root
+
+
+def sensor_of(width: int) -> Any:
+    return arguments(Path())["sensor"] | {"img_prop": {"width": width, "height": SENSOR.rows}}
+
+
+def test_a_width_with_stripes_is_refused(made: Path, dense: Path) -> None:
+    """At 512 columns a synthetic scan of 256 fills every second one; a real scan of 512 fills all."""
+    with pytest.raises(ConfigError, match=rf"empty cell to the right.*img_prop.width: {SENSOR.columns} in"):
+        parser(dense, sensor=sensor_of(2 * SENSOR.columns))
+    parser(dense)  # both kinds in images of the synthetic scans' width
+    parser(made, sensor=sensor_of(2 * SENSOR.columns))  # stripes in both kinds do not tell them apart
+
+
+@pytest.fixture
+def labelled_scans() -> Path:
+    if not os.environ.get("LIDAR_SYNTH_LABELLED_SCANS"):
+        pytest.skip("LIDAR_SYNTH_LABELLED_SCANS is not set")
+    return Path(os.environ["LIDAR_SYNTH_LABELLED_SCANS"])
+
+
+DENSITY = {2048: ((0.75, 0.05), (0.37, 0.98)), 1024: ((0.78, 0.02), (0.75, 0.03))}
+"""By width: the share of filled cells and of empty right neighbours, in real images and in those of the model."""
+
+
+@pytest.mark.slow
+def test_density_of_the_shipped_model_and_of_real_scans(made: Path, labelled_scans: Path) -> None:
+    """The stock 64 x 2048 has stripes in synthetic scans only; at 1,024 columns both kinds are alike."""
+    dataset = parser(made).train_dataset
+    dataset.sensor_img_H = 64
+    paths = sorted(labelled_scans.glob("semantic_kitti/sequences/*/velodyne/000000.bin"))
+    generated = Generated(load_generator("town"))[0]
+    found = {}
+    for width in DENSITY:
+        kinds = [dataset.image(str(path), width) for path in paths], [dataset.image(generated, width)]
+        found[width] = [(float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)]))) for k in kinds]
+        print(f"64 x {width}: filled and gaps of real scans {found[width][0]}, of synthetic ones {found[width][1]}")
+    for width, expected in DENSITY.items():
+        assert np.allclose(found[width], expected, atol=0.08), found
+
+
+def configure(made: Path, out: Path, epochs: int, **sensor: int) -> list[str | Path]:
+    """Arguments of ``train.py``: the stock configuration with a small image, and few iterations."""
+    source = next(ROOT.rglob("salsanext.yml" if SALSA else "config/arch/squeezeseg.yaml"))
+    arch, labels = yaml.safe_load(source.read_text()), data()
+    arch["train"] |= {"max_epochs": epochs, "batch_size": BATCH, "workers": 0, "report_batch": 1}
+    arch["dataset"]["sensor"]["img_prop"] = {"width": SENSOR.columns // 4, "height": SENSOR.rows} | sensor
+    labels["split"] = {"train": [0], "valid": [0], "test": []}
+    for name, content in {"arch": arch, "labels": labels}.items():
+        (out / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    return ["train.py", "-d", made / "sk", "-ac", out / "arch.yaml", "-dc", out / "labels.yaml", "-l", out / "log"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> None:
+    """``train.py`` as a user types it, with validation; SalsaNext resumes, and sees the samples of its epoch."""
+    cwd = clone(ROOT, tmp_path / "clone") / "train/tasks/semantic"
+    first = 1 if SALSA else 2
+    arguments = configure(made, tmp_path, first)
+    said = launched("rangenet", *arguments, *(["-p", ""] if SALSA else []), cwd=cwd, mixture=made / "mix.yaml")
+    if SALSA:
+        (log,) = (tmp_path / "log/logs").iterdir()
+        said += launched("rangenet", *configure(made, tmp_path, 2), "-p", log, cwd=cwd, mixture=made / "mix.yaml")
+    plans = {e: parser(made).train_dataset.mixed.plan(e).hash[:16] for e in (0, 1)}
+    seen = [line for line in epochs(said) if line[0] == 1][:1] + [line for line in epochs(said) if line[0] == 0][:1]
+    assert seen == [(e, REAL + EXTRA, EXTRA, plans[e]) for e in (1, 0)]
+    losses = [float(value) for value in re.findall(r"Epoch: \[\d+\]\[\d+/5\].*?Loss (\S+)", said)]
+    assert len(losses) == 10 and np.isfinite(losses).all()
+    assert said.count("Validation set:") == 2 and "IoU class 1 [car]" in said
+    assert [*tmp_path.rglob("SalsaNext" if SALSA else "segmentation_head*")] and [*tmp_path.rglob("events.out*")]
+
+
+@pytest.mark.slow
+def test_the_launcher_refuses_before_training(dense: Path, tmp_path: Path) -> None:
+    cwd = clone(ROOT, tmp_path / "clone") / "train/tasks/semantic"
+    arguments = configure(dense, tmp_path, 1, width=2 * SENSOR.columns)
+    said = launched("rangenet", *arguments, cwd=cwd, mixture=dense / "mix.yaml", status=1)
+    assert "lidar_synth: synthetic scans in images of 32 x 512" in said and "Traceback" not in said

@@ -1,0 +1,137 @@
+"""Shared by the launchers: the script on the command line, and a trial of a trainer on a machine without a GPU.
+
+With ``LIDAR_SYNTH_CPU=1`` what a trainer sends to a GPU stays on the CPU. That shows whether a configuration runs; no
+one trains so.
+"""
+
+import logging
+import os
+import runpy
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import torch
+from lidar_synth.integrations.removed import provide
+from torch.nn import functional
+
+from lidar_synth.errors import LidarSynthError
+
+CPU = "LIDAR_SYNTH_CPU"
+"""Environment variable: 1 keeps on the CPU what a trainer sends to a GPU."""
+
+
+def prepare_script(usage: str, *names: str) -> str:
+    """Take the trainer's script from the command line, as Python would, and set the removed names that it uses.
+
+    Args:
+        usage: a command, shown when there is no script.
+        names: keys of ``removed.NAMES``.
+
+    Returns:
+        The script's path, now ``sys.argv[0]``; its folder is first on the path.
+
+    Raises:
+        SystemExit: without a script.
+        LibraryError: if a library is missing.
+    """
+    if len(sys.argv) < 2 or not Path(sys.argv[1]).is_file():
+        print(f"usage: {usage}", file=sys.stderr)
+        raise SystemExit(2)
+    sys.argv = sys.argv[1:]
+    sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
+    say_epochs()
+    provide(*names)
+    if os.environ.get(CPU) == "1":
+        stay_on_cpu()
+    return sys.argv[0]
+
+
+def say_epochs() -> None:
+    """Print the package's own messages, one line for each epoch's mixture among them."""
+    handler = logging.StreamHandler(sys.stdout)
+    handler.setFormatter(logging.Formatter("lidar_synth: %(message)s"))
+    log = logging.getLogger("lidar_synth")
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+
+
+def run(script: str) -> None:
+    """Run a script as ``python SCRIPT`` does, with the arguments that are left."""
+    with plain_errors():
+        runpy.run_path(script, run_name="__main__")
+
+
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """End with the message alone, and exit status 1, where this package refuses a configuration."""
+    try:
+        yield
+    except LidarSynthError as error:
+        raise SystemExit(f"lidar_synth: {error}") from None
+
+
+def stay_on_cpu() -> None:
+    """Keep on the CPU what is sent to a GPU; class targets become int64, as these trainers make them on a GPU."""
+    print(f"lidar_synth: {CPU}=1, so what this trainer sends to a GPU stays on the CPU", flush=True)
+    changed: dict[tuple[Any, str], Any] = {
+        (torch.cuda, "set_device"): lambda device: None,
+        (torch.Tensor, "get_device"): lambda self: self.device,
+        (torch, "load"): _mapped(torch.load),
+        (functional, "nll_loss"): _int64(functional.nll_loss),
+    }
+    for kind in (torch.Tensor, torch.nn.Module):
+        changed[kind, "cuda"] = lambda self, *args, **options: self
+        changed[kind, "to"] = _kept(kind.to)
+    for (owner, name), new in changed.items():
+        setattr(owner, name, new)
+    if "spconv.pytorch" in sys.modules:
+        sparse = sys.modules["spconv.pytorch"]
+        sparse.ops.get_current_stream = lambda: 0  # a CPU has no stream
+        layer = sparse.conv.SparseConvolution
+        layer._conv_forward = _bias_after(layer._conv_forward)
+
+
+def _on_gpu(device: Any) -> bool:
+    return isinstance(device, str | torch.device) and str(device).startswith("cuda")
+
+
+def _int64(loss: Any) -> Any:
+    @wraps(loss)
+    def changed(values: Any, target: Any, *args: Any, **options: Any) -> Any:
+        return loss(values, target.long(), *args, **options)
+
+    return changed
+
+
+def _bias_after(forward: Any) -> Any:
+    """spconv adds a bias after the convolution in training, and within it, which needs a GPU, in evaluation."""
+
+    @wraps(forward)
+    def changed(self: Any, training: bool, *args: Any, **options: Any) -> Any:
+        return forward(self, True, *args, **options)
+
+    return changed
+
+
+def _kept(move: Any) -> Any:
+    @wraps(move)
+    def moved(self: Any, *args: Any, **options: Any) -> Any:
+        left = [value for value in args if not _on_gpu(value)]
+        named = {key: value for key, value in options.items() if not _on_gpu(value)}
+        return move(self, *left, **named) if left or set(named) - {"non_blocking"} else self
+
+    return moved
+
+
+def _mapped(load: Any) -> Any:
+    @wraps(load)
+    def loaded(*args: Any, **options: Any) -> Any:
+        if _on_gpu(options.get("map_location")):
+            options["map_location"] = "cpu"
+        return load(*args, **options)
+
+    return loaded
