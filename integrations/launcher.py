@@ -1,0 +1,118 @@
+"""Shared by the launchers: the script on the command line, and a trial of a trainer on a machine without a GPU.
+
+With ``LIDAR_SYNTH_CPU=1`` what a trainer sends to a GPU stays on the CPU. That shows whether a configuration runs; no
+one trains so.
+"""
+
+import logging
+import os
+import runpy
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import torch
+from lidar_synth.integrations.removed import provide
+from torch.nn import functional
+
+from lidar_synth.errors import LidarSynthError
+
+CPU = "LIDAR_SYNTH_CPU"
+"""Environment variable: 1 keeps on the CPU what a trainer sends to a GPU."""
+
+
+def prepare_script(usage: str, *names: str) -> str:
+    """Take the trainer's script from the command line, as Python would, and set the removed names that it uses.
+
+    Args:
+        usage: a command, shown when there is no script.
+        names: keys of ``removed.NAMES``.
+
+    Returns:
+        The script's path, now ``sys.argv[0]``; its folder is first on the path.
+
+    Raises:
+        SystemExit: without a script.
+        LibraryError: if a library is missing.
+    """
+    if len(sys.argv) < 2 or not Path(sys.argv[1]).is_file():
+        print(f"usage: {usage}", file=sys.stderr)
+        raise SystemExit(2)
+    sys.argv = sys.argv[1:]
+    sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
+    say_epochs()
+    provide(*names)
+    if os.environ.get(CPU) == "1":
+        stay_on_cpu()
+    return sys.argv[0]
+
+
+def say_epochs() -> None:
+    """Print the package's own messages, one line for each epoch's mixture among them."""
+    handler = logging.StreamHandler(sys.stdout)
+    handler.setFormatter(logging.Formatter("lidar_synth: %(message)s"))
+    log = logging.getLogger("lidar_synth")
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+
+
+def run(script: str) -> None:
+    """Run a script as ``python SCRIPT`` does, with the arguments that are left."""
+    with plain_errors():
+        runpy.run_path(script, run_name="__main__")
+
+
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """End with the message alone, and exit status 1, where this package refuses a configuration."""
+    try:
+        yield
+    except LidarSynthError as error:
+        raise SystemExit(f"lidar_synth: {error}") from None
+
+
+def stay_on_cpu() -> None:
+    """Keep on the CPU what is sent to a GPU; class targets become int64, as these trainers make them on a GPU."""
+    print(f"lidar_synth: {CPU}=1, so what this trainer sends to a GPU stays on the CPU", flush=True)
+    torch.cuda.set_device = lambda device: None
+    torch.Tensor.get_device = lambda self: self.device  # type: ignore[assignment, method-assign]
+    torch.load = _mapped(torch.load)
+    for kind in (torch.Tensor, torch.nn.Module):
+        kind.cuda = lambda self, *args, **options: self  # type: ignore[attr-defined, method-assign]
+        kind.to = _kept(kind.to)  # type: ignore[attr-defined, method-assign]
+    original = functional.nll_loss
+
+    @wraps(original)
+    def nll_loss(values: Any, target: Any, *args: Any, **options: Any) -> Any:
+        return original(values, target.long(), *args, **options)
+
+    functional.nll_loss = nll_loss
+    if "spconv.pytorch" in sys.modules:
+        sys.modules["spconv.pytorch"].ops.get_current_stream = lambda: 0  # a CPU has no stream
+
+
+def _on_gpu(device: Any) -> bool:
+    return isinstance(device, str | torch.device) and str(device).startswith("cuda")
+
+
+def _kept(move: Any) -> Any:
+    @wraps(move)
+    def moved(self: Any, *args: Any, **options: Any) -> Any:
+        left = [value for value in args if not _on_gpu(value)]
+        named = {key: value for key, value in options.items() if not _on_gpu(value)}
+        return move(self, *left, **named) if left or set(named) - {"non_blocking"} else self
+
+    return moved
+
+
+def _mapped(load: Any) -> Any:
+    @wraps(load)
+    def loaded(*args: Any, **options: Any) -> Any:
+        if _on_gpu(options.get("map_location")):
+            options["map_location"] = "cpu"
+        return load(*args, **options)
+
+    return loaded

@@ -1,0 +1,124 @@
+"""Datasets on disk for the trials: real scans where the machine has them, the town beside them, and synthetic scans.
+
+Real scans come from the folders that LIDAR_SYNTH_LABELLED_SCANS (``semantic_kitti/sequences``) and
+LIDAR_SYNTH_REAL_SCANS (``kitti_object/training``) name; without them every scan is one of the town. Each dataset is
+written when it is first used.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from functools import cached_property
+from pathlib import Path
+
+from lidar_synth.labels import ObjectBank
+from lidar_synth.town import Town, export_town
+
+TRAINING = tuple(f"{number:02d}" for number in (0, 1, 2, 3, 4, 5, 6, 7, 9, 10))
+VALIDATION = "08"
+REAL_VALIDATION = "09"
+"""The recorded sequence that serves as sequence 08, which every trainer validates on."""
+
+
+class Data:
+    """Datasets for the trials.
+
+    Args:
+        folder: where they are written.
+        scans: number of scans of each SemanticKITTI sequence, and of the town in KITTI's object set.
+    """
+
+    def __init__(self, folder: Path, scans: int = 1) -> None:
+        self.folder, self.scans = folder, scans
+
+    @cached_property
+    def real(self) -> str:
+        """Where the real scans come from, for the table."""
+        kinds = {"LIDAR_SYNTH_LABELLED_SCANS": "SemanticKITTI", "LIDAR_SYNTH_REAL_SCANS": "KITTI object"}
+        given = [kind for variable, kind in kinds.items() if os.environ.get(variable)]
+        return f"{' and '.join(given)}, and the town" if given else "the town"
+
+    @cached_property
+    def semantic_kitti(self) -> Path:
+        """SemanticKITTI's ``dataset`` folder: sequences 00 to 10; those without real scans are streets of the town."""
+        out = self.folder / "semantic_kitti"
+        recorded = Path(os.environ.get("LIDAR_SYNTH_LABELLED_SCANS", "")) / "semantic_kitti" / "sequences"
+        use = bool(os.environ.get("LIDAR_SYNTH_LABELLED_SCANS"))
+        for number in (*TRAINING, VALIDATION):
+            source = recorded / (REAL_VALIDATION if number == VALIDATION else number)
+            target = out / "sequences" / number
+            if target.is_dir():
+                continue
+            if use and source.is_dir() and (number == VALIDATION or number != REAL_VALIDATION):
+                self._copy_sequence(source, target)
+            else:
+                self._town_sequence(int(number), target)
+        return out
+
+    @cached_property
+    def kitti(self) -> Path:
+        """KITTI's object set with ``ImageSets``: the real frames that have an image, then frames of the town.
+
+        The last frame of each kind is for validation.
+        """
+        out = self.folder / "kitti"
+        if out.is_dir():
+            return out
+        made = self.folder / "kitti.part"
+        export_town(Town(seed=1, scans=self.scans + 1), made, "kitti", camera=True, progress=False)
+        town = sorted(path.stem for path in (made / "training" / "velodyne").glob("*.bin"))
+        for path in sorted(made.glob("training/*/*")):  # KITTI's own numbers end below 007481
+            path.rename(path.with_name(f"{int(path.stem) + 7500:06d}{path.suffix}"))
+        town = [f"{int(frame) + 7500:06d}" for frame in town]
+        real: list[str] = []
+        recorded = Path(os.environ.get("LIDAR_SYNTH_REAL_SCANS", "")) / "kitti_object" / "training"
+        if os.environ.get("LIDAR_SYNTH_REAL_SCANS") and recorded.is_dir():
+            kinds = {"velodyne": ".bin", "label_2": ".txt", "calib": ".txt", "image_2": ".png"}
+            for path in sorted((recorded / "velodyne").glob("*.bin")):
+                files = {kind: recorded / kind / f"{path.stem}{ending}" for kind, ending in kinds.items()}
+                if all(file.is_file() for file in files.values()):
+                    real.append(path.stem)
+                    for kind, file in files.items():
+                        shutil.copyfile(file, made / "training" / kind / file.name)
+        validation = [frames[-1] for frames in (real, town) if frames]
+        training = [frame for frame in real + town if frame not in validation]
+        for split, frames in {"train": training, "val": validation, "trainval": sorted(training + validation)}.items():
+            (made / "ImageSets" / f"{split}.txt").write_text("".join(f"{frame}\n" for frame in sorted(frames)))
+        made.rename(out)
+        return out
+
+    @cached_property
+    def bank(self) -> Path:
+        """A bank of eight scans of the shipped generator ``town``."""
+        out = self.folder / "bank"
+        bake = [sys.executable, "-m", "lidar_synth", "bake", out, "--count", "8"]
+        subprocess.run(bake, check=True, stdout=subprocess.DEVNULL)
+        return out
+
+    @cached_property
+    def objects(self) -> Path:
+        """A bank of objects of the town, for ``labels: mix``."""
+        out = self.folder / "objects.npz"
+        if not out.exists():
+            ObjectBank.from_scans(Town(seed=2, scans=4)).save(out)
+        return out
+
+    def _copy_sequence(self, source: Path, target: Path) -> None:
+        frames = sorted((source / "velodyne").glob("*.bin"))[: self.scans]
+        for kind in ("velodyne", "labels"):
+            (target / kind).mkdir(parents=True)
+        for frame in frames:
+            shutil.copyfile(frame, target / "velodyne" / frame.name)
+            shutil.copyfile(source / "labels" / f"{frame.stem}.label", target / "labels" / f"{frame.stem}.label")
+        for name in ("calib.txt", "poses.txt", "times.txt"):
+            if (source / name).is_file():
+                shutil.copyfile(source / name, target / name)
+
+    def _town_sequence(self, number: int, target: Path) -> None:
+        made = self.folder / f"town-{number:02d}"
+        town = Town(seed=number, scans=self.scans)
+        export_town(town, made, "semantic_kitti", sequence=number, camera=False, progress=False)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        (made / "sequences" / f"{number:02d}").rename(target)
+        shutil.rmtree(made)

@@ -1,0 +1,74 @@
+"""Run each trainer's own script on a mixture, in a fresh environment, with validation; print a Markdown table.
+
+    python tools/try_trainers.py --work FOLDER [--only NAME ...] [--scans 1]
+
+``tools/trainers/`` has one file for each trainer. Public source trees are found by environment variables such as
+OPENPCDET_ROOT and POINTCEPT_ROOT; each file names its own. Real scans are used where LIDAR_SYNTH_LABELLED_SCANS and
+LIDAR_SYNTH_REAL_SCANS name their folders, beside scans of the town. Logs are kept in FOLDER/<name>/logs. This shows
+that a trainer runs on the mixture, not that the mixture helps. The exit status is 1 if a trial failed.
+"""
+
+import argparse
+import importlib
+import os
+import platform
+import sys
+import traceback
+from pathlib import Path
+
+from trainers.data import Data
+from trainers.trial import STEPS, Failed, Row, Trial
+
+FRAME = ("__init__", "data", "trial")
+
+
+def names() -> list[str]:
+    """The trainers that have a file."""
+    return sorted(path.stem for path in (Path(__file__).parent / "trainers").glob("*.py") if path.stem not in FRAME)
+
+
+def attempt(name: str, work: Path, data: Data, reuse: bool) -> list[Row]:
+    """The rows of a trainer; a failure is the last of them."""
+    module = importlib.import_module(f"trainers.{name}")
+    trial = Trial(name, module.TITLE, work, data, reuse)
+    done: list[Row] = []
+    try:
+        for row in module.rows(trial):
+            done.append(row)
+            print(line(row), file=sys.stderr, flush=True)
+    except Exception as error:  # one trainer's failure must not stop the others
+        if not isinstance(error, Failed):
+            traceback.print_exc()
+        text = " ".join(str(error).split()) or type(error).__name__
+        done.append(trial.row("", (), f"**failed**: {text}", failed=True))
+    return done
+
+
+def line(row: Row) -> str:
+    """A row in Markdown."""
+    script = f"`{row.script}`" if row.script else ""
+    marks = ["yes" if step in row.ran else "no" for step in STEPS]
+    cells = [row.trainer, script, *marks, row.left_out.replace("|", "\\|"), f"{row.minutes:.1f}"]
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Runs the trials and prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, required=True, help="folder of environments, data and logs")
+    parser.add_argument("--only", nargs="+", choices=names(), default=names(), metavar="NAME", help=", ".join(names()))
+    parser.add_argument("--scans", type=int, default=1, help="scans of each SemanticKITTI sequence [1]")
+    parser.add_argument("--reuse-environments", action="store_true", help="keep those of an earlier run, to develop")
+    options = parser.parse_args()
+    work = options.work.absolute()
+    data = Data(work / f"data-{options.scans}", options.scans)
+    done = [row for name in options.only for row in attempt(name, work, data, options.reuse_environments)]
+    machine = f"Python {platform.python_version()}, {os.cpu_count()} cores, {platform.machine()}"
+    print(f"{machine}; scans called real: {data.real}\n")
+    print(f"| trainer | script | {' | '.join(STEPS)} | not on a CPU | minutes |\n|{'---|' * (len(STEPS) + 3)}---:|")
+    print("\n".join(line(row) for row in done))
+    sys.exit(any(row.failed for row in done))
+
+
+if __name__ == "__main__":
+    main()
