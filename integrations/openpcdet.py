@@ -32,7 +32,7 @@ if not pcdet.__version__.startswith("0.6."):
 from lidar_synth.integrations.openpcdet_kitti import MixedKitti
 from lidar_synth.integrations.openpcdet_nuscenes import MixedNuScenes
 
-DATASETS = {"MixedKitti": MixedKitti, "MixedNuScenes": MixedNuScenes}
+DATASETS: dict[str, Any] = {"MixedKitti": MixedKitti, "MixedNuScenes": MixedNuScenes}
 
 
 def register() -> None:
@@ -99,7 +99,8 @@ def read_checkpoints() -> None:
     """
     if hasattr(torch.serialization, "add_safe_globals"):  # from torch 2.4 on
         kinds = [np.dtype(kind) for kind in (np.float64, np.float32, np.int64)]
-        torch.serialization.add_safe_globals([np.float64(0).__reduce__()[0], np.dtype, *map(type, kinds)])
+        scalar: Any = np.float64(0).__reduce__()[0]
+        torch.serialization.add_safe_globals([scalar, np.dtype, *map(type, kinds)])
 
 
 def main() -> None:

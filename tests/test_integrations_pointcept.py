@@ -191,7 +191,7 @@ def test_invalid_settings_are_refused(made: Path) -> None:
 
 SMALL = """
 seed, batch_size, num_worker, mix_prob, enable_wandb, epoch, eval_epoch = 1, 2, 2, 0, False, {epochs}, {epochs}
-data = dict(train=dict(data_root={data!r}, mixture=dict(synthetic={synthetic!r}, ratio=0.4, seed=3, labels={labels!r})))
+data = dict(train=dict(data_root={data!r}, mixture=dict(synthetic={synthetic!r}, ratio={ratio}, seed=3, labels={labels!r})))
 """
 SEGMENTATION = """
 _base_ = [{stock!r}]
@@ -199,6 +199,7 @@ custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_fail
 hooks = [dict(type="SynthEpoch"), *[dict(type=name) for name in (
     "CheckpointLoader", "ModelHook", "IterationTimer", "InformationWriter", "SemSegEvaluator", "CheckpointSaver",
     "PreciseEvaluator")]]
+hooks[-2]["save_freq"] = 1
 model = dict(backbone=dict(channels=(8,) * 8, layers=(1,) * 8))
 {small}
 data["train"]["type"] = "MixedSemanticKITTI"
@@ -212,19 +213,14 @@ model = dict(backbone=dict(
 param_dicts = [dict(keyword="enc0", lr=0.004)]
 scheduler = dict(max_lr=[0.004, 0.004])
 {small}
+data["train"]["split"] = ["train"]
 """
 
 
-def train(
-    made: Path, text: str, out: Path, *options: str, epochs: int = 2, labels: str = "generated", **paths: Any
-) -> str:
+def train(made: Path, text: str, out: Path, *options: str, **values: Any) -> str:
     """What ``tools/train.py`` says with a configuration of the test, as a user types it."""
-    values = {
-        "data": str(made / "sk"),
-        "synthetic": str(made / "synthetic"),
-        "labels": labels,
-        "epochs": epochs,
-    } | paths
+    data = {"data": str(made / "sk"), "synthetic": str(made / "synthetic")}
+    values = data | {"ratio": 0.4, "labels": "generated"} | values
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.py").write_text(text.format(small=SMALL.format(**values), **values))
     return run_script(
@@ -248,7 +244,8 @@ def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(made: P
 
     This does not show: pointops and pointgroup_ops, which SparseUNet does not use, and mixed precision.
     """
-    said = train(made, SEGMENTATION, tmp_path, "epoch=3", "eval_epoch=3", stock=str(STOCK))
+    values = {"stock": str(STOCK), "epochs": 3}
+    said = train(made, SEGMENTATION, tmp_path, **values)
     seen = samples(said)
     assert sorted(seen) == [0, 1, 2]
     for names in seen.values():
@@ -257,12 +254,8 @@ def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(made: P
     losses = [float(loss) for loss in re.findall(r"loss: (\S+) Lr", said)]
     assert len(losses) == 15 and np.isfinite(losses).all()
     assert len(re.findall(r"Val result: mIoU/mAcc/allAcc [\d.]+/", said)) == 4  # after each epoch, and the best
-    checkpoint = tmp_path / "run" / "model" / "model_last.pth"
-    state = torch.load(checkpoint, weights_only=False)
-    torch.save(state | {"epoch": 2}, checkpoint)
-    rest = train(
-        made, SEGMENTATION, tmp_path, "epoch=3", "eval_epoch=3", "resume=True", f"weight={checkpoint}", stock=str(STOCK)
-    )
+    checkpoint = tmp_path / "run" / "model" / "epoch_2.pth"
+    rest = train(made, SEGMENTATION, tmp_path, "resume=True", f"weight={checkpoint}", **values)
     assert samples(rest) == {2: seen[2]}
 
 
@@ -273,11 +266,11 @@ def test_sonata_pretrains_on_scans_without_labels(made: Path, tmp_path: Path) ->
 
     This does not show: flash attention, and pointops, for which tools/stand_ins has a function of torch.
     """
-    bare = synthetic(tmp_path / "bare", 11, labels=False)
-    said = train(made, PRETRAINING, tmp_path, stock=str(SONATA), synthetic=str(bare), labels="none")
+    values = {"synthetic": str(synthetic(tmp_path / "bare", 2 * REAL, labels=False)), "labels": "none", "ratio": 0.5}
+    said = train(made, PRETRAINING, tmp_path, stock=str(SONATA), epochs=2, **values)
     seen = samples(said)
-    real = REAL + VALIDATION
-    for names in (seen[0], seen[1]):
-        assert Counter(n.startswith("synthetic_") for n in names) == {False: real, True: round(real * 0.4 / 0.6)}
+    for epoch in (0, 1):
+        assert Counter(n.startswith("synthetic_") for n in seen[epoch]) == {False: REAL, True: REAL}
+    assert set(seen[0]) & set(seen[1]) == {f"00_{i:06d}" for i in range(REAL)}
     losses = [float(loss) for loss in re.findall(r" loss: (\S+) ", said)]
     assert losses and np.isfinite(losses).all() and (tmp_path / "run" / "model" / "model_last.pth").exists()

@@ -29,7 +29,7 @@ def knn_query(
     ends, new_ends = ([0, *each.tolist()] for each in (offset, new_offset))
     for start, end, first, last in zip(ends, ends[1:], new_ends, new_ends[1:], strict=False):
         count = min(nsample, end - start)
-        for chunk in torch.arange(first, last, device=xyz.device).split(4096):
+        for chunk in torch.split(torch.arange(first, last, device=xyz.device), 4096):
             near = torch.cdist(new_xyz[chunk], xyz[start:end]).topk(count, largest=False)
             index[chunk, :count], distance[chunk, :count] = (near.indices + start).int(), near.values
     return index, distance
