@@ -23,6 +23,7 @@ ROOT = checkout("OPENPCDET_ROOT", "OpenPCDet")
 needs("skimage", "SharedArray", "spconv", "pyquaternion", "nuscenes", "torchvision", "easydict")
 sys.path.insert(0, str(SCRIPTS))
 from openpcdet_cpu import prepare
+from openpcdet_prepare import add_camera
 
 prepare(ROOT)
 
@@ -52,6 +53,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """nuScenes' folder, its info lists and GT database by OpenPCDet's own code, and synthetic scans."""
     root = tmp_path_factory.mktemp("nuscenes")
     write_dataset(root / "nuscenes" / VERSION, seed=0)
+    add_camera(root / "nuscenes" / VERSION / VERSION)
     create_nuscenes_info(VERSION, root / "nuscenes", root / "nuscenes", SWEEPS)
     add_recorded(root / "nuscenes" / VERSION)
     torch.Tensor.cuda = lambda self, *args, **options: self  # type: ignore[method-assign]  # it counts points on a GPU

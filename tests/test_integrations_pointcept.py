@@ -191,7 +191,8 @@ def test_invalid_settings_are_refused(made: Path) -> None:
 
 SMALL = """
 seed, batch_size, num_worker, mix_prob, enable_wandb, epoch, eval_epoch = 1, 2, 2, 0, False, {epochs}, {epochs}
-data = dict(train=dict(data_root={data!r}, mixture=dict(synthetic={synthetic!r}, ratio={ratio}, seed=3, labels={labels!r})))
+data = dict(train=dict(data_root={data!r}, mixture=dict(
+    synthetic={synthetic!r}, ratio={ratio}, seed=3, labels={labels!r})))
 """
 SEGMENTATION = """
 _base_ = [{stock!r}]

@@ -7,6 +7,7 @@ they are missing. A class without objects gets an empty entry, which OpenPCDet's
 """
 
 import argparse
+import json
 import pickle
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from openpcdet_cpu import prepare
 
 VERSION = "v1.0-mini"
+TABLES = ("sensor", "calibrated_sensor", "sample_data")
 
 
 def main() -> None:
@@ -57,12 +59,30 @@ def prepare_nuscenes(config: Any, folder: Path) -> None:
     from pcdet.datasets.nuscenes.nuscenes_dataset import NuScenesDataset, create_nuscenes_info
     from pcdet.utils.common_utils import create_logger
 
+    add_camera(folder / VERSION / VERSION)
     create_nuscenes_info(VERSION, folder, folder, config.MAX_SWEEPS)
     config.VERSION = VERSION
     dataset = NuScenesDataset(config, None, training=True, root_path=folder, logger=create_logger())
     dataset.create_groundtruth_database(max_sweeps=config.MAX_SWEEPS)
     names = [group.partition(":")[0] for group in config.DATA_AUGMENTOR.AUG_CONFIG_LIST[0].SAMPLE_GROUPS]
     complete(folder / VERSION / f"nuscenes_dbinfos_{config.MAX_SWEEPS}sweeps_withvelo.pkl", names)
+
+
+def add_camera(folder: Path) -> None:
+    """Add a front camera to nuScenes' tables that have none, because OpenPCDet reads its pose; there is no picture."""
+    tables = {name: json.loads((folder / f"{name}.json").read_text()) for name in TABLES}
+    if any(row["channel"] == "CAM_FRONT" for row in tables["sensor"]):
+        return
+    tables["sensor"].append({"token": "camera", "channel": "CAM_FRONT", "modality": "camera"})
+    pose = {"translation": [1.7, 0, 1.5], "rotation": [0.5, -0.5, 0.5, -0.5]}  # z ahead, x right, y down
+    lens = {"camera_intrinsic": [[1266, 0, 800], [0, 1266, 450], [0, 0, 1]]}
+    tables["calibrated_sensor"].append({"token": "camera", "sensor_token": "camera", **pose, **lens})
+    for row in [row for row in tables["sample_data"] if row["is_key_frame"]]:
+        new = {"token": f"{row['token']}-camera", "calibrated_sensor_token": "camera", "fileformat": "jpg"}
+        new |= {"height": 900, "width": 1600, "filename": "samples/CAM_FRONT/none.jpg", "prev": "", "next": ""}
+        tables["sample_data"].append(row | new)
+    for name, rows in tables.items():
+        (folder / f"{name}.json").write_text(json.dumps(rows))
 
 
 def complete(file: Path, names: list[str]) -> None:
