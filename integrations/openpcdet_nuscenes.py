@@ -47,7 +47,7 @@ class MixedNuScenes(Mixed, NuScenesDataset):  # type: ignore[misc]
                 "points": np.tile(points, (self.dataset_cfg.MAX_SWEEPS, 1)),
                 "frame_id": f"synthetic/{scan.id}",
                 "metadata": {"token": f"synthetic/{scan.id}"},
-                "gt_boxes": np.pad(scan.boxes.values, ((0, 0), (0, 2)), constant_values=np.nan),
+                "gt_boxes": np.pad(scan.boxes.values.astype(float), ((0, 0), (0, 2)), constant_values=np.nan),
                 "gt_names": np.array(scan.boxes.names, dtype=str),
             }
         )

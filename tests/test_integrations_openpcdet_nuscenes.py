@@ -126,7 +126,8 @@ def test_samples_have_the_form_of_the_trainers_own(made: Path) -> None:
         for key in ("points", "gt_boxes", "voxels", "voxel_coords"):
             assert real[key].dtype == synthetic[key].dtype and real[key].shape[1:] == synthetic[key].shape[1:], key
         assert synthetic["points"].shape[1] == 5 and 100 < synthetic["points"][:, 3].max() <= 255
-        assert (synthetic["points"][:, 4] == 0).all() and np.isfinite(synthetic["gt_boxes"]).all()
+        assert (synthetic["points"][:, 4] == 0).mean() > 0.9  # pasted objects have the times of their sweeps
+        assert np.isfinite(synthetic["gt_boxes"]).all()
         assert synthetic["voxel_num_points"].max() == 10 and str(synthetic["frame_id"]).startswith("synthetic/")
 
 
