@@ -77,25 +77,44 @@ def plain_errors() -> Iterator[None]:
 def stay_on_cpu() -> None:
     """Keep on the CPU what is sent to a GPU; class targets become int64, as these trainers make them on a GPU."""
     print(f"lidar_synth: {CPU}=1, so what this trainer sends to a GPU stays on the CPU", flush=True)
-    torch.cuda.set_device = lambda device: None
-    torch.Tensor.get_device = lambda self: self.device  # type: ignore[assignment, method-assign]
-    torch.load = _mapped(torch.load)
+    changed: dict[tuple[Any, str], Any] = {
+        (torch.cuda, "set_device"): lambda device: None,
+        (torch.Tensor, "get_device"): lambda self: self.device,
+        (torch, "load"): _mapped(torch.load),
+        (functional, "nll_loss"): _int64(functional.nll_loss),
+    }
     for kind in (torch.Tensor, torch.nn.Module):
-        kind.cuda = lambda self, *args, **options: self  # type: ignore[attr-defined, method-assign]
-        kind.to = _kept(kind.to)  # type: ignore[attr-defined, method-assign]
-    original = functional.nll_loss
-
-    @wraps(original)
-    def nll_loss(values: Any, target: Any, *args: Any, **options: Any) -> Any:
-        return original(values, target.long(), *args, **options)
-
-    functional.nll_loss = nll_loss
+        changed[kind, "cuda"] = lambda self, *args, **options: self
+        changed[kind, "to"] = _kept(kind.to)
+    for (owner, name), new in changed.items():
+        setattr(owner, name, new)
     if "spconv.pytorch" in sys.modules:
-        sys.modules["spconv.pytorch"].ops.get_current_stream = lambda: 0  # a CPU has no stream
+        sparse = sys.modules["spconv.pytorch"]
+        sparse.ops.get_current_stream = lambda: 0  # a CPU has no stream
+        layer = sparse.conv.SparseConvolution
+        layer._conv_forward = _bias_after(layer._conv_forward)
 
 
 def _on_gpu(device: Any) -> bool:
     return isinstance(device, str | torch.device) and str(device).startswith("cuda")
+
+
+def _int64(loss: Any) -> Any:
+    @wraps(loss)
+    def changed(values: Any, target: Any, *args: Any, **options: Any) -> Any:
+        return loss(values, target.long(), *args, **options)
+
+    return changed
+
+
+def _bias_after(forward: Any) -> Any:
+    """spconv adds a bias after the convolution in training, and within it, which needs a GPU, in evaluation."""
+
+    @wraps(forward)
+    def changed(self: Any, training: bool, *args: Any, **options: Any) -> Any:
+        return forward(self, True, *args, **options)
+
+    return changed
 
 
 def _kept(move: Any) -> Any:

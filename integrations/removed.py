@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import torch
 
 from lidar_synth.errors import LibraryError
 
@@ -68,22 +69,22 @@ def _imp() -> bool:
 
 def _tensorflow() -> bool:
     """TensorFlow 1's summaries, written by TensorBoard: the same messages in the same kind of file."""
-    if "tensorflow" in sys.modules or find_spec("tensorflow"):
-        import tensorflow
-
-        if hasattr(tensorflow.summary, "FileWriter"):
-            return False
+    there = "tensorflow" in sys.modules or find_spec("tensorflow")
+    if there and hasattr(import_module("tensorflow").summary, "FileWriter"):
+        return False
     try:
-        from tensorboard.compat import tf
-        from tensorboard.compat.proto.summary_pb2 import HistogramProto, Summary
-        from torch.utils.tensorboard.writer import FileWriter
+        tensorboard, messages = (
+            import_module("tensorboard.compat"),
+            import_module("tensorboard.compat.proto.summary_pb2"),
+        )
+        writer = import_module("torch.utils.tensorboard.writer")
     except ImportError as error:
         raise LibraryError(
             f"tensorboard cannot be imported ({error})", "tensorboard, for logs", "pip install tensorboard"
         ) from error
-    assert tf.io  # TensorBoard looks for TensorFlow once, when this is first used: before there is ours
-    summary = _module("tensorflow.summary", FileWriter=FileWriter)
-    _module("tensorflow", summary=summary, Summary=Summary, HistogramProto=HistogramProto)
+    assert tensorboard.tf.io  # TensorBoard looks for TensorFlow once, when this is first used: before there is ours
+    summary = _module("tensorflow.summary", FileWriter=writer.FileWriter)
+    _module("tensorflow", summary=summary, Summary=messages.Summary, HistogramProto=messages.HistogramProto)
     return True
 
 
@@ -109,10 +110,9 @@ def _spconv() -> bool:
         raise LibraryError("spconv is not installed", "spconv 2, for this trainer's network", "pip install spconv")
     if not find_spec("spconv.pytorch"):
         return False  # spconv 1
-    import spconv
-    import spconv.pytorch as new
+    old, new = import_module("spconv"), import_module("spconv.pytorch")
 
-    class SubMConv3d(new.SubMConv3d):  # type: ignore[misc]
+    class SubMConv3d(new.SubMConv3d):  # type: ignore[misc, name-defined]
         def __init__(self, ins: int, outs: int, kernel_size: Any, *args: Any, **options: Any) -> None:
             if options.get("indice_key"):
                 options["indice_key"] = f"{options['indice_key']} {kernel_size}"
@@ -121,9 +121,18 @@ def _spconv() -> bool:
     tensor = new.SparseConvTensor
     tensor.features = property(tensor.features.fget, lambda self, value: setattr(self, "_features", value))
     for name in ("SparseConvTensor", "SparseConv3d", "SparseInverseConv3d", "SparseSequential", "SparseModule"):
-        setattr(spconv, name, getattr(new, name))
-    spconv.SubMConv3d = SubMConv3d
+        setattr(old, name, getattr(new, name))
+    old.SubMConv3d = SubMConv3d  # type: ignore[attr-defined]
     return True
+
+
+def _torch_load() -> bool:
+    """Numpy's numbers in a checkpoint: ``torch.load`` reads them again, and still runs no code."""
+    scalar: Any = np.float64(0).__reduce__()[0]
+    kinds = [type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int32, np.int64)]
+    missing = scalar not in torch.serialization.get_safe_globals()
+    torch.serialization.add_safe_globals([scalar, np.dtype, *kinds])
+    return missing
 
 
 NAMES: dict[str, tuple[str, Callable[[], bool]]] = {
@@ -132,6 +141,7 @@ NAMES: dict[str, tuple[str, Callable[[], bool]]] = {
     "imp": ("removed in Python 3.12", _imp),
     "tensorflow.summary": ("of TensorFlow 1, written by TensorBoard", _tensorflow),
     "torchvision": ("imported without use; empty here", _torchvision),
+    "torch.load": ("of numpy's numbers, refused since torch 2.6", _torch_load),
     "spconv": ("of spconv 1, by spconv 2", _spconv),
 }
 """Name: (since when or how, the function that sets it and returns whether it was missing)."""
