@@ -23,7 +23,6 @@ os.environ.setdefault("NUMBA_ENABLE_CUDASIM", "1")  # before anything imports nu
 import spconv.pytorch  # noqa: F401 - the launcher looks whether it is there
 import torch
 from cpu_torchvision import import_torchvision
-from spconv.pytorch.conv import SparseConvolution
 from torch.utils.cpp_extension import load
 
 NEEDS_GPU = (
@@ -111,8 +110,6 @@ def main() -> None:
     tools = Path(sys.argv[1]).resolve().parent
     prepare(tools.parent)
     os.environ["LIDAR_SYNTH_CPU"] = "1"
-    convolve = SparseConvolution._conv_forward  # adds a bias on a CPU only as it does in training, with the same result
-    SparseConvolution._conv_forward = lambda self, training, *args, **options: convolve(self, True, *args, **options)
     torch.cuda.FloatTensor = torch.FloatTensor
     wait = time.sleep
     time.sleep = lambda seconds: wait(min(seconds, 0.1))  # type: ignore[assignment]  # evaluation waits for checkpoints
