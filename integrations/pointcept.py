@@ -4,9 +4,11 @@
     hooks = [dict(type="SynthEpoch"), ...]
     data["train"] |= dict(type="MixedSemanticKITTI", mixture=dict(synthetic="bank/", ratio=0.25))
 
-A synthetic scan always brings its labels: Pointcept reads a missing ``.label`` as zeros, which mean "car".
+For segmentation, a synthetic scan always brings its labels: Pointcept reads a missing ``.label`` as zeros, which mean
+"car". Self-supervised pretraining reads no labels, so that its mixture may have ``labels: none``.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from lidar_synth.integrations.mixture import (
     require_ids,
 )
 
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.geometry.scan import Scan
 
@@ -40,7 +43,8 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
     """``SemanticKITTIDataset`` with synthetic samples, for training.
 
     Args:
-        mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them.
+        mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them. ``labels: none`` is
+            refused if the transforms collect ``segment``.
         options: as for ``SemanticKITTIDataset``. ``cache`` is refused, because it identifies samples by name only.
 
     Raises:
@@ -52,7 +56,9 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
             raise ConfigError("MixedSemanticKITTI with test_mode or cache", "training without a cache")
         super().__init__(**options)
         settings = read_settings(mixture)
-        refuse_unlabelled(settings, "Pointcept")
+        self._labelled = settings.get("labels", "generated") not in ("none", "ignore")
+        if collects_labels(options.get("transform")):
+            refuse_unlabelled(settings, "Pointcept")
         self._ids = id_table(0, self.ignore_index, np.int32)
         require_ids(self.learning_map, self._ids)
         self.mixed = mix(len(self.data_list), settings, lambda scan, rng: scan)
@@ -78,24 +84,60 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
         return {
             "coord": points[:, :3],
             "strength": points[:, 3:],
-            "segment": class_ids(sample, self._ids),
+            "segment": class_ids(sample, self._ids) if self._labelled else np.full(len(points), self._ids[IGNORE]),
             "name": f"synthetic_{sample.id}",
         }
 
 
+def collects_labels(transform: Any) -> bool:
+    """Whether a pipeline gives ``segment`` to the network; without a ``Collect`` step it gives everything."""
+    keys = [step["keys"] for step in transform or [] if step["type"] == "Collect"]
+    return not keys or any("segment" in ([each] if isinstance(each, str) else each) for each in keys)
+
+
+class EpochOf:
+    """A trainer's loader that sets the epoch of its mixtures each time it begins to iterate.
+
+    Pointcept requests scans before it calls a hook of an epoch, and any hook of ``before_train`` may change the epoch
+    in which training begins, as ``CheckpointLoader`` does. So the epoch is read when it is needed.
+
+    Args:
+        loader: any loader of Pointcept; whatever else is asked of it is passed on.
+        trainer: its ``epoch`` counts.
+    """
+
+    def __init__(self, loader: Any, trainer: Any) -> None:
+        self._loader, self._trainer = loader, trainer
+
+    def __iter__(self) -> Iterator[Any]:
+        for each in mixtures(self._loader):
+            each.set_epoch(self._trainer.epoch)
+        return iter(self._loader)
+
+    def __len__(self) -> int:
+        return len(self._loader)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loader, name)
+
+
+def mixtures(loader: Any) -> list[MixedSemanticKITTI]:
+    """The mixtures that a loader reads, also within ``ConcatDataset`` and ``MultiDatasetDataloader``."""
+    datasets = loader.datasets if hasattr(loader, "datasets") else [loader.dataset]
+    return [each for dataset in datasets for each in inner(dataset) if isinstance(each, MixedSemanticKITTI)]
+
+
 @HOOKS.register_module()
 class SynthEpoch(HookBase):  # type: ignore[misc]
-    """Sets the next epoch when one ends, because Pointcept's loader requests scans before it calls hooks."""
+    """Sets the epoch of the mixtures in the training data, at any place among the hooks.
+
+    Raises:
+        ConfigError: if the training data have none.
+    """
 
     def before_train(self) -> None:
-        """Set the epoch in which training begins."""
-        self._tell(self.trainer.start_epoch)
-
-    def after_epoch(self) -> None:
-        """Set the next epoch."""
-        self._tell(self.trainer.epoch + 1)
-
-    def _tell(self, epoch: int) -> None:
-        for each in inner(self.trainer.train_loader.dataset):
-            if isinstance(each, MixedSemanticKITTI):
-                each.set_epoch(epoch)
+        """Set the epoch whenever the training loader begins to iterate."""
+        loader = self.trainer.train_loader
+        if not mixtures(loader):
+            raise ConfigError("the hook SynthEpoch without a mixture", "MixedSemanticKITTI in data.train")
+        self.trainer.train_loader = EpochOf(loader, self.trainer)

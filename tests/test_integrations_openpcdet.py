@@ -1,7 +1,11 @@
 # ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
-"""OpenPCDet's own dataset, augmentor and collate code on mixed scans: OPENPCDET_ROOT is a checkout, built or not."""
+"""OpenPCDet's own dataset, augmentor, collate code and ``train.py`` on mixed scans: OPENPCDET_ROOT is a checkout.
+
+It need not be built: ``openpcdet_cpu`` compiles what OpenPCDet has for a CPU, and says what these tests do not show.
+"""
 
 import importlib
+import pickle
 import re
 import sys
 from collections import Counter
@@ -12,20 +16,22 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from checkouts import checkout, launch, openpcdet_stand_ins
+from checkouts import SCRIPTS, checkout, needs, run_script
 
 ROOT = checkout("OPENPCDET_ROOT", "OpenPCDet")
-easydict = pytest.importorskip("easydict", reason="easydict is not installed")
-pytest.importorskip("skimage", reason="scikit-image is not installed")
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
-openpcdet_stand_ins()
+needs("skimage", "SharedArray", "spconv", "pyquaternion", "torchvision", "easydict")
+sys.path.insert(0, str(SCRIPTS))
+from openpcdet_cpu import prepare
 
+prepare(ROOT)
+
+import easydict
 import lidar_synth.integrations.openpcdet as adapter
 import pcdet
 import torch
 from layouts import write_all
 from lidar_synth.integrations.detection import in_view, write_gt_database
-from lidar_synth.integrations.openpcdet import NAME, register
+from lidar_synth.integrations.openpcdet import register
 from pcdet.datasets import __all__ as registered
 from pcdet.datasets.kitti import kitti_dataset
 from pcdet.datasets.kitti.kitti_dataset import KittiDataset, create_kitti_infos
@@ -38,12 +44,13 @@ from lidar_synth.geometry.scan import Boxes
 from lidar_synth.labels import ObjectBank
 
 REAL, EXTRA, CLASSES = 6, 4, ["Car"]
+VALIDATION = 2  # further real scans
+NAME = "MixedKitti"
 
 
 def config(root: Path, synthetic_scans: Path, sampling: bool = True, **settings: Any) -> Any:
-    """The stock data configuration, without its last step (spconv's voxels), for the tests' scans."""
+    """The stock data configuration for the tests' scans."""
     loaded = yaml.safe_load((ROOT / "tools/cfgs/dataset_configs/kitti_dataset.yaml").read_text())
-    loaded["DATA_PROCESSOR"] = loaded["DATA_PROCESSOR"][:2]
     loaded["DATA_PATH"] = str(root)
     loaded["LIDAR_SYNTH"] = {"SYNTHETIC": str(synthetic_scans), "RATIO": 0.4, "SEED": 3, **settings}
     augment = loaded["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"]
@@ -74,21 +81,21 @@ def make(root: Path) -> Path:
     """KITTI's folders, their info lists and GT database by OpenPCDet's own code, and synthetic scans."""
     synthetic(root / "synthetic", 11)
     synthetic(root / "bare", 5, boxes=False)
-    kitti(root / "kitti", REAL)
+    kitti(root / "kitti", REAL + VALIDATION)
     write_infos(root / "kitti")
     return root
 
 
 def write_infos(root: Path) -> None:
-    import pickle
-
     kitti_dataset.Path = Path  # it imports that only when it is run as a script
-    (root / "ImageSets" / "val.txt").write_text("")
+    frames = [f"{i:06d}\n" for i in range(REAL + VALIDATION)]
     loaded = config(root, root)
-    dataset = KittiDataset(loaded, CLASSES, training=False, root_path=root)
-    dataset.set_split("train")
-    with (root / "kitti_infos_train.pkl").open("wb") as file:
-        pickle.dump(dataset.get_infos(num_workers=1), file)
+    for split, part in {"val": frames[REAL:], "train": frames[:REAL]}.items():
+        (root / "ImageSets" / f"{split}.txt").write_text("".join(part))
+        dataset = KittiDataset(loaded, CLASSES, training=False, root_path=root)
+        dataset.set_split(split)
+        with (root / f"kitti_infos_{split}.pkl").open("wb") as file:
+            pickle.dump(dataset.get_infos(num_workers=1), file)
     dataset.create_groundtruth_database(root / "kitti_infos_train.pkl", split="train")
 
 
@@ -129,7 +136,7 @@ def test_real_samples_are_the_trainers_own(made: Path) -> None:
         # GT sampling goes on through its database from sample to sample.
         own = theirs[index]
         assert set(mine) == set(own)
-        for key in ("points", "gt_boxes"):
+        for key in ("points", "gt_boxes", "voxels", "voxel_coords", "voxel_num_points"):
             assert mine[key].dtype == own[key].dtype and np.array_equal(mine[key], own[key])
 
 
@@ -162,14 +169,16 @@ def test_gt_sampling_places_objects_on_the_synthetic_ground(made: Path) -> None:
 
 def test_synthetic_scans_without_boxes_are_refused_not_replaced(made: Path) -> None:
     """Trap: OpenPCDet puts another scan in their place, and the mixture becomes all real."""
-    dataset = build(made, "bare", sampling=False)
-    np.random.seed(0)
-    for position in range(len(dataset)):
-        if dataset.domain(position):
-            with pytest.raises(DataError, match="synthetic scan '.*' has no box .*labels: mix"):
-                dataset[position]
-        else:
-            assert not is_synthetic(dataset[position]["frame_id"])
+    dataset = build(made, sampling=False)
+    dataset.data_processor.data_processor_queue.insert(0, no_boxes)
+    for position in (i for i in range(len(dataset)) if dataset.domain(i)):
+        with pytest.raises(DataError, match="synthetic scan '.*' has no box .*labels: mix"):
+            dataset[position]
+
+
+def no_boxes(data_dict: Any) -> Any:
+    """A step of OpenPCDet's processing after which no box is in range."""
+    return data_dict | {"gt_boxes": data_dict["gt_boxes"][:0]}
 
 
 def test_real_scans_without_boxes_are_replaced_by_real_ones(made: Path) -> None:
@@ -194,7 +203,7 @@ def test_the_trainers_generator_does_not_decide_on_scans(made: Path) -> None:
 
 
 def test_a_database_of_any_source_is_drawn_from(made: Path, tmp_path: Path) -> None:
-    root = kitti(tmp_path / "kitti", REAL)
+    root = kitti(tmp_path / "kitti", REAL + VALIDATION)
     write_infos(root)
     objects = ObjectBank.from_scans(open_scans(made / "synthetic"))
     write_gt_database(objects, root, origin="gravity", folder="gt_town", infos="kitti_dbinfos_train.pkl")
@@ -244,11 +253,19 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(made: Path
     boxes = [scan.boxes for scan in scans]
     renamed = [replace(s, boxes=replace(b, names=("car",) * 3)) for s, b in zip(scans, boxes, strict=True) if b]
     write_all("npz", tmp_path / "named", renamed)
-    build(made, tmp_path / "without")
-    with pytest.raises(DataError, match="has no boxes, and there is no gt_sampling"):
-        build(made, tmp_path / "without", sampling=False)
+    for sampling in (True, False):
+        with pytest.raises(DataError, match="synthetic scan '.*' has no boxes.*labels: mix"):
+            build(made, tmp_path / "without", sampling=sampling)
     with pytest.raises(DataError, match="boxes of .'car'. in synthetic scan .* some of Car"):
         build(made, tmp_path / "named")
+    some = [replace(s, boxes=replace(b, names=("Car", "car", "Car"))) for s, b in zip(scans, boxes, strict=True) if b]
+    write_all("npz", tmp_path / "some", some)
+    with pytest.raises(DataError, match="boxes of .'car'. in synthetic scan .* OpenPCDet drops boxes of other names"):
+        build(made, tmp_path / "some")
+    with pytest.raises(DataError, match="no box of .'Car'., and there is no gt_sampling"):
+        build(made, "bare", sampling=False)
+    with pytest.raises(ConfigError, match="epoch_size: replace"):
+        build(made, RATIO=[0.2, 0.4])
     calib = made / "kitti" / "training" / "calib" / "000002.txt"
     calib.rename(calib.with_suffix(".gone"))
     with pytest.raises(ConfigError, match="calib without 1 scans .000002"):
@@ -256,49 +273,74 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(made: Path
     calib.with_suffix(".gone").rename(calib)
 
 
-def test_the_training_loop_tells_the_epoch(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lidar_synth.integrations.openpcdet import tell_epochs
-    from train_utils import train_utils as loop
-
-    told: list[int] = []
-    monkeypatch.setattr(loop, "train_one_epoch", lambda *args, **options: told.append(args[2].dataset.mixed.epoch))
-    tell_epochs()
-    dataset = build(made)
-    loader = DataLoader(dataset, batch_size=2, collate_fn=dataset.collate_batch)
-    monkeypatch.setattr(loop, "disable_augmentation_hook", lambda *args: False)
-    monkeypatch.setattr(loop, "save_checkpoint", lambda *args, **options: None)
-    monkeypatch.setattr(loop, "checkpoint_state", lambda *args: {})
-    loop.train_model(
-        torch.nn.Linear(1, 1), None, loader, None, None, easydict.EasyDict(), 3, 5, 0, 0, None, made, cfg={}
-    )
-    assert told == [3, 4]
-
-
-def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> None:
-    """Stock PointPillars, only smaller: ``train.py`` as a user types it, two epochs with two workers."""
-    tools = ROOT / "tools"
-    own = yaml.safe_load((tools / "cfgs/kitti_models/pointpillar.yaml").read_text())
-    data, model = own["DATA_CONFIG"], own["MODEL"]
-    data |= {"DATA_PATH": str(made / "kitti"), "POINT_CLOUD_RANGE": [0, -12.8, -3, 25.6, 12.8, 1]}
-    data["DATA_PROCESSOR"][2]["VOXEL_SIZE"] = [0.4, 0.4, 4]
-    sampling = data["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]
+def small(made: Path, folder: Path, **data: Any) -> list[str]:
+    """The arguments of ``train.py`` for stock PointPillars, only smaller, with cars only."""
+    own = yaml.safe_load((ROOT / "tools/cfgs/kitti_models/pointpillar.yaml").read_text())
+    own["DATA_CONFIG"] |= {"DATA_PATH": str(made / "kitti"), "POINT_CLOUD_RANGE": [0, -12.8, -3, 25.6, 12.8, 1]} | data
+    own["DATA_CONFIG"]["DATA_PROCESSOR"][2]["VOXEL_SIZE"] = [0.4, 0.4, 4]
+    sampling = own["DATA_CONFIG"]["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]
     sampling |= {"SAMPLE_GROUPS": ["Car:3"], "PREPARE": {"filter_by_min_points": ["Car:5"]}}
     own["CLASS_NAMES"] = CLASSES
-    del model["DENSE_HEAD"]["ANCHOR_GENERATOR_CONFIG"][1:]
-    model["BACKBONE_2D"] |= {"NUM_FILTERS": [16, 16, 16], "NUM_UPSAMPLE_FILTERS": [16, 16, 16]}
-    (tmp_path / "small.yaml").write_text(yaml.safe_dump(own))
+    del own["MODEL"]["DENSE_HEAD"]["ANCHOR_GENERATOR_CONFIG"][1:]
+    own["MODEL"]["BACKBONE_2D"] |= {"NUM_FILTERS": [16, 16, 16], "NUM_UPSAMPLE_FILTERS": [16, 16, 16]}
+    own["MODEL"]["POST_PROCESSING"]["SCORE_THRESH"] = 0.01  # it learns little, and its boxes are to be evaluated
+    own["MODEL"]["POST_PROCESSING"]["NMS_CONFIG"]["NMS_POST_MAXSIZE"] = 20
+    (folder / "small.yaml").write_text(yaml.safe_dump(own))
     mixture = {"synthetic": str(made / "synthetic"), "ratio": 0.4, "seed": 3}
-    (tmp_path / "mix.yaml").write_text(yaml.safe_dump(mixture))
-    said = launch(
-        "openpcdet", "train.py", "--cfg_file", str(tmp_path / "small.yaml"), "--epochs", "2", "--batch_size", "2",
-        "--workers", "2", "--fix_random_seed", "--logger_iter_interval", "1", "--wo_gpu_stat",
-        "--set", "DATA_CONFIG.DATASET", NAME,
-        cwd=tools, mixture=tmp_path / "mix.yaml",
+    (folder / "mix.yaml").write_text(yaml.safe_dump(mixture))
+    return [
+        "train.py", "--cfg_file", str(folder / "small.yaml"), "--epochs", "2", "--batch_size", "2", "--workers", "2",
+        "--logger_iter_interval", "1", "--wo_gpu_stat", "--set", "DATA_CONFIG.DATASET", NAME,
+    ]  # fmt: skip
+
+
+def trained(folder: Path, output: Path, arguments: list[str]) -> tuple[list[list[str]], str]:
+    """The training batches of a run of ``train.py``, and all that it said."""
+    said = run_script(
+        SCRIPTS / "openpcdet_cpu.py", *arguments, cwd=ROOT / "tools", mixture=folder / "mix.yaml",
+        OPENPCDET_OUTPUT=str(output),
     )  # fmt: skip
+    before, _, _ = said.partition("Start evaluation")
+    return [yaml.safe_load(batch) for batch in re.findall(r"batch of (\[.*\])", before)], said
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_its_own_script_trains_evaluates_and_resumes_from_our_launcher(made: Path, tmp_path: Path) -> None:
+    """``train.py`` as a user types it, with its evaluation, and resumed at the start and in the middle of an epoch.
+
+    This does not show: OpenPCDet's GPU kernels of the overlaps of boxes, of which those for a CPU are used.
+    """
+    arguments = small(made, tmp_path)
+    batches, said = trained(tmp_path, tmp_path / "whole", arguments)
     losses = [float(value) for value in re.findall(r"Loss: (\S+) ", said)]
-    batches = [yaml.safe_load(batch) for batch in re.findall(r"batch of (.*)", said)]
     each = (REAL + EXTRA) // 2
     assert len(losses) == len(batches) == 2 * each and np.isfinite(losses).all()
     for epoch in (batches[:each], batches[each:]):
-        assert sum(map(Counter, epoch), Counter()) == {"real": REAL, "synthetic": EXTRA}
-    assert list(tmp_path.rglob("checkpoint_epoch_2.pth"))
+        assert Counter(is_synthetic(name) for batch in epoch for name in batch) == {False: REAL, True: EXTRA}
+    first, second = (
+        {n for batch in part for n in batch if is_synthetic(n)} for part in (batches[:each], batches[each:])
+    )
+    assert not first & second
+    assert re.search(r"Car AP_R40@0.70, 0.70, 0.70:\s*bbox AP:[\d., ]+\s*bev  AP:[\d., ]+\s*3d   AP:[\d., ]+", said)
+
+    end = next((tmp_path / "whole").rglob("checkpoint_epoch_1.pth"))
+    state = torch.load(end, weights_only=False)
+    assert state["it"] == each
+    for done in (0, 2):  # of the second epoch; OpenPCDet writes latest_model.pth in the middle of an epoch
+        output = tmp_path / f"after-{done}"
+        folder = output / end.parent.relative_to(tmp_path / "whole")
+        folder.mkdir(parents=True)
+        torch.save(state | {"it": each + done}, folder / "latest_model.pth")
+        rest, _ = trained(tmp_path, output, arguments)
+        assert rest == batches[each + done :]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_its_own_script_refuses_scans_without_boxes_before_training(made: Path, tmp_path: Path) -> None:
+    write_all("npz", tmp_path / "without", [replace(street(i), boxes=None) for i in range(4)])
+    arguments = small(made, tmp_path)
+    (tmp_path / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(tmp_path / "without"), "labels": "generated"}))
+    with pytest.raises(RuntimeError, match="has no boxes; expected boxes, or every object in it would be background"):
+        trained(tmp_path, tmp_path, arguments)

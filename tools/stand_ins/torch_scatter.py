@@ -1,7 +1,7 @@
-"""The two functions of torch_scatter that FRNet calls, by torch's own operators.
+"""The functions of torch_scatter that FRNet and Pointcept call, by torch's own operators.
 
 torch_scatter is distributed as source only and takes half an hour to compile. Put this folder on PYTHONPATH to try
-FRNet without it; on a GPU install the real library.
+these trainers without it; on a GPU install the real library.
 """
 
 import torch
@@ -18,6 +18,36 @@ def scatter_max(
 def scatter_mean(src: Tensor, index: Tensor, dim: int = -1, out: None = None, dim_size: int | None = None) -> Tensor:
     """The mean of the values for each index; 0 for an index without values."""
     return _reduce(src, index, dim, dim_size, "mean")
+
+
+def segment_coo(
+    src: Tensor, index: Tensor, out: None = None, dim_size: int | None = None, reduce: str = "sum"
+) -> Tensor:
+    """Reduce rows that belong to the same segment; ``index`` (N,) is sorted."""
+    return _reduce(src, index, 0, dim_size, KINDS[reduce])
+
+
+def segment_csr(src: Tensor, indptr: Tensor, out: None = None, reduce: str = "sum") -> Tensor:
+    """Reduce rows of consecutive segments; segment i has the rows from ``indptr[i]`` to ``indptr[i + 1]``."""
+    lengths = indptr.diff()
+    index = torch.arange(len(lengths), device=src.device).repeat_interleave(lengths)
+    return _reduce(src, index, 0, len(lengths), KINDS[reduce])
+
+
+KINDS = {"sum": "sum", "add": "sum", "mean": "mean", "min": "amin", "max": "amax"}
+"""torch's name of each reduction."""
+
+
+def scatter_min(
+    src: Tensor, index: Tensor, dim: int = -1, out: None = None, dim_size: int | None = None
+) -> tuple[Tensor, None]:
+    """The smallest value for each index, and None for its position."""
+    return _reduce(src, index, dim, dim_size, "amin"), None
+
+
+def scatter_softmax(*args: object, **options: object) -> None:
+    """Imported by Pointcept for its StratifiedTransformer, which needs further libraries for a GPU."""
+    raise RuntimeError("install torch_scatter")
 
 
 def _reduce(src: Tensor, index: Tensor, dim: int, size: int | None, how: str) -> Tensor:

@@ -1,0 +1,133 @@
+"""What OpenPCDet's mixed datasets share: which sample is at a position, and what is refused before training."""
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from lidar_synth.integrations.mixture import mix, read_settings
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.scan import Scan
+
+LOOKED_AT = 16
+"""Number of synthetic scans among which one has to have a box, if GT sampling adds none."""
+
+
+class Mixed:
+    """A dataset of OpenPCDet mixed with synthetic scans; evaluation uses only real ones.
+
+    Combine it with a dataset class of OpenPCDet, ``class MixedKitti(Mixed, KittiDataset)``, that calls ``_start`` at
+    the end of its ``__init__`` and defines ``_synthetic``.
+
+    OpenPCDet replaces a scan without boxes after augmentation by another random scan. To keep the ratio, a real scan is
+    replaced by a real one here, and a synthetic one raises an error: ``labels: mix`` gives synthetic scans boxes.
+
+    OpenPCDet counts the iterations of an epoch once. All epochs therefore have the length of the first one, and one
+    with a synthetic scan fewer repeats a sample.
+    """
+
+    _current: int | None = None  # the position whose sample is being made
+    mixed: Any = None
+    dataset_cfg: Any
+    class_names: Any
+
+    def _start(self, known: Collection[str]) -> None:
+        """Make the mixture and check its first synthetic scans; ``known`` are the class names that a box may have."""
+        settings = read_settings(self.dataset_cfg.get("LIDAR_SYNTH", None))
+        ratio = settings.get("ratio", 0.25)
+        if not isinstance(ratio, int | float) and settings.get("epoch_size", "add") == "add":
+            raise ConfigError(
+                f"ratio {ratio} with epochs of different lengths",
+                "one ratio, or epoch_size: replace",
+                "OpenPCDet counts the iterations of an epoch once.",
+            )
+        self.mixed = mix(super().__len__(), settings, lambda scan, rng: scan)  # type: ignore[misc]
+        self._length = self.mixed.length(0)
+        self._check_boxes({*self.class_names, *known})
+
+    def _synthetic(self, scan: Scan) -> Any:
+        """Process a synthetic scan with the trainer's own augmentation and processing."""
+        raise NotImplementedError
+
+    def merge_all_iters_to_one_epoch(self, merge: bool = True, epochs: int | None = None) -> None:
+        """Refuse to merge epochs of a mixture, which differ from one another.
+
+        Raises:
+            ConfigError: with ``merge`` for a mixture.
+        """
+        if merge and self.mixed is not None:
+            raise ConfigError(f"merge_all_iters_to_one_epoch with {type(self).__name__}", "epochs one by one")
+        super().merge_all_iters_to_one_epoch(merge, epochs)  # type: ignore[misc]
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch, also for workers."""
+        if self.mixed is not None:
+            self.mixed.set_epoch(epoch)
+
+    def domain(self, index: int) -> int:
+        """0 if the sample at ``index`` is real in this epoch, 1 if it is synthetic."""
+        return 0 if self.mixed is None else int(self.mixed.domain(index % len(self.mixed)))
+
+    def __len__(self) -> int:
+        # While OpenPCDet's own code works, it counts real scans.
+        if self.mixed is None or self._current is not None:
+            return int(super().__len__())  # type: ignore[misc]
+        return int(self._length)
+
+    def __getitem__(self, index: int) -> Any:
+        if self.mixed is None:
+            return super().__getitem__(index)  # type: ignore[misc]
+        if self._current is not None:
+            return self._replacement(index)
+        self._current = index % len(self.mixed)
+        try:
+            sample = self.mixed[self._current]
+            if isinstance(sample, Scan):
+                return self._synthetic(sample)
+            return super().__getitem__(int(sample))  # type: ignore[misc]
+        finally:
+            self._current = None
+
+    def _replacement(self, index: int) -> Any:
+        """The sample with which ``prepare_data`` replaces a scan without boxes after augmentation."""
+        assert self._current is not None
+        if not self.mixed.domain(self._current):
+            return super().__getitem__(index)  # type: ignore[misc]
+        scan = self.mixed[self._current]
+        raise DataError(
+            f"synthetic scan {scan.id!r} has no box of {list(self.class_names)} in range after augmentation",
+            "at least one, because OpenPCDet would replace the scan by another one",
+            "Use labels: mix with a bank of objects, and gt_sampling.",
+        )
+
+    def _check_boxes(self, known: Collection[str]) -> None:
+        """Check that the first synthetic scans have boxes, and only of known classes."""
+        hint = "labels: mix with a bank of objects gives a scan boxes."
+        used = False
+        for position in np.flatnonzero(self.mixed.plan().domain)[:LOOKED_AT]:
+            scan = self.mixed[int(position)]
+            if scan.boxes is None:
+                given = f"synthetic scan {scan.id!r} has no boxes"
+                raise DataError(given, "boxes, or every object in it would be background", hint)
+            if lost := sorted(set(scan.boxes.names) - set(known)):
+                raise DataError(
+                    f"boxes of {lost} in synthetic scan {scan.id!r}",
+                    f"some of {', '.join(sorted(known))}",
+                    "OpenPCDet drops boxes of other names. Rename them to its classes.",
+                )
+            used = used or bool(self._trained_names(scan) & set(self.class_names))
+            if used or self._sampling():
+                return
+        if self.mixed.plan().synthetics and not used:
+            given = f"the first synthetic scans have no box of {list(self.class_names)}, and there is no gt_sampling"
+            raise DataError(given, "boxes, for a detector", hint)
+
+    def _trained_names(self, scan: Scan) -> set[str]:
+        """The class names that a scan's boxes have for the trainer."""
+        return set() if scan.boxes is None else set(scan.boxes.names)
+
+    def _sampling(self) -> list[Any]:
+        """The steps of GT sampling that are in use."""
+        steps = self.dataset_cfg.DATA_AUGMENTOR
+        unused = steps.get("DISABLE_AUG_LIST", [])
+        return [s for s in steps.AUG_CONFIG_LIST if s.NAME == "gt_sampling" and s.NAME not in unused]

@@ -1,0 +1,95 @@
+"""What OpenPCDet makes once from a dataset, on a machine without a GPU: info lists and the database of GT sampling.
+
+    python openpcdet_prepare.py TREE kitti FOLDER       or       python openpcdet_prepare.py TREE nuscenes FOLDER
+
+FOLDER is KITTI's object set with ``ImageSets``, or the folder that holds ``v1.0-mini``. KITTI's planes are fitted where
+they are missing. A class without objects gets an empty entry, which OpenPCDet's sampler looks up.
+"""
+
+import argparse
+import json
+import pickle
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+from openpcdet_cpu import prepare
+
+VERSION = "v1.0-mini"
+TABLES = ("sensor", "calibrated_sensor", "sample_data")
+
+
+def main() -> None:
+    """Write the files beside the dataset."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tree", type=Path)
+    parser.add_argument("kind", choices=["kitti", "nuscenes"])
+    parser.add_argument("folder", type=Path)
+    options = parser.parse_args()
+    prepare(options.tree)
+    import torch
+    import yaml
+    from easydict import EasyDict
+
+    torch.Tensor.cuda = lambda self, *args, **kwargs: self  # type: ignore[method-assign]
+    stock = options.tree / "tools" / "cfgs" / "dataset_configs" / f"{options.kind}_dataset.yaml"
+    config = EasyDict(yaml.safe_load(stock.read_text()))
+    {"kitti": prepare_kitti, "nuscenes": prepare_nuscenes}[options.kind](config, options.folder)
+
+
+def prepare_kitti(config: Any, folder: Path) -> None:
+    """Info lists of both splits, GT database and planes."""
+    from lidar_synth.integrations.folders import write_planes
+    from pcdet.datasets.kitti import kitti_dataset
+
+    kitti_dataset.Path = Path  # it imports that only when it is run as a script
+    write_planes(folder)
+    for split in ("val", "train"):
+        dataset = kitti_dataset.KittiDataset(config, ["Car", "Pedestrian", "Cyclist"], training=False, root_path=folder)
+        dataset.set_split(split)
+        file = folder / f"kitti_infos_{split}.pkl"
+        file.write_bytes(pickle.dumps(dataset.get_infos(num_workers=1)))
+    dataset.create_groundtruth_database(file, split="train")
+    complete(folder / "kitti_dbinfos_train.pkl", ["Car", "Pedestrian", "Cyclist"])
+
+
+def prepare_nuscenes(config: Any, folder: Path) -> None:
+    """Info lists of both splits and GT database."""
+    from pcdet.datasets.nuscenes.nuscenes_dataset import NuScenesDataset, create_nuscenes_info
+    from pcdet.utils.common_utils import create_logger
+
+    add_camera(folder / VERSION / VERSION)
+    create_nuscenes_info(VERSION, folder, folder, config.MAX_SWEEPS)
+    config.VERSION = VERSION
+    dataset = NuScenesDataset(config, None, training=True, root_path=folder, logger=create_logger())
+    dataset.create_groundtruth_database(max_sweeps=config.MAX_SWEEPS)
+    names = [group.partition(":")[0] for group in config.DATA_AUGMENTOR.AUG_CONFIG_LIST[0].SAMPLE_GROUPS]
+    complete(folder / VERSION / f"nuscenes_dbinfos_{config.MAX_SWEEPS}sweeps_withvelo.pkl", names)
+
+
+def add_camera(folder: Path) -> None:
+    """Add a front camera to nuScenes' tables that have none, because OpenPCDet reads its pose; there is no picture."""
+    tables = {name: json.loads((folder / f"{name}.json").read_text()) for name in TABLES}
+    if any(row["channel"] == "CAM_FRONT" for row in tables["sensor"]):
+        return
+    tables["sensor"].append({"token": "camera", "channel": "CAM_FRONT", "modality": "camera"})
+    pose = {"translation": [1.7, 0, 1.5], "rotation": [0.5, -0.5, 0.5, -0.5]}  # z ahead, x right, y down
+    lens = {"camera_intrinsic": [[1266, 0, 800], [0, 1266, 450], [0, 0, 1]]}
+    tables["calibrated_sensor"].append({"token": "camera", "sensor_token": "camera", **pose, **lens})
+    for row in [row for row in tables["sample_data"] if row["is_key_frame"]]:
+        new = {"token": f"{row['token']}-camera", "calibrated_sensor_token": "camera", "fileformat": "jpg"}
+        new |= {"height": 900, "width": 1600, "filename": "samples/CAM_FRONT/none.jpg", "prev": "", "next": ""}
+        tables["sample_data"].append(row | new)
+    for name, rows in tables.items():
+        (folder / f"{name}.json").write_text(json.dumps(rows))
+
+
+def complete(file: Path, names: list[str]) -> None:
+    """Add classes without objects to a GT database's list, which this script has just written."""
+    found = pickle.loads(file.read_bytes())
+    file.write_bytes(pickle.dumps({name: [] for name in names} | found))
+
+
+if __name__ == "__main__":
+    main()
