@@ -172,7 +172,7 @@ def write_gt_database(
         path = f"{folder}/{scan}_{name}_{objects.number[i]}.bin"
         values = [points, objects.reflectance[part]]
         if nuscenes:
-            values = [points, objects.reflectance[part] * INTENSITY_MAX, np.zeros(len(points))]
+            values = [points, objects.reflectance[part] * INTENSITY_MAX, np.zeros(len(points), np.float32)]
             box = np.append(box, np.zeros(2, np.float32))
         write_file(root / path, np.column_stack(values).astype("<f4").tobytes())
         facts = {"name": name, "path": path, "image_idx": scan, "gt_idx": int(objects.number[i]), "box3d_lidar": box}

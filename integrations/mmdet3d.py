@@ -47,6 +47,10 @@ except ImportError as error:
 if not mmdet3d.__version__.startswith("1.4."):
     raise LibraryError(f"mmdet3d {mmdet3d.__version__}", "1.4", "bash tools/install_mmdet3d.sh")
 
+from lidar_synth.integrations.mmdet3d_checkpoints import allow_checkpoints  # needs mmengine  # noqa: E402
+
+allow_checkpoints()
+
 
 @register_backend("lsynth", prefixes="lsynth", force=True)
 class SynthBackend(BaseStorageBackend):  # type: ignore[misc]
@@ -156,7 +160,7 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
         dataset.__getitems__ = Fetch(dataset, [folder.path for folder in folders])
         self.start = 0
 
-    def __iter__(self) -> Iterator[tuple[int, int]]:  # type: ignore[override]
+    def __iter__(self) -> Iterator[tuple[int, int]]:
         """The (epoch, index) of each sample."""
         start, self.start = self.start, 0
         epoch = self.epoch

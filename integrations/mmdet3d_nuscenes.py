@@ -60,7 +60,8 @@ def _entry(tables: Any, sample: dict[str, Any], sweeps: int) -> dict[str, Any]:
     in_ego, in_world = _poses(tables, frame)
     points = {"lidar_path": Path(frame["filename"]).name, "num_pts_feats": 5, "lidar2ego": in_ego.tolist()}
     entry = {"token": sample["token"], "timestamp": frame["timestamp"] / 1e6, "ego2global": in_world.tolist()}
-    found, earlier = [], frame
+    found: list[dict[str, Any]] = []
+    earlier = frame
     while earlier["prev"] and len(found) < sweeps:
         earlier = tables.get("sample_data", earlier["prev"])
         found.append(_sweep(tables, earlier, in_world @ in_ego))

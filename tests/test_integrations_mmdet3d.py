@@ -357,7 +357,8 @@ def test_configurations_change_data_only(path: Path) -> None:
     changed = {key for key in ours if ours[key] != theirs.get(key)} | set(theirs) - set(ours)
     assert all(key.startswith((".train_dataloader", ".custom")) for key in changed)
     names = {key.rpartition(".")[2] for key in changed}
-    assert names <= {"imports", "allow_failed_imports", "custom_hooks", *DATA_KEYS}, changed
+    defaults = {"backend_args", "test_mode"}  # left out where the dataset is written anew
+    assert names <= {"imports", "allow_failed_imports", "custom_hooks", *defaults, *DATA_KEYS}, changed
     assert {"type": "SynthEpochHook"} in [dict(h) for h in config.custom_hooks]
 
 

@@ -5,6 +5,7 @@ The network is one number, so that these tests are about data alone; the trainer
 ``test_integrations_mmdet3d_train.py``.
 """
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -138,3 +139,16 @@ def test_the_hook_asks_for_the_sampler(listed: Path, tmp_path: Path) -> None:
     for stock in ("DefaultSampler", "InfiniteSampler"):
         with pytest.raises(ConfigError, match=f"sampler {stock}.*type='SynthSampler'"):
             run(listed, tmp_path / stock, LOOPS["epochs"], {"interval": 1}, sampler={"type": stock, "shuffle": True})
+
+
+class Harmful:
+    def __reduce__(self) -> Any:
+        return getattr, (Path, "unlink")
+
+
+@pytest.mark.parametrize("content", [Harmful(), {"f": Path.unlink}], ids=["another method", "a function"])
+def test_a_checkpoint_still_cannot_name_other_functions(tmp_path: Path, content: Any) -> None:
+    """Reading mmengine's checkpoints is allowed for what they hold, with torch's own protection in force."""
+    torch.save({"meta": content}, tmp_path / "a.pth")
+    with pytest.raises(pickle.UnpicklingError, match="Weights only load failed|expected a method of"):
+        torch.load(tmp_path / "a.pth")

@@ -26,10 +26,14 @@ SCRIPTS = Path(__file__).parent.parent / "tools" / "trainers" / "scripts"
 TRAIN = Path(find_spec("mmdet3d").origin or "").parent / ".mim" / "tools" / "train.py"  # type: ignore[union-attr]
 
 
+ENVIRONMENT = {"PYTHONPATH": str(SCRIPTS), "NUMBA_ENABLE_CUDASIM": "1"}
+"""KITTI's metrics are kernels for CUDA by numba, which simulates them on a CPU if it is asked to."""
+
+
 def typed(folder: Path, *command: object) -> str:
     """The output of a command that a user types in a folder."""
     done = subprocess.run(
-        [sys.executable, *map(str, command)], cwd=folder, env=os.environ | {"PYTHONPATH": str(SCRIPTS)},
+        [sys.executable, *map(str, command)], cwd=folder, env=os.environ | ENVIRONMENT,
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]

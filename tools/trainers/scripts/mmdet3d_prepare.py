@@ -28,7 +28,7 @@ from lidar_synth.town import Town
 
 CONFIGS = Path(__file__).parents[3] / "configs" / "mmdet3d"
 MIX = {"ratio": 0.5, "seed": 0}
-SPCONV_ON_CPU = ("minkunet", "centerpoint_voxel")
+SPCONV_ON_CPU = ("centerpoint_voxel_nuscenes.py",)
 """Configurations whose sparse convolutions need ``spconv_on_cpu``."""
 
 
@@ -152,7 +152,7 @@ def main() -> None:
     if options.nuscenes:
         nuscenes(out, options.scans, options.frame)
     for name in options.configs:
-        extra = ("spconv_on_cpu",) if name.startswith(SPCONV_ON_CPU) else ()
+        extra = ("spconv_on_cpu",) if name in SPCONV_ON_CPU else ()
         shorten(name, out, extra=("mmdet3d_report", *extra))
 
 
