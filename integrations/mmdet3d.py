@@ -47,7 +47,7 @@ except ImportError as error:
 if not mmdet3d.__version__.startswith("1.4."):
     raise LibraryError(f"mmdet3d {mmdet3d.__version__}", "1.4", "bash tools/install_mmdet3d.sh")
 
-from lidar_synth.integrations.mmdet3d_checkpoints import allow_checkpoints  # needs mmengine  # noqa: E402
+from lidar_synth.integrations.mmdet3d_checkpoints import allow_checkpoints  # needs mmengine
 
 allow_checkpoints()
 

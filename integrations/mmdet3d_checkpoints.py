@@ -1,8 +1,8 @@
 """Resuming MMDetection3D from its own checkpoints with torch 2.6 or later.
 
-mmengine 0.10 reads a checkpoint by ``torch.load``, which since torch 2.6 refuses everything but tensors and plain values
-unless it is declared safe. A checkpoint of mmengine also holds numbers of numpy, the history of the loss and parts of
-the configuration: these are declared here, so that nothing has to be read as a pickle that may run code.
+mmengine 0.10 reads a checkpoint by ``torch.load``, which since torch 2.6 refuses everything but tensors and plain
+values, unless it is declared safe. A checkpoint of mmengine also holds numbers of numpy, the history of the loss and
+parts of the configuration. They are declared here, so that no pickle has to be read that may run code.
 """
 
 from collections.abc import Callable
