@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from lidar_synth.integrations.nuscenes import nuscenes_names, turned_boxes, turned_points
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
@@ -18,6 +19,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA
+from lidar_synth.formats.nuscenes import INTENSITY_MAX
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.ground import GROUND
@@ -124,7 +126,13 @@ def difficulty(boxes: Boxes) -> NDArray[np.int32]:
 
 
 def write_gt_database(
-    objects: ObjectBank, root: str | Path, *, origin: Origin, folder: str = "gt_database", infos: str
+    objects: ObjectBank,
+    root: str | Path,
+    *,
+    origin: Origin,
+    folder: str = "gt_database",
+    infos: str,
+    layout: Literal["kitti", "nuscenes"] = "kitti",
 ) -> Path:
     """Write a bank of objects as the database of a trainer's GT sampling.
 
@@ -137,24 +145,36 @@ def write_gt_database(
         origin: ``"gravity"`` for OpenPCDet, ``"bottom"`` for MMDetection3D.
         folder: of the points, under the root.
         infos: name of the list, such as ``kitti_dbinfos_train.pkl``.
+        layout: ``"nuscenes"`` turns the objects to nuScenes' frame and gives them its names, points of five values
+            (intensity 0..255, time 0) and boxes with a velocity of zero; objects of classes that it lacks are left out.
 
     Returns:
         The list's file.
 
     Raises:
+        DataError: for nuScenes, on a name that ``nuscenes.NAMES`` does not have.
         FileError: if it cannot be written.
     """
     root, found, level = Path(root), dict[str, list[dict[str, Any]]](), difficulty(objects.boxes)
-    for i, name in enumerate(objects.boxes.names):
+    nuscenes = layout == "nuscenes"
+    names = nuscenes_names(objects.boxes.names, "the bank of objects") if nuscenes else objects.boxes.names
+    boxes = (turned_boxes(objects.boxes) if nuscenes else objects.boxes).values
+    for i, name in enumerate(names):
+        if name is None:
+            continue
         part = slice(objects.start[i], objects.start[i + 1])
-        box, points = objects.boxes.values[i].copy(), objects.points[part].copy()
+        box, points = boxes[i].copy(), objects.points[part].copy()
+        points = turned_points(points) if nuscenes else points
         if origin == "bottom":
             box[2] -= box[5] / 2
             points[:, 2] += box[5] / 2
         scan = re.sub(r"\W+", "_", str(objects.scan[i]))
         path = f"{folder}/{scan}_{name}_{objects.number[i]}.bin"
-        content = np.column_stack([points, objects.reflectance[part]]).astype("<f4").tobytes()
-        write_file(root / path, content)
+        values = [points, objects.reflectance[part]]
+        if nuscenes:
+            values = [points, objects.reflectance[part] * INTENSITY_MAX, np.zeros(len(points), np.float32)]
+            box = np.append(box, np.zeros(2, np.float32))
+        write_file(root / path, np.column_stack(values).astype("<f4").tobytes())
         facts = {"name": name, "path": path, "image_idx": scan, "gt_idx": int(objects.number[i]), "box3d_lidar": box}
         facts |= {"num_points_in_gt": len(points), "difficulty": int(level[i]), "group_id": i, "score": -1.0}
         found.setdefault(name, []).append(facts | {"bbox": objects.boxes.image_box[i]})

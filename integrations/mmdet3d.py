@@ -1,27 +1,32 @@
-"""MMDetection3D 1.4: a file backend, a dataset and a hook, registered when a configuration imports this module::
+"""MMDetection3D 1.4: a file backend, datasets, a sampler and a hook, registered when a configuration imports this
+module::
 
     custom_imports = dict(imports=["lidar_synth.integrations.mmdet3d"])
     custom_hooks = [dict(type="SynthEpochHook")]
+    train_dataloader = dict(sampler=dict(_delete_=True, type="SynthSampler"), dataset=dict(ann_file=...))
 
 Segmentation uses the trainer's own datasets: the file backend serves points and labels of synthetic entries. Detection
-needs ``SynthKittiDataset``, whose synthetic entries get their boxes and ground plane from the scan.
+needs ``SynthKittiDataset`` or ``SynthNuScenesDataset``, whose synthetic entries get their boxes from the scan.
 ``mmdet3d_infos.write_infos`` writes the list, ``tools/install_mmdet3d.sh`` installs the trainer.
 """
 
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lidar_synth.integrations.detection import check_names, ground_plane
 from lidar_synth.integrations.mixture import id_table, inner, require_ids
-from lidar_synth.integrations.mmdet3d_infos import (
-    MIXTURE,
+from lidar_synth.integrations.mmdet3d_slots import (
     PREFIX,
     Folder,
+    is_mixed,
     open_folder,
     read_url,
     require_boxes,
     scan_of,
+    split_url,
 )
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError
@@ -29,16 +34,22 @@ from lidar_synth.geometry.scan import Scan
 
 try:
     import mmdet3d
-    from mmdet3d.datasets import KittiDataset, Seg3DDataset
-    from mmdet3d.registry import DATASETS, HOOKS
+    from mmdet3d.datasets import CBGSDataset, Det3DDataset, KittiDataset, NuScenesDataset, Seg3DDataset
+    from mmdet3d.registry import DATA_SAMPLERS, DATASETS, HOOKS
     from mmdet3d.structures import LiDARInstance3DBoxes
+    from mmengine.dataset import DefaultSampler
     from mmengine.fileio.backends import BaseStorageBackend, register_backend
     from mmengine.hooks import Hook
+    from mmengine.runner import EpochBasedTrainLoop
 except ImportError as error:
     raise LibraryError(f"mmdet3d cannot be imported ({error})", "1.4.0", "bash tools/install_mmdet3d.sh") from error
 
 if not mmdet3d.__version__.startswith("1.4."):
     raise LibraryError(f"mmdet3d {mmdet3d.__version__}", "1.4", "bash tools/install_mmdet3d.sh")
+
+from lidar_synth.integrations.mmdet3d_checkpoints import allow_checkpoints  # needs mmengine
+
+allow_checkpoints()
 
 
 @register_backend("lsynth", prefixes="lsynth", force=True)
@@ -58,98 +69,188 @@ class SynthBackend(BaseStorageBackend):  # type: ignore[misc]
         raise DataError(f"{filepath} read as text", "points (.bin) or labels (.label)")
 
 
-@DATASETS.register_module(force=True)
-class SynthKittiDataset(KittiDataset):  # type: ignore[misc]
-    """``KittiDataset`` for a mixed list: the boxes of a synthetic entry are those of its scan in this epoch.
+class SynthBoxes:
+    """What a ``Det3DDataset`` for a mixed list adds: a synthetic entry has the boxes of its scan in this epoch.
 
     Args:
-        options: as for ``KittiDataset``. ``filter_empty_gt`` must be False: replacing scans without boxes by others
-            would change the ratio.
+        options: as for the dataset. ``filter_empty_gt`` must be False: replacing scans without boxes by others would
+            change the ratio.
 
     Raises:
         ConfigError: on other boxes than LiDAR's, or ``filter_empty_gt``.
     """
 
     def __init__(self, **options: Any) -> None:
+        name = type(self).__name__
         if options.get("filter_empty_gt", True) and not options.get("test_mode", False):
             raise ConfigError(
-                "SynthKittiDataset with filter_empty_gt=True, which replaces every scan without a box by a random one",
+                f"{name} with filter_empty_gt=True, which replaces every scan without a box by a random one",
                 "filter_empty_gt=False",
                 "Give synthetic scans boxes by labels='mix'; ObjectSample adds more.",
             )
         if str(options.get("box_type_3d", "LiDAR")).lower() != "lidar":
-            raise ConfigError(f"box_type_3d={options['box_type_3d']!r} of SynthKittiDataset", "'LiDAR'")
+            raise ConfigError(f"box_type_3d={options['box_type_3d']!r} of {name}", "'LiDAR'")
         super().__init__(**options)
 
     def get_data_info(self, idx: int) -> dict[str, Any]:
-        """The trainer's entry; a synthetic one gets its boxes (centre of the floor) and its ground plane."""
-        info: dict[str, Any] = super().get_data_info(idx)
+        """The trainer's entry; a synthetic one gets the boxes of its scan, and a ground plane if real ones have one."""
+        info: dict[str, Any] = super().get_data_info(idx)  # type: ignore[misc]
         path = info["lidar_points"]["lidar_path"]
         if path.startswith(PREFIX):
-            folder, _, name = path.removeprefix(PREFIX).rpartition("/")
-            scan = scan_of(folder, int(name.removesuffix(".bin")))
+            scan = scan_of(*split_url(path)[:2])
             info["ann_info"] = self._annotations(scan)
-            info["plane"] = ground_plane(scan)
+            if "plane" in info:
+                info["plane"] = ground_plane(scan)
         return info
 
     def _annotations(self, scan: Scan) -> dict[str, Any]:
-        given, known = require_boxes(scan), self.METAINFO["classes"]
+        given, known = require_boxes(scan), self.METAINFO["classes"]  # type: ignore[attr-defined]
         check_names(scan, known)
-        ids = [self.label_mapping[known.index(n)] if n in known else -1 for n in given.names]
-        labels = np.array(ids, np.int64).reshape(-1)
-        boxes = LiDARInstance3DBoxes(given.values[labels >= 0], origin=(0.5, 0.5, 0.5))
+        mapping = self.label_mapping  # type: ignore[attr-defined]
+        labels = np.array([mapping[known.index(n)] if n in known else -1 for n in given.names], np.int64).reshape(-1)
+        values = given.values
+        if getattr(self, "with_velocity", False):  # nothing moves in the sweeps of a synthetic scan
+            values = np.column_stack([values, np.zeros((len(values), 2), np.float32)])
+        boxes = LiDARInstance3DBoxes(values[labels >= 0], box_dim=values.shape[1], origin=(0.5, 0.5, 0.5))
         return {"gt_bboxes_3d": boxes, "gt_labels_3d": labels[labels >= 0], "instances": []}
+
+
+@DATASETS.register_module(force=True)
+class SynthKittiDataset(SynthBoxes, KittiDataset):  # type: ignore[misc]
+    """``KittiDataset`` for a mixed list."""
+
+
+@DATASETS.register_module(force=True)
+class SynthNuScenesDataset(SynthBoxes, NuScenesDataset):  # type: ignore[misc]
+    """``NuScenesDataset`` for a mixed list."""
+
+    def parse_data_info(self, info: dict[str, Any]) -> Any:
+        """The trainer's entry; its sweeps keep their paths, of which the trainer keeps the names only."""
+        sweeps = info.get("lidar_sweeps", ())
+        paths = [sweep["lidar_points"]["lidar_path"] for sweep in sweeps]
+        parsed = super().parse_data_info(info)
+        for sweep, path in zip(sweeps, paths, strict=True):
+            sweep["lidar_points"]["lidar_path"] = path
+        return parsed
+
+
+@DATA_SAMPLERS.register_module(force=True)
+class SynthSampler(DefaultSampler):  # type: ignore[misc]
+    """The sampler of a mixed list, for loops by epochs and by iterations.
+
+    Its order is a function of the mixture's seed and the epoch, so a resumed run sees the samples of an uninterrupted
+    one. Each index carries its epoch to the worker process that reads the sample.
+
+    Args:
+        dataset: holds a mixed list.
+        seed: not used: the runner draws another one if a run is resumed.
+        options: ``shuffle`` and ``round_up`` of ``DefaultSampler``.
+
+    Attributes:
+        start: number of samples that the next pass leaves out.
+
+    Raises:
+        ConfigError: on a dataset without a mixed list, other classes than SemanticKITTI's, a detector's dataset
+            without synthetic boxes, or one that repeats scans by class.
+    """
+
+    def __init__(self, dataset: Any, seed: int | None = None, **options: Any) -> None:
+        folders = _checked(dataset)
+        super().__init__(dataset, seed=int(folders[0].settings["seed"]), **options)
+        dataset.__getitems__ = Fetch(dataset, [folder.path for folder in folders])
+        self.start = 0
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        """The (epoch, index) of each sample."""
+        start, self.start = self.start, 0
+        epoch = self.epoch
+        return ((epoch, index) for index in islice(super().__iter__(), start, None))
+
+
+class Fetch:
+    """Reads the samples of a batch in the epoch of their indices; torch's loaders call it.
+
+    Args:
+        dataset: the loader's dataset.
+        paths: of the folders of its mixed lists.
+    """
+
+    def __init__(self, dataset: Any, paths: list[Path]) -> None:
+        self.dataset, self.paths = dataset, paths
+
+    def __call__(self, indices: list[tuple[int, int]]) -> list[Any]:
+        """The samples of (epoch, index) pairs."""
+        samples = []
+        for epoch, index in indices:
+            for path in self.paths:
+                open_folder(path).epoch = epoch
+            samples.append(self.dataset[index])
+        return samples
 
 
 @HOOKS.register_module(force=True)
 class SynthEpochHook(Hook):  # type: ignore[misc]
-    """Passes the epoch to every worker, and checks labels and classes before training starts."""
+    """Checks that training uses ``SynthSampler``, and resumes in the middle of an epoch.
+
+    The trainer's loop by epochs starts the epoch of a checkpoint again; the hook leaves out the samples that it has
+    seen. Its loop by iterations reads and drops them itself.
+    """
 
     def before_train(self, runner: Any) -> None:
-        """Check the training data.
+        """Check the sampler.
 
         Raises:
-            ConfigError: if no dataset is a mixed list, or the classes are not SemanticKITTI's.
+            ConfigError: if it is another one.
         """
-        self._folders = [folder for _, folder in _mixed(runner.train_dataloader.dataset)]
-        if not self._folders:
-            raise ConfigError("SynthEpochHook without a mixed list", "an ann_file that write_infos wrote")
-        for dataset, _ in _mixed(runner.train_dataloader.dataset):
-            if isinstance(dataset, Seg3DDataset):
-                ids = id_table(0, dataset.ignore_index, np.int64)
-                require_ids(dict(enumerate(np.asarray(dataset.seg_label_mapping).tolist())), ids)
-        self._tell(_epoch(runner))
+        if not isinstance(runner.train_dataloader.sampler, SynthSampler):
+            raise ConfigError(
+                f"SynthEpochHook with the sampler {type(runner.train_dataloader.sampler).__name__}",
+                "train_dataloader = dict(sampler=dict(_delete_=True, type='SynthSampler'))",
+            )
+        self._resumes = True
 
     def before_train_epoch(self, runner: Any) -> None:
-        """Set the new epoch, before the loader's workers request its first scans."""
-        self._tell(_epoch(runner))
-
-    def before_train_iter(self, runner: Any, batch_idx: int, data_batch: Any = None) -> None:
-        """Set the epoch in loops by iterations: one epoch is a pass through the list, up to prefetched batches."""
-        if _by_iterations(runner) and runner.iter % _steps(runner) == 0:
-            self._tell(_epoch(runner))
-
-    def _tell(self, epoch: int) -> None:
-        for folder in self._folders:
-            folder.epoch = epoch
+        """Set the epoch, and after a resumption the first sample."""
+        loader = runner.train_dataloader
+        if not isinstance(runner.train_loop, EpochBasedTrainLoop):
+            return
+        loader.sampler.set_epoch(runner.epoch)
+        done = runner.iter - runner.epoch * len(loader)
+        if self._resumes and 0 < done <= len(loader):  # otherwise at the start of an epoch
+            loader.sampler.start = done * loader.batch_size
+        self._resumes = False
 
 
-def _by_iterations(runner: Any) -> bool:
-    return type(runner.train_loop).__name__ == "IterBasedTrainLoop"
+def _checked(dataset: Any) -> list[Folder]:
+    """The folders of a dataset's mixed lists.
 
-
-def _steps(runner: Any) -> int:
-    """Iterations of a pass through the list."""
-    loader = runner.train_dataloader
-    return max(int(len(loader.dataset) // (loader.batch_size * runner.world_size)), 1)
-
-
-def _epoch(runner: Any) -> int:
-    return int(runner.iter // _steps(runner) if _by_iterations(runner) else runner.epoch)
-
-
-def _mixed(dataset: Any) -> list[tuple[Any, Folder]]:
-    """The datasets that hold a mixed list, with its folder."""
+    Raises:
+        ConfigError: see ``SynthSampler``.
+    """
     held = [each for each in inner(dataset) if isinstance(getattr(each, "ann_file", None), str)]
-    folders = [(each, Path(each.ann_file).resolve().parent) for each in held]
-    return [(each, open_folder(folder)) for each, folder in folders if (folder / MIXTURE).is_file()]
+    mixed = [each for each in held if is_mixed(Path(each.ann_file).resolve().parent)]
+    if not mixed:
+        raise ConfigError(
+            f"SynthSampler with {[each.ann_file for each in held]}", "a mixed list, an ann_file that write_infos wrote"
+        )
+    for each in mixed:
+        _check_dataset(each)
+    if any(isinstance(each, CBGSDataset) for each in inner(dataset)):
+        raise ConfigError(
+            "CBGSDataset around a mixed list: it repeats scans by class, which changes the ratio",
+            "the dataset without it",
+            "Balance the real scans by write_infos(..., balance=True).",
+        )
+    return [open_folder(Path(each.ann_file).resolve().parent) for each in mixed]
+
+
+def _check_dataset(dataset: Any) -> None:
+    if isinstance(dataset, Seg3DDataset):
+        ids = id_table(0, dataset.ignore_index, np.int64)
+        require_ids(dict(enumerate(np.asarray(dataset.seg_label_mapping).tolist())), ids)
+    elif isinstance(dataset, Det3DDataset) and not isinstance(dataset, SynthBoxes):
+        raise ConfigError(
+            f"{type(dataset).__name__} with a mixed list: its synthetic scans would have no boxes",
+            "SynthKittiDataset or SynthNuScenesDataset",
+            "For another dataset, register class Mine(SynthBoxes, TheDataset).",
+        )

@@ -1,42 +1,38 @@
-"""Info lists for MMDetection3D with real and synthetic scans, and the scans behind synthetic entries.
+"""Info lists for MMDetection3D with real and synthetic scans.
 
 ``write_infos`` writes into one folder::
 
-    infos.json      the trainer's list: its own entries with absolute paths, then a *slot* for each synthetic sample
-                    of an epoch, whose files are lsynth://<folder>/<slot>.bin and .label
+    infos.json      the trainer's list: its own entries with absolute paths, then a slot for each synthetic sample of an
+                    epoch, see ``mmdet3d_slots``
     mixture.json    the settings of the mixture
-    epoch-<rank>    the current epoch, written by the hook and read by every worker process
 
 Real and synthetic scans must be in one list, because LaserMix, PolarMix and FrustumMix sample partners from the
-dataset itself. ``plan(seed, epoch)`` assigns a scan to each slot, a new one in each epoch.
+dataset itself.
 """
 
 import json
-from collections import OrderedDict
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.detection import check_names, in_view
-from lidar_synth.integrations.mixture import class_ids, id_table, mix, open_synthetic, points_of, refuse_unlabelled
-from lidar_synth.integrations.mmdet3d_lists import CLASSES
-from numpy.typing import NDArray
+from lidar_synth.integrations.detection import check_names
+from lidar_synth.integrations.mixture import refuse_unlabelled
+from lidar_synth.integrations.mmdet3d_slots import (
+    FORMATS,
+    INFOS,
+    LAYOUTS,
+    MIXTURE,
+    PREFIX,
+    Folder,
+    open_folder,
+    require_boxes,
+)
 
-from lidar_synth.datasets.classes import SEMANTIC_KITTI
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import read_text, write_file
-from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.point_labels import encode_labels
-from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.mixing import Synthetic, make_synthetic
-from lidar_synth.mixing.schedules import settled
-from lidar_synth.mixing.state import place
+from lidar_synth.files.parsing import parse_json
 
-PREFIX = "lsynth://"
-MIXTURE, INFOS, EPOCH = "mixture.json", "infos.json", "epoch"
-FORMAT = "lidar-synth-mmdet3d/1"
-_CACHED = 4  # number of scans in the cache of a process: points, labels and boxes of a scan are read one after another
+Entry = dict[str, Any]
 
 
 def write_infos(
@@ -46,7 +42,10 @@ def write_infos(
     *,
     data_root: str | Path = "",
     points: str = "",
-    view: bool = True,
+    sweeps: str = "",
+    view: bool | None = None,
+    layout: str | None = None,
+    balance: bool = False,
 ) -> Path:
     """Write the mixed list beside the trainer's own.
 
@@ -56,222 +55,163 @@ def write_infos(
         settings: settings of the mixture, see ``mixture.OPTIONS``; one ratio for all epochs.
         data_root: the folder to which the paths in ``real`` are relative.
         points: the folder of the points under ``data_root`` (the configuration's ``data_prefix['pts']``).
-        view: for detection, whether to crop synthetic scans to the view of the first real entry's camera, as in
-            ``velodyne_reduced``.
+        sweeps: the folder of the sweeps between nuScenes' key frames (``data_prefix['sweeps']``).
+        view: for detection, whether to crop synthetic scans to the view of the first real entry's CAM2, as in KITTI's
+            ``velodyne_reduced``; by default if the entry has this camera.
+        layout: ``"kitti"`` or ``"nuscenes"``, the form of points and boxes; by default nuScenes' if the list says that
+            it is nuScenes'.
+        balance: repeat real entries so that each class is in about as many, as ``CBGSDataset`` does, which would
+            change the ratio of a mixture.
 
     Returns:
         The mixed list, for ``ann_file``.
 
     Raises:
-        ConfigError: on a mixture that a list cannot hold: a schedule, ``epoch_size``, labels that make a loss NaN.
-        DataError: on a list without entries, or of another format; for detection, on entries without a camera or
-            synthetic scans without boxes.
+        ConfigError: on a mixture that a list cannot hold: a schedule, ``epoch_size``, labels that make a loss NaN; on
+            ``view=True`` without a camera.
+        DataError: on a list without entries, or of another format; for detection, on synthetic scans without boxes.
+        FileError: if the scan of the first entry does not exist.
     """
-    from mmengine.fileio import load  # reads the trainer's own pickle, as the trainer does
-
     out = Path(out).resolve()
-    given = load(str(real))
+    given = _read(real)
     if not isinstance(given, dict) or not given.get("data_list"):
         raise DataError(f"{real} has no 'data_list'", "an info list of MMDetection3D 1.1 or later")
     entries = given["data_list"]
     detects = "instances" in entries[0]
     if not detects:
         refuse_unlabelled(settings, "MMDetection3D's segmentation")
-    settings = {"synthetic": settings.get("synthetic"), "ratio": 0.25, "labels": "generated", "seed": 0} | settings
-    if isinstance(settings["synthetic"], str | Path) and Path(settings["synthetic"]).exists():
-        settings["synthetic"] = str(Path(settings["synthetic"]).resolve())
-    camera = _camera(entries[0], real) if detects else None
-    facts: dict[str, Any] = {"format": FORMAT, "real": len(entries), "settings": settings}
-    facts["view"] = camera if view else None
+    camera = _camera(entries[0], real, view) if detects else None
+    for entry in entries:
+        _make_absolute(entry, Path(data_root).resolve(), points, sweeps)
+    _check_files(entries[0])
+    if balance:
+        entries = _balanced(entries, int(settings.get("seed", 0)))
+    facts: dict[str, Any] = {"format": FORMATS[-1], "real": len(entries), "settings": _complete(settings)}
+    facts["layout"] = _layout(given, entries[0], layout, real)
+    facts["view"] = None if view is False else camera
     folder = Folder(out, facts)
     if detects and folder.slots:
         require_boxes(folder.scan(0))
-        check_names(folder.scan(0), CLASSES)
-    for entry in entries:
-        _make_absolute(entry, Path(data_root).resolve(), points)
-    entries += [_slot(out, i, camera) for i in range(folder.slots)]
+        check_names(folder.scan(0), folder.layout.classes)
+    slots = [_slot(out, i, folder.layout.features, entries[i % len(entries)], detects) for i in range(folder.slots)]
     write_file(out / MIXTURE, json.dumps(facts | {"plan": folder.mixed.plan(0).hash}, indent=1).encode())
-    listed = {"metainfo": given.get("metainfo", {}), "data_list": entries}
+    listed = {"metainfo": given.get("metainfo", {}), "data_list": entries + slots}
     write_file(out / INFOS, json.dumps(listed, default=_plain).encode())
-    _write_epoch(out, 0)
+    open_folder.cache_clear()  # this process may have opened an earlier list in this folder
     return out / INFOS
 
 
-class Folder:
-    """The slots of a mixed list.
+def _read(real: str | Path) -> Any:
+    if Path(real).suffix == ".json":
+        return parse_json(read_text(Path(real)), str(real), "an info list of MMDetection3D")
+    from mmengine.fileio import load  # reads the trainer's own pickle, as the trainer does
 
-    Args:
-        path: the folder.
-        facts: the content of its ``mixture.json``.
-
-    Attributes:
-        mixed: the mixture; its real samples are the numbers of the list's real entries.
-        slots: number of synthetic samples in the first epoch; a later epoch may have one fewer, and then repeats one
-            of its scans.
-    """
-
-    def __init__(self, path: Path, facts: dict[str, Any]) -> None:
-        self.path, self.settings = path, facts["settings"]
-        self.mixed = mix(facts["real"], self.settings, lambda scan, rng: scan)
-        mixture = self.mixed.mixture
-        if mixture.epoch_size != "add" or settled(mixture.ratio) != 0:
-            raise ConfigError(
-                f"ratio={self.settings['ratio']}, epoch_size={mixture.epoch_size!r} for MMDetection3D",
-                "one ratio for all epochs, and epoch_size='add': a list is read once",
-            )
-        self.slots = len(self.mixed) - facts["real"]
-        self._view = None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
-        self._cached: OrderedDict[tuple[int, int], Scan] = OrderedDict()
-        self._positions: tuple[int, NDArray[np.int64]] | None = None
-
-    @classmethod
-    def open(cls, path: Path) -> "Folder":
-        """Open a folder of ``write_infos``.
-
-        Raises:
-            DataError: on another format, or if the synthetic scans, and thus the plan, have changed since.
-        """
-        facts = json.loads(read_text(path / MIXTURE))
-        if facts.get("format") != FORMAT:
-            raise DataError(f"{path / MIXTURE} has format {facts.get('format')!r}", FORMAT, "Write the list again.")
-        folder = cls(path, facts)
-        if folder.mixed.plan(0).hash != facts["plan"]:
-            raise DataError(
-                f"{path}: the synthetic scans {folder.settings['synthetic']} are not those of the list",
-                "the bank or model for which the list was written",
-                "Write the list again.",
-            )
-        return folder
-
-    @property
-    def epoch(self) -> int:
-        """The current epoch of training."""
-        file = self.path / f"{EPOCH}-{place(None, None)[0]}"
-        return int(read_text(file)) if file.is_file() else 0
-
-    @epoch.setter
-    def epoch(self, epoch: int) -> None:
-        _write_epoch(self.path, epoch)
-
-    def scan(self, slot: int) -> Scan:
-        """The scan of a slot in the current epoch, with its labels and boxes.
-
-        Raises:
-            DataError: on a slot that does not exist.
-        """
-        key = (self.epoch, slot)
-        if key not in self._cached:
-            scan = self.mixed.sample(*self._position(*key))
-            self._cached[key] = scan if self._view is None else in_view(scan, self._view)
-            if len(self._cached) > _CACHED:
-                self._cached.popitem(last=False)
-        return self._cached[key]
-
-    def _position(self, epoch: int, slot: int) -> tuple[int, int]:
-        """Epoch and position of a slot: in this epoch, or in the latest one with synthetic scans if it has none."""
-        if not 0 <= slot < self.slots:
-            raise DataError(f"slot {slot} of {self.path}", f"0 to {self.slots - 1}")
-        while not self.mixed.plan(epoch).synthetics:
-            epoch -= 1
-        if self._positions is None or self._positions[0] != epoch:
-            self._positions = (epoch, np.flatnonzero(self.mixed.plan(epoch).domain))
-        return epoch, int(self._positions[1][slot % len(self._positions[1])])
+    return load(str(real))
 
 
-open_folder = cache(Folder.open)
-"""``Folder.open``, once per process and folder."""
+def _complete(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings with defaults, and with an absolute path to the synthetic scans."""
+    settings = {"synthetic": settings.get("synthetic"), "ratio": 0.25, "labels": "generated", "seed": 0} | settings
+    if isinstance(settings["synthetic"], str | Path) and Path(settings["synthetic"]).exists():
+        settings["synthetic"] = str(Path(settings["synthetic"]).resolve())
+    return settings
 
 
-@cache
-def _opened(source: str) -> Synthetic:
-    return make_synthetic(open_synthetic(source))
+def _layout(given: dict[str, Any], entry: Entry, layout: str | None, real: str | Path) -> str:
+    """The layout of a list: the one that is given, or nuScenes' if the list says so, or KITTI's."""
+    dataset = str(given.get("metainfo", {}).get("dataset", "")).lower()
+    name = layout or ("nuscenes" if dataset == "nuscenes" else "kitti")
+    if name not in LAYOUTS:
+        raise ConfigError(f"layout={name!r}", f"one of {', '.join(LAYOUTS)}")
+    found = entry["lidar_points"].get("num_pts_feats", LAYOUTS[name].features)
+    if found != LAYOUTS[name].features:
+        fits = ", ".join(f"{each!r} ({known.features})" for each, known in LAYOUTS.items())
+        raise ConfigError(f"{real}: points of {found} values for layout={name!r}", f"another layout: {fits}")
+    return name
 
 
-def read_url(url: str) -> bytes:
-    """The bytes of ``lsynth://<source>/<number>.bin`` (float32 x, y, z, reflectance) or ``.label`` (SemanticKITTI's).
-
-    Args:
-        url: the URL; its source is the folder of a mixed list, a bank, a checkpoint or a folder of scans.
-
-    Raises:
-        DataError: on any other URL, or on labels of a scan without labels.
-    """
-    source, _, name = url.removeprefix(PREFIX).rpartition("/")
-    number, _, kind = name.partition(".")
-    if not (url.startswith(PREFIX) and source and number.isdigit() and kind in ("bin", "label")):
-        raise DataError(f"{url!r}", f"{PREFIX}<folder or bank>/<number>.bin or .label")
-    scan = scan_of(source, int(number))
-    if kind == "bin":
-        return points_of(scan).astype("<f4").tobytes()
-    class_ids(scan, _TRAIN_IDS)
-    return encode_labels(scan, SEMANTIC_KITTI).astype("<u4").tobytes()
-
-
-_TRAIN_IDS = id_table(0, 255, np.uint8)
-
-
-def scan_of(source: str, number: int) -> Scan:
-    """The scan that a URL names."""
-    if (Path(source) / MIXTURE).is_file():
-        return open_folder(Path(source)).scan(number)
-    return _opened(source)[number]
-
-
-def require_boxes(scan: Scan) -> Boxes:
-    """The boxes of a synthetic scan, for a detector; they may be zero in number.
-
-    Raises:
-        DataError: if ``scan.boxes`` is None.
-    """
-    if scan.boxes is None:
-        raise DataError(
-            f"synthetic scan {scan.id!r} has no boxes",
-            "boxes, for a detector",
-            "Write the list with labels='mix' and a bank of objects.",
-        )
-    return scan.boxes
-
-
-def _slot(out: Path, number: int, camera: dict[str, Any] | None) -> dict[str, Any]:
+def _slot(out: Path, number: int, features: int, real: Entry, detects: bool) -> Entry:
+    """An entry for a synthetic scan, with the keys of a real one."""
     base = f"{PREFIX}{out}/{number:06d}"
-    slot: dict[str, Any] = {
-        "sample_idx": f"synthetic/{number}",
-        "sample_id": f"synthetic/{number}",
-        "lidar_points": {"lidar_path": f"{base}.bin", "num_pts_feats": 4},
-    }
-    if camera is None:
+    name = f"synthetic/{number}"
+    slot: Entry = {"sample_idx": name, "sample_id": name, "token": name}
+    slot["lidar_points"] = {"lidar_path": f"{base}.bin", "num_pts_feats": features}
+    if not detects:
         return slot | {"pts_semantic_mask_path": f"{base}.label"}
-    lidar2cam = camera["camera_from_sensor"]
-    cam2img = np.vstack([camera["projection"], (0, 0, 0, 1)])
-    images = {"CAM2": {"lidar2cam": lidar2cam, "cam2img": cam2img, "lidar2img": cam2img @ np.array(lidar2cam)}}
-    return slot | {"images": images, "instances": []}
+    if "CAM2" in real.get("images", {}):  # KittiDataset needs it to convert boxes
+        slot["images"] = {"CAM2": {k: v for k, v in real["images"]["CAM2"].items() if k != "img_path"}}
+    if "timestamp" in real:
+        slot["timestamp"] = real["timestamp"]
+    if "lidar_sweeps" in real:
+        slot["lidar_sweeps"] = [_sweep(f"{base}.bin", sweep) for sweep in real["lidar_sweeps"]]
+    return slot | {"instances": []}
 
 
-def _camera(entry: dict[str, Any], real: str | Path) -> dict[str, Any]:
-    """Camera 2 of a real entry, plain values."""
-    camera = entry.get("images", {}).get("CAM2", {})
-    if not {"lidar2cam", "cam2img", "height", "width"} <= set(camera):
-        raise DataError(f"{real}: entries without images.CAM2 {sorted(camera)}", "lidar2cam, cam2img, height, width")
+def _sweep(path: str, real: Entry) -> Entry:
+    """A sweep of a synthetic scan: the scan itself at the time of a real sweep, as a standing sensor sees a street in
+    which nothing moves. Number and times of sweeps are thus those of the real scans."""
     return {
-        "projection": np.array(camera["cam2img"], float)[:3].tolist(),
-        "camera_from_sensor": np.array(camera["lidar2cam"], float).tolist(),
-        "image_size": [int(camera["width"]), int(camera["height"])],
+        "timestamp": real["timestamp"],
+        "lidar_points": {"lidar_path": path, "lidar2sensor": np.eye(4).tolist()},
     }
 
 
-def _arrays(camera: dict[str, Any]) -> dict[str, Any]:
-    return camera | {"image_size": tuple(camera["image_size"])}
+def _camera(entry: Entry, real: str | Path, view: bool | None) -> dict[str, Any] | None:
+    """Camera 2 of a real entry as plain values, or None if it has none."""
+    camera = entry.get("images", {}).get("CAM2", {})
+    if {"lidar2cam", "cam2img", "height", "width"} <= set(camera):
+        return {
+            "projection": np.array(camera["cam2img"], float)[:3].tolist(),
+            "camera_from_sensor": np.array(camera["lidar2cam"], float).tolist(),
+            "image_size": [int(camera["width"]), int(camera["height"])],
+        }
+    if view:
+        raise ConfigError(
+            f"view=True, but the entries of {real} have images.CAM2 with {sorted(camera)}",
+            "lidar2cam, cam2img, height and width, as in KITTI's lists",
+            "Leave view out: synthetic scans then have the full turn.",
+        )
+    return None
 
 
-def _make_absolute(entry: dict[str, Any], root: Path, points: str) -> None:
+def _make_absolute(entry: Entry, root: Path, points: str, sweeps: str) -> None:
     entry["lidar_points"]["lidar_path"] = str(root / points / entry["lidar_points"]["lidar_path"])
     if "pts_semantic_mask_path" in entry:
         entry["pts_semantic_mask_path"] = str(root / entry["pts_semantic_mask_path"])
+    for sweep in entry.get("lidar_sweeps", ()):  # the trainer takes the name only, too
+        given = Path(sweep["lidar_points"]["lidar_path"])
+        sweep["lidar_points"]["lidar_path"] = str(root / (points if "samples" in str(given) else sweeps) / given.name)
+
+
+def _check_files(entry: Entry) -> None:
+    paths = [entry["lidar_points"]["lidar_path"], entry.get("pts_semantic_mask_path")]
+    paths += [sweep["lidar_points"]["lidar_path"] for sweep in entry.get("lidar_sweeps", ())]
+    for path in filter(None, paths):
+        if not Path(path).is_file():
+            raise FileError(
+                f"{path}, of the first entry, does not exist",
+                "data_root, points and sweeps of write_infos that lead to the scans",
+                "They are the configuration's data_root, data_prefix['pts'] and data_prefix['sweeps'].",
+            )
+
+
+def _balanced(entries: list[Entry], seed: int) -> list[Entry]:
+    """Entries drawn so that each class is in about the same number of them (Zhu et al. 2019, arXiv:1908.09492).
+
+    A class that few entries have is drawn more often; classes that no entry has do not count.
+    """
+    by_class: dict[int, list[int]] = {}
+    for number, entry in enumerate(entries):
+        valid = [each for each in entry["instances"] if each.get("bbox_3d_isvalid", True)]
+        for label in {each["bbox_label_3d"] for each in valid} - {-1}:
+            by_class.setdefault(int(label), []).append(number)
+    if not by_class:
+        raise DataError("a list without any box", "boxes, for balance=True")
+    share = sum(map(len, by_class.values())) // len(by_class)
+    rng = np.random.default_rng(seed)
+    drawn = [rng.choice(by_class[label], max(share, 1)) for label in sorted(by_class)]
+    return [json.loads(json.dumps(entries[i], default=_plain)) for i in np.concatenate(drawn).tolist()]
 
 
 def _plain(value: Any) -> Any:
     return value.tolist()  # numpy's arrays and numbers, exactly
-
-
-def _write_epoch(folder: Path, epoch: int) -> None:
-    write_file(folder / f"{EPOCH}-{place(None, None)[0]}", str(epoch).encode())

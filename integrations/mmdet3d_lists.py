@@ -1,17 +1,19 @@
 """Info lists of real scans for MMDetection3D 1.1 and later, made from the datasets' own folders.
 
-They are the lists of its ``create_data.py``, reduced to the entries that training reads, in JSON, and made without its
-compiled operators.
+They are the lists of its ``create_data.py``, reduced to the entries that training and validation read, and made without
+its compiled operators. A list's file is JSON or, if its name ends with ``.pkl``, a pickle, as the stock configurations
+name it. ``split`` chooses the training or the validation list.
 """
 
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lidar_synth.integrations.detection import difficulty, ground_plane, in_view, plane_in_camera
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats import KITTIObject, SemanticKITTI
 from lidar_synth.formats.calibration import Calibration
@@ -25,7 +27,13 @@ CLASSES = ("Pedestrian", "Cyclist", "Car", "Van", "Truck", "Person_sitting", "Tr
 def semantic_kitti_list(root: str | Path, out: str | Path, split: str = "train") -> Path:
     """Write the list of a SemanticKITTI folder; its paths are relative to ``root``.
 
+    Args:
+        root: the folder that holds ``sequences``.
+        out: the list's file, ``.json`` or ``.pkl``.
+        split: ``train`` or ``val``.
+
     Raises:
+        ConfigError: on another name of ``out``.
         DataError, FileError: if the scans cannot be found, or the list cannot be written.
     """
     scans = SemanticKITTI(root, split)
@@ -35,7 +43,7 @@ def semantic_kitti_list(root: str | Path, out: str | Path, split: str = "train")
         entry: dict[str, Any] = {"sample_idx": number, "sample_id": f"{sequence}{frame}"}
         entry["lidar_points"] = {"lidar_path": f"{base}/velodyne/{frame}.bin", "num_pts_feats": 4}
         entries.append(entry | {"pts_semantic_mask_path": f"{base}/labels/{frame}.label"})
-    return _write(out, "SemanticKITTI", entries, {})
+    return write_list(out, "SemanticKITTI", entries, {})
 
 
 def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: str = "velodyne_reduced") -> Path:
@@ -45,11 +53,12 @@ def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: 
 
     Args:
         root: the folder that holds ``training`` and ``ImageSets``.
-        out: the list's file.
+        out: the list's file, ``.json`` or ``.pkl``.
         split: ``train``, ``val`` or ``trainval``.
         points: folder of the points.
 
     Raises:
+        ConfigError: on another name of ``out``.
         DataError, FileError: if a scan, its boxes or its calibration cannot be read, or the list not be written.
     """
     scans, entries = KITTIObject(root, split), []
@@ -65,7 +74,7 @@ def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: 
         planes = Path(root) / part / "planes" / f"{frame}.txt"
         plane = read_plane(planes) if planes.is_file() else plane_in_camera(ground_plane(scan), camera)
         entries.append(_entry(frame, scan, seen, camera) | {"plane": plane.tolist()})
-    return _write(out, "KITTI", entries, {name: i for i, name in enumerate(CLASSES)})
+    return write_list(out, "KITTI", entries, {name: i for i, name in enumerate(CLASSES)})
 
 
 def read_plane(path: Path) -> Any:
@@ -111,7 +120,22 @@ def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, 
     return found
 
 
-def _write(out: str | Path, name: str, entries: list[dict[str, Any]], categories: dict[str, int]) -> Path:
+def write_list(out: str | Path, name: str, entries: list[dict[str, Any]], categories: dict[str, int]) -> Path:
+    """Write entries as a list of the trainer.
+
+    Args:
+        out: the list's file, ``.json`` or ``.pkl``.
+        name: the dataset's.
+        entries: of the scans.
+        categories: number by class.
+
+    Raises:
+        ConfigError: on another name of ``out``, because the trainer chooses the reader by it.
+        FileError: if it cannot be written.
+    """
+    writers = {".json": lambda data: json.dumps(data).encode(), ".pkl": pickle.dumps}
+    if (suffix := Path(out).suffix) not in writers:
+        raise ConfigError(f"a list in {out}", " or ".join(writers))
     meta = {"dataset": name, "categories": categories, "info_version": "1.1"}
-    write_file(Path(out), json.dumps({"metainfo": meta, "data_list": entries}).encode())
+    write_file(Path(out), writers[suffix]({"metainfo": meta, "data_list": entries}))
     return Path(out)

@@ -62,19 +62,23 @@ class Rest(Sampler[int]):
         self.whole.set_epoch(epoch)
 
 
+def _is_mixed(loader: Any) -> bool:
+    return isinstance(loader.dataset, tuple(DATASETS.values()))
+
+
 def tell_epochs() -> None:
     """Make OpenPCDet's training loop set the epoch of a mixture, and resume in the middle of one; ``tools`` must be on
     the path.
 
-    The plan is the order of a mixture, so that a run resumed from ``latest_model`` goes on after its last batch.
-    OpenPCDet itself would draw the rest of such an epoch from a new order.
+    The plan is the order of a mixture, so that a run resumed from ``latest_model`` continues after its last batch.
+    OpenPCDet itself would take the rest of the epoch from a new order.
     """
     from train_utils import train_utils as loop
 
     whole_training, one_epoch = loop.train_model, loop.train_one_epoch
 
     def train_model(model: Any, optimizer: Any, train_loader: Any, *args: Any, **options: Any) -> Any:
-        if isinstance(train_loader.dataset, tuple(DATASETS.values())):
+        if _is_mixed(train_loader):
             batches = train_loader.batch_sampler
             several = options.get("train_sampler") is not None
             batches.sampler = Rest(batches.sampler if several else SequentialSampler(train_loader.dataset))
@@ -82,7 +86,7 @@ def tell_epochs() -> None:
         return whole_training(model, optimizer, train_loader, *args, **options)
 
     def train_one_epoch(model: Any, optimizer: Any, train_loader: Any, *args: Any, **options: Any) -> Any:
-        if isinstance(train_loader.dataset, tuple(DATASETS.values())):
+        if _is_mixed(train_loader):
             train_loader.dataset.set_epoch(options["cur_epoch"])
             done = options["accumulated_iter"] % options["total_it_each_epoch"]
             train_loader.batch_sampler.sampler.skipped = done * train_loader.batch_size

@@ -1,10 +1,10 @@
-"""What the tests of MMDetection3D's adapter need: its configurations as plain values, and a runner for its hook."""
+"""What the tests of MMDetection3D's adapter need: its configurations as plain values."""
 
 from pathlib import Path
 from typing import Any
 
 CONFIGS = Path(__file__).parent.parent / "configs" / "mmdet3d"
-DATA_KEYS = ("type", "data_root", "ann_file", "data_prefix", "pts", "filter_empty_gt")
+DATA_KEYS = ("type", "data_root", "ann_file", "data_prefix", "pts", "sweeps", "img", "filter_empty_gt")
 """Keys of a stock configuration that ours may change."""
 
 
@@ -20,18 +20,3 @@ def bare(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: bare(item) for key, item in value.items() if key != "_scope_"}
     return [bare(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-class FakeLoader:
-    batch_size = 2
-
-    def __init__(self, dataset: Any) -> None:
-        self.dataset = dataset
-
-
-class FakeRunner:
-    world_size, epoch, iter = 1, 7, 0
-    train_loop: Any = None
-
-    def __init__(self, dataset: Any) -> None:
-        self.train_dataloader = FakeLoader(dataset)

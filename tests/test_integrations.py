@@ -31,8 +31,8 @@ from lidar_synth.integrations.mixture import (
     refuse_unlabelled,
     require_ids,
 )
-from lidar_synth.integrations.mmdet3d_infos import read_url
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, read_plane, semantic_kitti_list
+from lidar_synth.integrations.mmdet3d_slots import read_url
 from lidar_synth.integrations.rangenet import write_parser
 from mixtures import SENSOR as SMALL
 from mixtures import Endless, Scans, as_is

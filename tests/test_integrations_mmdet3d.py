@@ -2,7 +2,6 @@
 """MMDetection3D's own datasets, transforms and loaders on mixed lists; skipped where it is not installed."""
 
 import importlib
-import json
 import os
 import sys
 from collections import Counter
@@ -25,10 +24,11 @@ import mmdet3d
 import torch
 from layouts import write_all
 from lidar_synth.integrations.detection import in_view, write_gt_database
-from lidar_synth.integrations.mmdet3d_infos import Folder, open_folder, read_url, write_infos
+from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
+from lidar_synth.integrations.mmdet3d_slots import Folder, open_folder, read_url
 from mmdet3d.registry import DATASETS, TRANSFORMS
-from mmdet3d_parts import CONFIGS, DATA_KEYS, FakeRunner, bare, flat
+from mmdet3d_parts import CONFIGS, DATA_KEYS, bare, flat
 from mmengine.config import Config
 from mmengine.dataset import pseudo_collate
 from mmengine.fileio import get
@@ -115,14 +115,15 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path, make: Any) -> None
     packed = PACK if make is segmentation else PACK_BOXES
     dataset = make(made, [packed])
     folder = open_folder(made / ("seg" if make is segmentation else "det"))
+    sampler = adapter.SynthSampler(dataset)
     loader = DataLoader(
-        dataset, batch_size=2, num_workers=2, shuffle=True, persistent_workers=True, collate_fn=pseudo_collate
+        dataset, batch_size=2, num_workers=2, sampler=sampler, persistent_workers=True, collate_fn=pseudo_collate
     )
     source = open_scans(made / "synthetic")
     ids = {scan.reflectance[:50].tobytes() if make is segmentation else i: i for i, scan in enumerate(source)}
     seen: list[set[int]] = []
     for epoch in (0, 1):
-        folder.epoch = epoch
+        sampler.set_epoch(epoch)
         samples = [s for batch in loader for s in zip(batch["data_samples"], batch["inputs"]["points"], strict=True)]
         assert Counter(is_synthetic(s) for s, _ in samples) == {False: REAL, True: EXTRA}
         planned = folder.mixed.plan(epoch)
@@ -132,7 +133,13 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path, make: Any) -> None
             assert given == wanted
         seen.append(wanted)
     assert not seen[0] & seen[1]
-    folder.epoch = 0
+
+
+def test_a_loader_without_the_sampler_is_refused(made: Path) -> None:
+    """Its workers would read the synthetic scans of the first epoch in every epoch."""
+    loader = DataLoader(segmentation(made, [PACK]), num_workers=1, collate_fn=pseudo_collate)
+    with pytest.raises(ConfigError, match="type='SynthSampler'.*every epoch would have"):
+        list(loader)
 
 
 def test_real_samples_are_the_trainers_own(made: Path) -> None:
@@ -297,11 +304,6 @@ def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_pat
             tmp_path / "h", made / "kitti" / "train.json", MIX | {"synthetic": named},
             data_root=made / "kitti", points="training/velodyne_reduced",
         )  # fmt: skip
-    entries = json.loads((made / "kitti" / "train.json").read_text())
-    del entries["data_list"][0]["images"]
-    (tmp_path / "bare.json").write_text(json.dumps(entries))
-    with pytest.raises(DataError, match="images.CAM2"):
-        write_infos(tmp_path / "f", tmp_path / "bare.json", MIX | {"synthetic": made / "synthetic"})
 
 
 def test_other_synthetic_scans_than_the_lists_are_noticed(made: Path, tmp_path: Path) -> None:
@@ -312,47 +314,23 @@ def test_other_synthetic_scans_than_the_lists_are_noticed(made: Path, tmp_path: 
         Folder.open(tmp_path / "seg")
 
 
-def test_the_hook_tells_the_epoch_through_wrappers(made: Path) -> None:
-    wrapped = DATASETS.build({"type": "RepeatDataset", "times": 2, "dataset": segmentation(made, [PACK])})
-    hook, runner = adapter.SynthEpochHook(), FakeRunner(wrapped)
-    hook.before_train(runner)
-    assert open_folder(made / "seg").epoch == 7
-    runner.epoch = 8
-    hook.before_train_epoch(runner)
-    assert open_folder(made / "seg").epoch == 8
-    open_folder(made / "seg").epoch = 0
-
-
-class IterBasedTrainLoop:
-    """By its name, as the hook knows it."""
-
-
-def test_the_hook_counts_passes_where_there_are_no_epochs(made: Path) -> None:
-    hook, runner, folder = adapter.SynthEpochHook(), FakeRunner(segmentation(made, [PACK])), open_folder(made / "seg")
-    runner.train_loop = IterBasedTrainLoop()
-    steps = (REAL + EXTRA) // 2
-    for runner.iter, wanted in ((steps + 1, 1), (2 * steps, 2)):
-        hook.before_train(runner)
-        assert folder.epoch == wanted
-    hook.before_train_iter(runner, 0)
-    runner.iter = 3 * steps - 1
-    hook.before_train_iter(runner, 0)
-    assert folder.epoch == 2
-    runner.iter += 1
-    hook.before_train_iter(runner, 0)
-    assert folder.epoch == 3
-    folder.epoch = 0
-
-
 def test_classes_that_do_not_fit_are_refused(made: Path) -> None:
-    dataset = segmentation(made, [PACK])
-    adapter.SynthEpochHook().before_train(FakeRunner(dataset))
+    adapter.SynthSampler(segmentation(made, [PACK]))
     meta = train_set("minkunet_semantickitti.py")["metainfo"]
-    meta = {**meta, "seg_label_mapping": {**meta["seg_label_mapping"], 10: 4}}
-    with pytest.raises(ConfigError, match="SemanticKITTI's 19 classes"):
-        adapter.SynthEpochHook().before_train(FakeRunner(segmentation(made, [PACK], metainfo=meta)))
-    with pytest.raises(ConfigError, match="without a mixed list"):
-        adapter.SynthEpochHook().before_train(FakeRunner(object()))
+    for changed in ({10: 4}, {252: 19, 10: 19}):  # a car that counts as another class, and as none
+        wrong = {**meta, "seg_label_mapping": {**meta["seg_label_mapping"], **changed}}
+        with pytest.raises(ConfigError, match="SemanticKITTI's 19 classes"):
+            adapter.SynthSampler(segmentation(made, [PACK], metainfo=wrong))
+
+
+def test_datasets_that_do_not_fit_are_refused(made: Path, tmp_path: Path) -> None:
+    stock = train_set("minkunet_semantickitti.py") | {"ann_file": str(made / "sk" / "train.json")}
+    with pytest.raises(ConfigError, match="SynthSampler with.*train.json.*write_infos wrote"):
+        adapter.SynthSampler(DATASETS.build(stock | {"data_root": str(made / "sk")}))
+    with pytest.raises(ConfigError, match="KittiDataset with a mixed list.*SynthKittiDataset"):
+        adapter.SynthSampler(detection(made, [PACK_BOXES], type="KittiDataset"))
+    wrapped = DATASETS.build({"type": "RepeatDataset", "times": 2, "dataset": segmentation(made, [PACK])})
+    assert len(adapter.SynthSampler(wrapped)) == 2 * (REAL + EXTRA)
 
 
 @pytest.mark.parametrize("version", ["1.3.0", "2.0.0"])
@@ -372,11 +350,15 @@ def test_configurations_change_data_only(path: Path) -> None:
     stock = stock.replace("mmdet3d::", f"{Path(mmdet3d.__file__).parent}/.mim/configs/")
     ours = flat(bare(config.to_dict()))
     stock = stock.replace("{{$FRNET_ROOT:.}}", os.environ.get("FRNET_ROOT", "."))
-    theirs = flat(bare(Config.fromfile(stock).to_dict()))
+    stock_config = bare(Config.fromfile(stock).to_dict())
+    if stock_config["train_dataloader"]["dataset"]["type"] == "CBGSDataset":  # the list itself is balanced
+        stock_config["train_dataloader"]["dataset"] = stock_config["train_dataloader"]["dataset"]["dataset"]
+    theirs = flat(stock_config)
     changed = {key for key in ours if ours[key] != theirs.get(key)} | set(theirs) - set(ours)
     assert all(key.startswith((".train_dataloader", ".custom")) for key in changed)
     names = {key.rpartition(".")[2] for key in changed}
-    assert names <= {"imports", "allow_failed_imports", "custom_hooks", *DATA_KEYS}, changed
+    defaults = {"backend_args", "test_mode"}  # left out where the dataset is written anew
+    assert names <= {"imports", "allow_failed_imports", "custom_hooks", *defaults, *DATA_KEYS}, changed
     assert {"type": "SynthEpochHook"} in [dict(h) for h in config.custom_hooks]
 
 

@@ -1,0 +1,229 @@
+"""The synthetic scans behind a mixed list of MMDetection3D.
+
+A list of ``mmdet3d_infos.write_infos`` has a *slot* for each synthetic sample of an epoch. Its files are
+``lsynth://<folder>/<slot>.bin`` and ``.label``. ``plan(seed, epoch)`` assigns a scan to each slot, a new one in each
+epoch. The epoch comes to a worker process with each batch (``mmdet3d.SynthSampler``), never by a file, so that several
+runs can share a list.
+"""
+
+import json
+from collections import OrderedDict
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from lidar_synth.integrations.detection import in_view
+from lidar_synth.integrations.mixture import class_ids, id_table, mix, open_synthetic, points_of
+from lidar_synth.integrations.mmdet3d_lists import CLASSES
+from lidar_synth.integrations.nuscenes import CLASSES as NUSCENES_CLASSES
+from lidar_synth.integrations.nuscenes import as_nuscenes, five_values
+from numpy.typing import NDArray
+from torch.utils.data import get_worker_info
+
+from lidar_synth.datasets.classes import SEMANTIC_KITTI
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files.disk import read_text
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.point_labels import encode_labels
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.mixing import Synthetic, make_synthetic
+from lidar_synth.mixing.schedules import settled
+
+PREFIX = "lsynth://"
+MIXTURE, INFOS = "mixture.json", "infos.json"
+FORMATS = ("lidar-synth-mmdet3d/1", "lidar-synth-mmdet3d/2")
+"""Formats of ``mixture.json``: the second has a layout; the first is always KITTI's."""
+
+_CACHED = 4  # number of scans in the cache of a process: points, labels and boxes of a scan are read one after another
+
+
+class Layout(NamedTuple):
+    """The form of a dataset's points and boxes.
+
+    Args:
+        classes: the names of its boxes.
+        features: number of values of a point.
+        convert: gives a scan the dataset's frame and names.
+        points: (N, features) float32 of a converted scan.
+    """
+
+    classes: tuple[str, ...]
+    features: int
+    convert: Callable[[Scan], Scan]
+    points: Callable[[Scan], NDArray[np.float32]]
+
+
+LAYOUTS = {
+    "kitti": Layout(CLASSES, 4, lambda scan: scan, points_of),
+    "nuscenes": Layout(NUSCENES_CLASSES, 5, as_nuscenes, five_values),
+}
+
+
+class Folder:
+    """The slots of a mixed list.
+
+    Args:
+        path: the folder.
+        facts: the content of its ``mixture.json``.
+
+    Attributes:
+        mixed: the mixture; its real samples are the numbers of the list's real entries.
+        slots: number of synthetic samples in the first epoch; a later epoch may have one fewer, and then repeats one
+            of its scans.
+        layout: the form of points and boxes.
+    """
+
+    def __init__(self, path: Path, facts: dict[str, Any]) -> None:
+        self.path, self.settings = path, facts["settings"]
+        self.layout = LAYOUTS[facts.get("layout", "kitti")]
+        self.mixed = mix(facts["real"], self.settings, lambda scan, rng: scan)
+        mixture = self.mixed.mixture
+        if mixture.epoch_size != "add" or settled(mixture.ratio) != 0:
+            raise ConfigError(
+                f"ratio={self.settings['ratio']}, epoch_size={mixture.epoch_size!r} for MMDetection3D",
+                "one ratio for all epochs, and epoch_size='add': a list is read once",
+            )
+        self.slots = len(self.mixed) - facts["real"]
+        self._view = None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
+        self._cached: OrderedDict[tuple[int, int], Scan] = OrderedDict()
+        self._positions: tuple[int, NDArray[np.int64]] | None = None
+        self._epoch: int | None = None
+
+    @classmethod
+    def open(cls, path: Path) -> "Folder":
+        """Open a folder of ``write_infos``.
+
+        Raises:
+            DataError: on another format, or if the synthetic scans, and thus the plan, have changed since.
+        """
+        facts = json.loads(read_text(path / MIXTURE))
+        if facts.get("format") not in FORMATS:
+            raise DataError(
+                f"{path / MIXTURE} has format {facts.get('format')!r}", " or ".join(FORMATS), "Write the list again."
+            )
+        folder = cls(path, facts)
+        if folder.mixed.plan(0).hash != facts["plan"]:
+            raise DataError(
+                f"{path}: the synthetic scans {folder.settings['synthetic']} are not those of the list",
+                "the bank or model for which the list was written",
+                "Write the list again.",
+            )
+        return folder
+
+    @property
+    def epoch(self) -> int:
+        """The epoch of the samples that this process reads; 0 until it is set.
+
+        Raises:
+            ConfigError: in a worker process that was never told the epoch: every epoch would have the same scans.
+        """
+        if self._epoch is None and get_worker_info() is not None:
+            raise ConfigError(
+                f"a DataLoader that reads {self.path} without its sampler",
+                "train_dataloader = dict(sampler=dict(type='SynthSampler'))",
+                "Without it, every epoch would have the synthetic scans of the first.",
+            )
+        return self._epoch or 0
+
+    @epoch.setter
+    def epoch(self, epoch: int) -> None:
+        self._epoch = epoch
+
+    def scan(self, slot: int) -> Scan:
+        """The scan of a slot in the current epoch, in the form of the dataset, with its labels and boxes.
+
+        Raises:
+            DataError: on a slot that does not exist, or on boxes with names that the dataset cannot have.
+        """
+        key = (self.epoch, slot)
+        if key not in self._cached:
+            scan = self.mixed.sample(*self._position(*key))
+            self._cached[key] = self.layout.convert(scan if self._view is None else in_view(scan, self._view))
+            if len(self._cached) > _CACHED:
+                self._cached.popitem(last=False)
+        return self._cached[key]
+
+    def _position(self, epoch: int, slot: int) -> tuple[int, int]:
+        """Epoch and position of a slot: in this epoch, or in the latest one with synthetic scans if it has none."""
+        if not 0 <= slot < self.slots:
+            raise DataError(f"slot {slot} of {self.path}", f"0 to {self.slots - 1}")
+        while not self.mixed.plan(epoch).synthetics:
+            epoch -= 1
+        if self._positions is None or self._positions[0] != epoch:
+            self._positions = (epoch, np.flatnonzero(self.mixed.plan(epoch).domain))
+        return epoch, int(self._positions[1][slot % len(self._positions[1])])
+
+
+open_folder = cache(Folder.open)
+"""``Folder.open``, once per process and folder."""
+
+
+@cache
+def _opened(source: str) -> Synthetic:
+    return make_synthetic(open_synthetic(source))
+
+
+def read_url(url: str) -> bytes:
+    """The bytes of ``lsynth://<source>/<number>.bin`` (float32 points) or ``.label`` (SemanticKITTI's).
+
+    Args:
+        url: the URL; its source is the folder of a mixed list, whose layout the points have, or else a bank, a
+            checkpoint or a folder of scans, with points x, y, z, reflectance.
+
+    Raises:
+        DataError: on any other URL, or on labels of a scan without labels.
+    """
+    source, number, kind = split_url(url)
+    scan = scan_of(source, number)
+    if kind == "bin":
+        points = open_folder(Path(source)).layout.points if is_mixed(source) else points_of
+        return points(scan).astype("<f4").tobytes()
+    class_ids(scan, _TRAIN_IDS)
+    return encode_labels(scan, SEMANTIC_KITTI).astype("<u4").tobytes()
+
+
+_TRAIN_IDS = id_table(0, 255, np.uint8)
+
+
+def split_url(url: str) -> tuple[str, int, str]:
+    """Source, number and ending (``bin`` or ``label``) of a URL.
+
+    Raises:
+        DataError: on any other URL.
+    """
+    source, _, name = url.removeprefix(PREFIX).rpartition("/")
+    number, _, kind = name.partition(".")
+    if not (url.startswith(PREFIX) and source and number.isdigit() and kind in ("bin", "label")):
+        raise DataError(f"{url!r}", f"{PREFIX}<folder or bank>/<number>.bin or .label")
+    return source, int(number), kind
+
+
+def is_mixed(source: str | Path) -> bool:
+    """Whether a URL's source is the folder of a mixed list."""
+    return (Path(source) / MIXTURE).is_file()
+
+
+def scan_of(source: str, number: int) -> Scan:
+    """The scan that a URL names."""
+    return open_folder(Path(source)).scan(number) if is_mixed(source) else _opened(source)[number]
+
+
+def require_boxes(scan: Scan) -> Boxes:
+    """The boxes of a synthetic scan, for a detector; they may be zero in number.
+
+    Raises:
+        DataError: if ``scan.boxes`` is None.
+    """
+    if scan.boxes is None:
+        raise DataError(
+            f"synthetic scan {scan.id!r} has no boxes",
+            "boxes, for a detector",
+            "Write the list with labels='mix' and a bank of objects.",
+        )
+    return scan.boxes
+
+
+def _arrays(camera: dict[str, Any]) -> dict[str, Any]:
+    return camera | {"image_size": tuple(camera["image_size"])}

@@ -1,0 +1,170 @@
+"""Info lists for MMDetection3D: none of these tests needs the trainer."""
+
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from layouts import write_all
+from lidar_synth.integrations.detection import write_gt_database
+from lidar_synth.integrations.mmdet3d_infos import write_infos
+from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
+from lidar_synth.integrations.mmdet3d_slots import Folder, read_url
+from lidar_synth.integrations.nuscenes import CLASSES, as_nuscenes, five_values
+from streets import held, kitti, semantic_kitti, street, synthetic
+
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.formats import NuScenes, open_scans
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.labels import ObjectBank
+
+REAL, SLOTS = 4, 4
+MIX = {"ratio": 0.5, "seed": 3}
+WHERE = {"points": "samples/LIDAR_TOP", "sweeps": "sweeps/LIDAR_TOP"}
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of nine synthetic scans."""
+    return synthetic(tmp_path_factory.mktemp("mmdet3d_lists") / "synthetic", 9)
+
+
+def nuscenes_like(root: Path, **changes: Any) -> Path:
+    """nuScenes' files, and a list as the trainer's ``create_data.py`` writes it."""
+    entries = []
+    for i in range(REAL):
+        scan = replace(street(i), ring=None)
+        names = [f"samples/LIDAR_TOP/{i}.pcd.bin", f"sweeps/LIDAR_TOP/{i}a.pcd.bin", f"sweeps/LIDAR_TOP/{i}b.pcd.bin"]
+        for name in names:
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_bytes(five_values(as_nuscenes(scan)).astype("<f4").tobytes())
+        sweep = [
+            {"timestamp": 9.95 - 0.05 * k, "lidar_points": {"lidar_path": name, "lidar2sensor": np.eye(4).tolist()}}
+            for k, name in enumerate(names[1:])
+        ]
+        box = {"bbox_3d": [0, 9, -1, 4, 2, 1.5, 0], "bbox_label_3d": 0 if i else 7, "num_lidar_pts": 9}
+        entries.append({
+            "sample_idx": i, "token": f"t{i}", "timestamp": 10.0, "images": {"CAM_FRONT": {"img_path": "a.jpg"}},
+            "lidar_points": {"lidar_path": f"{i}.pcd.bin", "num_pts_feats": 5}, "lidar_sweeps": sweep[: i % 3],
+            "instances": [box | {"bbox_3d_isvalid": True, "velocity": [0.0, 0.0]}],
+        } | changes)  # fmt: skip
+    (root / "list.json").write_text(json.dumps({"metainfo": {"dataset": "nuscenes"}, "data_list": entries}))
+    return root / "list.json"
+
+
+@pytest.mark.parametrize("view", [None, False])
+def test_a_list_without_kittis_camera_is_taken(scans: Path, tmp_path: Path, view: bool | None) -> None:
+    listed = nuscenes_like(tmp_path / "n")
+    path = write_infos(tmp_path / "m", listed, MIX | {"synthetic": scans}, data_root=tmp_path / "n", view=view, **WHERE)
+    entries = json.loads(path.read_text())["data_list"]
+    assert len(entries) == REAL + SLOTS
+    for real, slot in zip(entries[:REAL], entries[REAL:], strict=True):
+        assert Path(real["lidar_points"]["lidar_path"]).is_file()
+        assert all(Path(sweep["lidar_points"]["lidar_path"]).is_file() for sweep in real["lidar_sweeps"])
+        points = np.frombuffer(read_url(slot["lidar_points"]["lidar_path"]), "<f4").reshape(-1, 5)
+        assert points[:, 0].min() < -3 < 3 < points[:, 0].max() and points[:, 1].min() < -5, "cropped to a view"
+        assert 1 < points[:, 3].max() <= 255 and set(points[:, 4]) <= set(range(32))
+        times = [[s["timestamp"] for s in entry["lidar_sweeps"]] for entry in (real, slot)]
+        assert times[0] == times[1]
+        assert {s["lidar_points"]["lidar_path"] for s in slot["lidar_sweeps"]} <= {slot["lidar_points"]["lidar_path"]}
+    with pytest.raises(ConfigError, match="view=True.*Leave view out"):
+        write_infos(tmp_path / "v", listed, MIX | {"synthetic": scans}, data_root=tmp_path / "n", view=True, **WHERE)
+
+
+def test_scans_in_nuscenes_form(tmp_path: Path) -> None:
+    """Written in nuScenes' form and read by the reader of nuScenes, a scan is what it was."""
+    scan = street(0)
+    turned = as_nuscenes(scan)
+    (tmp_path / "a.pcd.bin").write_bytes(five_values(turned).astype("<f4").tobytes())
+    back = NuScenes(tmp_path, sensor=scan.sensor)[0]
+    assert np.array_equal(back.points, scan.points) and np.array_equal(back.ring, turned.ring)  # type: ignore[arg-type]
+    assert np.allclose(back.reflectance, scan.reflectance, atol=1e-6)
+    assert turned.boxes is not None and scan.boxes is not None
+    assert set(turned.boxes.names) == {"car"} and len(turned.boxes) == 3
+    assert np.abs(held(turned.boxes, turned.points) - held(scan.boxes, scan.points)).max() <= 3  # those on a face
+
+
+def test_names_of_boxes_become_nuscenes_classes() -> None:
+    scan = street(0)
+    assert scan.boxes is not None
+    named = replace(scan, boxes=replace(scan.boxes, names=("Cyclist", "Tram", "traffic_cone")))
+    boxes = as_nuscenes(named).boxes
+    assert boxes is not None and boxes.names == ("bicycle", "traffic_cone") and set(boxes.names) <= set(CLASSES)
+    with pytest.raises(DataError, match="boxes of .'car_x'. in scan.*Rename"):
+        as_nuscenes(replace(scan, boxes=replace(scan.boxes, names=("Car", "car_x", "Car"))))
+    far = Scan(scan.points[:1] + 500, scan.reflectance[:1], scan.sensor, boxes=scan.boxes)
+    assert len(as_nuscenes(far).boxes or ()) == 0  # nuScenes' trainers drop boxes without a return
+
+
+def test_balanced_lists_hold_each_class_as_often(scans: Path, tmp_path: Path) -> None:
+    listed = nuscenes_like(tmp_path / "n")
+    path = write_infos(
+        tmp_path / "m", listed, MIX | {"synthetic": scans}, data_root=tmp_path / "n", balance=True, **WHERE
+    )
+    entries = json.loads(path.read_text())["data_list"]
+    labels = [e["instances"][0]["bbox_label_3d"] for e in entries if e["instances"]]
+    assert sorted(labels) == [0, 0, 7, 7] and len(entries) == 8
+
+
+def test_lists_that_do_not_fit_are_refused(scans: Path, tmp_path: Path) -> None:
+    listed, settings = nuscenes_like(tmp_path / "n"), MIX | {"synthetic": scans}
+    with pytest.raises(FileError, match="of the first entry, does not exist.*data_prefix"):
+        write_infos(tmp_path / "a", listed, settings, data_root=tmp_path / "n")
+    with pytest.raises(ConfigError, match="points of 5 values for layout='kitti'.*'nuscenes' .5."):
+        write_infos(tmp_path / "a", listed, settings, data_root=tmp_path / "n", layout="kitti", **WHERE)
+    with pytest.raises(ConfigError, match="layout='waymo'"):
+        write_infos(tmp_path / "a", listed, settings, data_root=tmp_path / "n", layout="waymo", **WHERE)
+    bare = tmp_path / "bare"
+    write_all("npz", bare, [replace(street(i), boxes=None) for i in range(5)])
+    with pytest.raises(DataError, match="no boxes.*labels='mix'"):
+        write_infos(tmp_path / "a", listed, MIX | {"synthetic": bare}, data_root=tmp_path / "n", **WHERE)
+
+
+@pytest.mark.parametrize("make", [semantic_kitti_list, kitti_list])
+def test_a_lists_file_is_what_its_name_says(tmp_path: Path, make: Any) -> None:
+    """The stock configurations name pickles, and the trainer chooses the reader by the name."""
+    root = (semantic_kitti if make is semantic_kitti_list else kitti)(tmp_path / "real", 2)
+    content = json.loads(make(root, tmp_path / "list.json").read_text())
+    pickled = make(root, tmp_path / "list.pkl").read_bytes()
+    assert pickle.loads(pickled) == content
+    with pytest.raises(ConfigError, match=".txt; expected .json or .pkl"):
+        make(root, tmp_path / "list.txt")
+
+
+def test_two_runs_that_share_a_list_have_their_own_epochs(scans: Path, tmp_path: Path) -> None:
+    real = semantic_kitti_list(semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json")
+    write_infos(tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk")
+    runs = Folder.open(tmp_path / "m"), Folder.open(tmp_path / "m")
+    before = {path: path.read_bytes() for path in (tmp_path / "m").iterdir()}
+    runs[0].epoch, runs[1].epoch = 0, 1
+    seen = [{run.scan(slot).id for slot in range(SLOTS)} for run in runs]
+    assert runs[0].epoch == 0 and not seen[0] & seen[1]
+    assert {path: path.read_bytes() for path in (tmp_path / "m").iterdir()} == before
+
+
+def test_lists_of_the_first_format_stay_readable(scans: Path, tmp_path: Path) -> None:
+    real = semantic_kitti_list(semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json")
+    write_infos(tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk")
+    facts = json.loads((tmp_path / "m" / "mixture.json").read_text())
+    del facts["layout"]
+    (tmp_path / "m" / "mixture.json").write_text(json.dumps(facts | {"format": "lidar-synth-mmdet3d/1"}))
+    assert Folder.open(tmp_path / "m").layout.features == 4
+    (tmp_path / "m" / "mixture.json").write_text(json.dumps(facts | {"format": "lidar-synth-mmdet3d/3"}))
+    with pytest.raises(DataError, match="mmdet3d/3.*Write the list again"):
+        Folder.open(tmp_path / "m")
+
+
+def test_objects_in_nuscenes_form(scans: Path, tmp_path: Path) -> None:
+    objects = ObjectBank.from_scans(open_scans(scans))
+    infos = write_gt_database(objects, tmp_path, origin="bottom", infos="db.pkl", layout="nuscenes")
+    found = pickle.loads(infos.read_bytes())
+    assert set(found) == {"car"}
+    for each in found["car"]:
+        points = np.fromfile(tmp_path / each["path"], "<f4").reshape(-1, 5)
+        length, width, height = each["box3d_lidar"][3:6]
+        assert len(each["box3d_lidar"]) == 9 and not points[:, 4].any() and points[:, 3].max() > 1
+        assert (np.hypot(points[:, 0], points[:, 1]) <= np.hypot(length, width) / 2 + 0.1).all()
+        assert points[:, 2].min() >= -0.1 and points[:, 2].max() <= height + 0.1

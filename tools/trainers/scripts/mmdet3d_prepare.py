@@ -1,0 +1,160 @@
+"""Prepare short trainings of MMDetection3D: lists, mixed lists, databases of objects, and short configurations.
+
+    python tools/trainers/scripts/mmdet3d_prepare.py OUT --kitti KITTI --semantic-kitti DATASET --nuscenes NUSCENES
+        [--frame NUSCENES_FRAME]
+
+Datasets are copied to OUT/data, where the stock configurations look for them; run the trainer in OUT. The synthetic
+scans are from the town. ``--frame`` names a folder of one real nuScenes key frame with the trainer's ``info.json``.
+"""
+
+import argparse
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from lidar_synth.integrations.detection import write_gt_database
+from lidar_synth.integrations.folders import write_planes
+from lidar_synth.integrations.mmdet3d_infos import write_infos
+from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
+from lidar_synth.integrations.mmdet3d_nuscenes import nuscenes_list
+from mmengine.config import Config
+
+from lidar_synth.formats import WRITERS, open_scans
+from lidar_synth.formats.convert import convert
+from lidar_synth.labels import ObjectBank
+from lidar_synth.town import Town
+
+CONFIGS = Path(__file__).parents[3] / "configs" / "mmdet3d"
+MIX = {"ratio": 0.5, "seed": 0}
+SPCONV_ON_CPU = ("centerpoint_voxel_nuscenes.py",)
+"""Configurations whose sparse convolutions need ``spconv_on_cpu``."""
+
+
+def semantic_kitti(out: Path, scans: int) -> None:
+    """The lists of ``data/semantickitti``, and the mixed one."""
+    root = out / "data" / "semantickitti"
+    for split in ("train", "val"):
+        semantic_kitti_list(root, root / f"semantickitti_infos_{split}.pkl", split)
+    settings = MIX | {"synthetic": town(out / "synthetic", scans, "town")}
+    write_infos(out / "data" / "semantickitti_mixed", root / "semantickitti_infos_train.pkl", settings, data_root=root)
+
+
+def kitti(out: Path, scans: int) -> None:
+    """The lists of ``data/kitti``, the mixed one, and the database of objects."""
+    root = out / "data" / "kitti"
+    write_planes(root, "trainval")
+    for split in ("train", "val"):
+        kitti_list(root, root / f"kitti_infos_{split}.pkl", split)
+    made = town(out / "synthetic", scans, "town")
+    where = {"data_root": root, "points": "training/velodyne_reduced"}
+    write_infos(out / "data" / "kitti_mixed", root / "kitti_infos_train.pkl", MIX | {"synthetic": made}, **where)
+    objects = ObjectBank.from_scans(open_scans(made))
+    write_gt_database(objects, root, origin="bottom", folder="kitti_gt_database", infos="kitti_dbinfos_train.pkl")
+
+
+def nuscenes(out: Path, scans: int, frame: Path | None) -> None:
+    """The lists of ``data/nuscenes`` with one more real key frame, the mixed one, and the database of objects."""
+    root = out / "data" / "nuscenes"
+    for split in ("train", "val"):
+        nuscenes_list(root, root / f"nuscenes_infos_{split}.pkl", split, "v1.0-mini")
+    listed = root / "nuscenes_infos_train.pkl"
+    if frame is not None:
+        listed = with_frame(nuscenes_list(root, root / "town.json", "train", "v1.0-mini"), frame, root)
+    made = town(out / "synthetic32", scans, "hdl32e_nuscenes")
+    where = {"data_root": root, "points": "samples/LIDAR_TOP", "sweeps": "sweeps/LIDAR_TOP"}
+    write_infos(out / "data" / "nuscenes_mixed", listed, MIX | {"synthetic": made}, balance=True, **where)
+    objects = ObjectBank.from_scans(open_scans(made))
+    write_gt_database(
+        objects, root, origin="bottom", folder="nuscenes_gt_database", infos="nuscenes_dbinfos_train.pkl",
+        layout="nuscenes",
+    )  # fmt: skip
+
+
+def with_frame(listed: Path, frame: Path, root: Path) -> Path:
+    """Add a real key frame to a list, and its scan to the dataset."""
+    content, real = json.loads(listed.read_text()), json.loads((frame / "info.json").read_text())
+    content["data_list"] += real["data_list"]
+    listed.write_text(json.dumps(content))
+    for path in (frame / "samples" / "LIDAR_TOP").iterdir():
+        shutil.copy(path, root / "samples" / "LIDAR_TOP")
+    return listed
+
+
+def town(out: Path, scans: int, sensor: str) -> Path:
+    """A folder of synthetic scans of the town."""
+    if not out.is_dir():
+        convert(Town(seed=2, sensor=sensor, scans=scans), WRITERS["npz"](out))
+    return out
+
+
+def shorten(name: str, out: Path, iterations: int = 4, batch_size: int = 1, extra: Iterable[str] = ()) -> Path:
+    """Write a configuration of ours with few iterations, small batches and one worker; the network is the stock one.
+
+    Args:
+        name: the file in ``configs/mmdet3d``.
+        out: output folder.
+        iterations: of training; a checkpoint is written in the middle and at the end, where validation follows.
+        batch_size: of training.
+        extra: further modules to import.
+    """
+    config = Config.fromfile(str(CONFIGS / name))
+    loader = config.train_dataloader
+    loader.update(batch_size=batch_size, num_workers=1)
+    dataset = loader.dataset.dataset if loader.dataset.type == "RepeatDataset" else loader.dataset
+    for step in dataset.pipeline:
+        if step.type == "ObjectSample":
+            few_objects(step.db_sampler)
+    config.train_cfg = {"type": "IterBasedTrainLoop", "max_iters": iterations, "val_interval": iterations}
+    config.param_scheduler = []
+    if config.optim_wrapper.type == "AmpOptimWrapper":  # mixed precision is a GPU's
+        config.optim_wrapper = {"type": "OptimWrapper", "optimizer": config.optim_wrapper.optimizer}
+    config.default_hooks.logger = {"type": "LoggerHook", "interval": 1}
+    config.default_hooks.checkpoint = {"type": "CheckpointHook", "interval": iterations // 2, "by_epoch": False}
+    config.log_processor = {"type": "LogProcessor", "window_size": 1, "by_epoch": False}
+    if "mmdet3d_report" in extra:
+        config.custom_hooks = [*config.custom_hooks, {"type": "Report"}]
+    config.custom_imports.imports = [*extra, *config.custom_imports.imports]
+    if "nuscenes" in name:
+        config.val_dataloader.dataset.metainfo.version = "v1.0-mini"
+    config.dump(out / name)
+    return out / name
+
+
+def few_objects(sampler: Any) -> None:
+    """Restrict a database sampler to cars, which every street has; the stock one stops at a class without objects."""
+    kept = [name for name in sampler.classes if name in ("Car", "car")]
+    sampler.classes, sampler.sample_groups = kept, dict.fromkeys(kept, 2)
+    sampler.prepare = {"filter_by_difficulty": [], "filter_by_min_points": dict.fromkeys(kept, 5)}
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--kitti", type=Path)
+    parser.add_argument("--semantic-kitti", type=Path)
+    parser.add_argument("--nuscenes", type=Path)
+    parser.add_argument("--frame", type=Path, help="a real nuScenes key frame: info.json and samples/LIDAR_TOP")
+    parser.add_argument("--scans", type=int, default=4, help="number of synthetic scans")
+    parser.add_argument("--configs", nargs="*", default=[], help="configurations to shorten")
+    options = parser.parse_args()
+    out = options.out.resolve()
+    given = {"kitti": options.kitti, "semantickitti": options.semantic_kitti, "nuscenes": options.nuscenes}
+    for name, root in given.items():
+        if root is not None:
+            shutil.copytree(root, out / "data" / name)
+    if options.kitti:
+        kitti(out, options.scans)
+    if options.semantic_kitti:
+        semantic_kitti(out, options.scans)
+    if options.nuscenes:
+        nuscenes(out, options.scans, options.frame)
+    for name in options.configs:
+        extra = ("spconv_on_cpu",) if name in SPCONV_ON_CPU else ()
+        shorten(name, out, extra=("mmdet3d_report", *extra))
+
+
+if __name__ == "__main__":
+    main()
