@@ -18,10 +18,10 @@ demo: $(READY)  ## scans mixed with synthetic ones, a comparison of trainings, a
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
 
 test: $(READY)  ## all tests
-	$(BIN)/python -m pytest $(PARALLEL)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL)
 
 quick: $(READY)  ## the tests that are not marked slow
-	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL) -m "not slow"
 
 test-lowest: $(READY)  ## tests of files and banks on the lowest versions of the dependencies; installs them
 	$(BIN)/python tools/test_lowest_versions.py

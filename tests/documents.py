@@ -21,10 +21,13 @@ TRAINERS = "MMDetection3D|OpenPCDet|Pointcept|RangeNet\\+\\+|SalsaNext|Cylinder3
 
 REASONS = (
     f"needs the source tree of ({TRAINERS})",
+    "needs the trainer's source tree",
     "needs (KITTI-360|SemanticKITTI|KITTI|nuScenes)",
-    "needs a (GPU|cluster|trainer's source tree|network connection|package that is not installed for tests)",
+    "needs a (GPU|cluster|network connection|package that is not installed for tests)",
     "needs (released weights|a model of your own)",
     "takes hours",
+    "compiles for half an hour",
+    "a configuration of the trainer",
     "make target",
 )
 """Why a block cannot run in a test; each is a pattern that the whole reason has to match."""

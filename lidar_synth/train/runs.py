@@ -13,6 +13,8 @@ The folder holds::
 import math
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,33 +66,52 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
         >>> run(load_config(TrainConfig, "town_tiny", changes)).as_posix()
         'runs/mine/mine.safetensors'
     """
-    try:
-        from accelerate import Accelerator
-    except ImportError as error:
-        hint = "pip install 'lidar_synth[train]'"
-        raise LibraryError("Accelerate is not installed", "the extra 'train'", hint) from error
-
     state = config.output / "state.safetensors"
     if state.exists():
         if not resume:
             raise ConfigError(f"{config.output} holds a run", "--resume to continue it, or another output=FOLDER")
         check_resumed(config)
+    with _accelerator(config) as accelerator:
+        plan = make_plan(config, accelerator)
+        training = Training(plan.network.to(accelerator.device), config.recipe)
+        if state.exists():
+            check_parents(config, plan.header)
+            training.load(state)
+        if accelerator.is_main_process:  # after all checks
+            write_file(config.output / "config.yaml", yaml.safe_dump(config.model_dump(mode="json")).encode())
+        if config.compile:
+            plan.network.compile()
+        for module in plan.network.modules():
+            if hasattr(module, "gradient_checkpointing"):
+                module.gradient_checkpointing = config.gradient_checkpointing  # type: ignore[assignment]
+        return _train(config, plan, training, accelerator, minutes)
+
+
+@contextmanager
+def _accelerator(config: Run) -> Iterator["Accelerator"]:
+    """Accelerate's handle for one run.
+
+    Accelerate keeps the first precision of a process. It is cleared after the run, so that the next one can have
+    another, unless the caller had set up Accelerate before.
+    """
+    try:
+        from accelerate import Accelerator
+        from accelerate.state import AcceleratorState, is_initialized
+    except ImportError as error:
+        hint = "pip install 'lidar_synth[train]'"
+        raise LibraryError("Accelerate is not installed", "the extra 'train'", hint) from error
+
+    by_caller = is_initialized()
+    if by_caller and AcceleratorState().mixed_precision != config.precision:
+        given = f"precision={config.precision}, where this process has set up Accelerate with"
+        raise ConfigError(f"{given} {AcceleratorState().mixed_precision!r}", "the same precision, or a new process")
     # Without cpu=True, Accelerate treats the processes of torchrun on a machine without GPU as separate runs.
     gpu = torch.cuda.is_available() or torch.xpu.is_available() or torch.backends.mps.is_available()
-    accelerator = Accelerator(mixed_precision=config.precision, cpu="LOCAL_RANK" in os.environ and not gpu)
-    plan = make_plan(config, accelerator)
-    training = Training(plan.network.to(accelerator.device), config.recipe)
-    if state.exists():
-        check_parents(config, plan.header)
-        training.load(state)
-    if accelerator.is_main_process:  # after all checks
-        write_file(config.output / "config.yaml", yaml.safe_dump(config.model_dump(mode="json")).encode())
-    if config.compile:
-        plan.network.compile()
-    for module in plan.network.modules():
-        if hasattr(module, "gradient_checkpointing"):
-            module.gradient_checkpointing = config.gradient_checkpointing  # type: ignore[assignment]
-    return _train(config, plan, training, accelerator, minutes)
+    try:
+        yield Accelerator(mixed_precision=config.precision, cpu="LOCAL_RANK" in os.environ and not gpu)
+    finally:
+        if not by_caller:
+            AcceleratorState._reset_state()
 
 
 def checkpoint_path(config: Run) -> Path:
