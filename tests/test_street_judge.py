@@ -59,7 +59,7 @@ def change(archive: Path, edit: Callable[[dict], object]) -> None:  # type: igno
 def test_the_input_of_the_network_is_the_nearest_point_of_each_cell(archive: Path) -> None:
     judge = load_archive(archive, columns=1024)
     scan = random_scan(presets()["town"], 4000, seed=1)
-    image, label = judge._image(scan)
+    image, label = judge.image(scan)
     expected = project(scan, judge.sensor, ["reflectance", "label"])
     values = image * judge.deviation[:, None, None] + judge.mean[:, None, None]
     filled = expected.mask
@@ -78,7 +78,7 @@ def test_predictions_are_counted_by_train_id_and_never_as_unlabelled(archive: Pa
             judge.network.segmentation_head[1].weight.zero_()
             judge.network.segmentation_head[1].bias.copy_(torch.arange(20) / 100 + 9 * (torch.arange(20) == chosen))
         table = judge.confusion([scan])
-        _, label = judge._image(scan)
+        _, label = judge.image(scan)
         column = int(SEMANTIC_KITTI.decode(np.array([RAW[chosen or 19]]))[0])
         assert (table.sum(1) == np.bincount(label[label != IGNORE], minlength=19)).all()
         assert table[:, column].sum() == table.sum()

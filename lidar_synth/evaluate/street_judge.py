@@ -56,30 +56,34 @@ class StreetJudge:
             DataError: on a scan without labels.
         """
         count = len(NAMES)
-        known = np.flatnonzero(self.train_id != IGNORE)
         table = np.zeros(count * count, np.int64)
         for scan in scans:
             if scan.label is None:
                 raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
-            image, label = self._image(scan)
-            with torch.inference_mode():
-                predicted = self.train_id[known[self.network(image[None])[0, known].argmax(0).numpy()]]
+            image, label = self.image(scan)
             valid = label != IGNORE
-            table += np.bincount(label[valid].astype(np.int64) * count + predicted[valid], minlength=len(table))
+            pairs = label[valid].astype(np.int64) * count + self.predict(image)[valid]
+            table += np.bincount(pairs, minlength=len(table))
         return table.reshape(count, count)
+
+    def predict(self, image: Tensor) -> NDArray[np.uint8]:
+        """Train ids (H, W) of an ``image`` (5, H, W); "unlabelled" is never predicted."""
+        known = np.flatnonzero(self.train_id != IGNORE)
+        with torch.inference_mode():
+            return self.train_id[known[self.network(image[None])[0, known].argmax(0).numpy()]]
 
     def features(self, scans: Sequence[Scan]) -> NDArray[np.floating]:
         """(n, 64) means of the decoder's last feature map over the cells with a return; an ``Extractor``."""
         rows = []
         for scan in scans:
-            image, _ = self._image(scan)
+            image, _ = self.image(scan)
             with torch.inference_mode():
                 features = self.network.decode(image[None])[0]  # type: ignore[operator]
             rows.append(features[:, image.abs().sum(0) > 0].mean(1).double().numpy())
         return np.stack(rows)
 
-    def _image(self, scan: Scan) -> tuple[Tensor, NDArray[np.uint8]]:
-        """The network's input (5, H, W), 0 where there is no return, and the labels (H, W)."""
+    def image(self, scan: Scan) -> tuple[Tensor, NDArray[np.uint8]]:
+        """The network's input (5, H, W), 0 where there is no return, and the train ids (H, W), 255 without labels."""
         cells = locate(scan.points, self.sensor)
         filled = cells.point >= 0
         nearest = cells.point[filled]
