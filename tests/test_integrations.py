@@ -33,7 +33,6 @@ from lidar_synth.integrations.mixture import (
 )
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, read_plane, semantic_kitti_list
 from lidar_synth.integrations.mmdet3d_slots import read_url
-from lidar_synth.integrations.rangenet import write_parser
 from mixtures import SENSOR as SMALL
 from mixtures import Endless, Scans, as_is
 from streets import CAMERA, kitti, semantic_kitti, street, synthetic
@@ -282,16 +281,6 @@ def test_urls_of_a_folder_of_scans(tmp_path: Path) -> None:
         read_url(f"lsynth://{bare}/000000.label")
 
 
-def test_a_parser_for_range_view_trainers(tmp_path: Path) -> None:
-    (tmp_path / "mix.yaml").write_text("synthetic: bank\n")
-    path = write_parser(tmp_path / "mix.yaml", tmp_path / "mixed")
-    assert path.name == "parser.py" and str(tmp_path / "mix.yaml") in path.read_text()
-    compile(path.read_text(), str(path), "exec")
-    with pytest.raises(ConfigError, match="as the settings"):
-        (tmp_path / "mix.yaml").write_text("")
-        write_parser(tmp_path / "mix.yaml", tmp_path / "mixed")
-
-
 @pytest.mark.parametrize(
     ("adapter", "trainer"),
     [("mmdet3d", "mmdet3d"), ("pointcept", "pointcept"), ("lightning", "lightning"), ("openpcdet", "pcdet")],
@@ -304,15 +293,13 @@ def test_a_missing_trainer_is_named(adapter: str, trainer: str) -> None:
 
 
 def test_other_missing_trainers_are_named() -> None:
-    from lidar_synth.integrations import cylinder3d, open3d_ml, rangenet
+    from lidar_synth.integrations import cylinder3d, rangenet, waffleiron
 
-    if any(find_spec(name) for name in ("dataloader", "tasks", "ml3d")):
+    if any(find_spec(name) for name in ("dataloader", "tasks", "waffleiron")):
         pytest.skip("a checkout is on the path")
-    for call in (cylinder3d.register, rangenet.dataset_class):
+    for adapter in (cylinder3d, rangenet, waffleiron):
         with pytest.raises(LibraryError, match="cannot be imported"):
-            call()
-    with pytest.raises(LibraryError, match="ml3d.datasets cannot be imported"):
-        open3d_ml.dataset_class("ml3d.datasets")
+            adapter.register()
 
 
 def test_the_stand_in_for_torch_scatter() -> None:
