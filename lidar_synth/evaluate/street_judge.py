@@ -70,7 +70,8 @@ class StreetJudge:
         """Train ids (H, W) of an ``image`` (5, H, W); "unlabelled" is never predicted."""
         known = np.flatnonzero(self.train_id != IGNORE)
         with torch.inference_mode():
-            return self.train_id[known[self.network(image[None])[0, known].argmax(0).numpy()]]
+            best: NDArray[np.intp] = self.network(image[None])[0, known].argmax(0).numpy()
+        return self.train_id[known[best]]
 
     def features(self, scans: Sequence[Scan]) -> NDArray[np.floating]:
         """(n, 64) means of the decoder's last feature map over the cells with a return; an ``Extractor``."""

@@ -18,7 +18,7 @@ def rows(trial: Trial) -> Iterator[Row]:
     (data / "dataset").symlink_to(trial.data.semantic_kitti)
     trial.run(
         "train", [python, SCRIPT, data, trial.folder / "mix.yaml"], env=environment(trial), minutes=90,
-        expect=[r"epoch 1: \d+ samples, [1-9]\d* of them synthetic", r"loss train: \d", r"eval: \d"],
+        expect=[r"epoch 1: \d+ samples, [1-9]\d* of them synthetic", r"Loss train: \d", r"eval: \d"],
     )  # fmt: skip
     if not list(trial.folder.rglob("ckpt_00001.pth")):
         raise Failed("no checkpoint")
