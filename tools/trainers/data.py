@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 
 from lidar_synth.labels import ObjectBank
-from lidar_synth.town import Town, export_town
+from lidar_synth.town import STRETCH_FRAMES, Town, export_town
 
 TRAINING = tuple(f"{number:02d}" for number in (0, 1, 2, 3, 4, 5, 6, 7, 9, 10))
 VALIDATION = "08"
@@ -98,10 +98,11 @@ class Data:
 
     @cached_property
     def objects(self) -> Path:
-        """A bank of objects of the town, for ``labels: mix``."""
+        """A bank of objects of 20 streets of the town, for ``labels: mix``."""
         out = self.folder / "objects.npz"
         if not out.exists():
-            ObjectBank.from_scans(Town(seed=2, scans=4)).save(out)
+            town = Town(seed=2, scans=20 * STRETCH_FRAMES)
+            ObjectBank.from_scans(town, range(0, len(town), STRETCH_FRAMES)).save(out)
         return out
 
     def _copy_sequence(self, source: Path, target: Path) -> None:

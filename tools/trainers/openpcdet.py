@@ -34,7 +34,7 @@ def kitti(trial: Trial, python: Path, tree: Path) -> Row:
     """Stock PointPillars on cars, pedestrians and cyclists."""
     data = trial.folder / "kitti"
     shutil.copytree(trial.data.kitti, data)
-    trial.run("KITTI's lists", [python, SCRIPTS / "openpcdet_prepare.py", tree, "kitti", data])
+    trial.run("KITTI's lists", [python, SCRIPTS / "openpcdet_prepare.py", tree, "kitti", data, trial.data.objects])
     mixture = {"synthetic": str(trial.data.bank), "ratio": 0.5, "labels": "mix"}
     mixture |= {"label_options": {"objects": str(trial.data.objects)}}
     config = "cfgs/kitti_models/pointpillar.yaml"
@@ -64,7 +64,7 @@ def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
     trial.run("nuScenes", [python, SCRIPTS / "nuscenes_town.py", data / "v1.0-mini"])
     town = ["town", trial.folder / "synthetic", "--scans", "4", "--seed", "9", "--layout", "kitti"]
     trial.run("synthetic scans", [python, "-m", "lidar_synth", *town, "--sensor", "hdl32e_nuscenes"])
-    trial.run("nuScenes' lists", [python, SCRIPTS / "openpcdet_prepare.py", tree, "nuscenes", data])
+    trial.run("nuScenes' lists", [python, SCRIPTS / "openpcdet_prepare.py", tree, "nuscenes", data, trial.data.objects])
     mixture = {"synthetic": str(trial.folder / "synthetic"), "ratio": 0.5}
     config = "cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml"
     small = yaml.safe_load((tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").read_text())

@@ -1,9 +1,10 @@
 """What OpenPCDet makes once from a dataset, on a machine without a GPU: info lists and the database of GT sampling.
 
-    python openpcdet_prepare.py TREE kitti FOLDER       or       python openpcdet_prepare.py TREE nuscenes FOLDER
+    python openpcdet_prepare.py TREE kitti|nuscenes FOLDER OBJECTS.npz
 
 FOLDER is KITTI's object set with ``ImageSets``, or the folder that holds ``v1.0-mini``. KITTI's planes are fitted where
-they are missing. A class without objects gets an empty entry, which OpenPCDet's sampler looks up.
+they are missing. OpenPCDet's sampler needs objects of every class, which so few scans lack: the database of GT sampling
+is that of a bank of objects.
 """
 
 import argparse
@@ -26,20 +27,26 @@ def main() -> None:
     parser.add_argument("tree", type=Path)
     parser.add_argument("kind", choices=["kitti", "nuscenes"])
     parser.add_argument("folder", type=Path)
+    parser.add_argument("objects", type=Path)
     options = parser.parse_args()
     prepare(options.tree)
     import torch
     import yaml
     from easydict import EasyDict
 
+    from lidar_synth.labels import ObjectBank
+
     torch.Tensor.cuda = lambda self, *args, **kwargs: self  # type: ignore[method-assign]
     stock = options.tree / "tools" / "cfgs" / "dataset_configs" / f"{options.kind}_dataset.yaml"
     config = EasyDict(yaml.safe_load(stock.read_text()))
-    {"kitti": prepare_kitti, "nuscenes": prepare_nuscenes}[options.kind](config, options.folder)
+    {"kitti": prepare_kitti, "nuscenes": prepare_nuscenes}[options.kind](
+        config, options.folder, ObjectBank.load(options.objects)
+    )
 
 
-def prepare_kitti(config: Any, folder: Path) -> None:
+def prepare_kitti(config: Any, folder: Path, objects: Any) -> None:
     """Info lists of both splits, GT database and planes."""
+    from lidar_synth.integrations.detection import write_gt_database
     from lidar_synth.integrations.folders import write_planes
     from pcdet.datasets.kitti import kitti_dataset
 
@@ -51,10 +58,10 @@ def prepare_kitti(config: Any, folder: Path) -> None:
         file = folder / f"kitti_infos_{split}.pkl"
         file.write_bytes(pickle.dumps(dataset.get_infos(num_workers=1)))
     dataset.create_groundtruth_database(file, split="train")
-    complete(folder / "kitti_dbinfos_train.pkl", ["Car", "Pedestrian", "Cyclist"])
+    write_gt_database(objects, folder, origin="gravity", infos="kitti_dbinfos_train.pkl")
 
 
-def prepare_nuscenes(config: Any, folder: Path) -> None:
+def prepare_nuscenes(config: Any, folder: Path, objects: Any) -> None:
     """Info lists of both splits and GT database."""
     from pcdet.datasets.nuscenes.nuscenes_dataset import NuScenesDataset, create_nuscenes_info
     from pcdet.utils.common_utils import create_logger
