@@ -65,7 +65,7 @@ def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
     town = ["town", trial.folder / "synthetic", "--scans", "4", "--seed", "9", "--layout", "kitti"]
     trial.run("synthetic scans", [python, "-m", "lidar_synth", *town, "--sensor", "hdl32e_nuscenes"])
     trial.run("nuScenes' lists", [python, SCRIPTS / "openpcdet_prepare.py", tree, "nuscenes", data, trial.data.objects])
-    mixture = {"synthetic": str(trial.folder / "synthetic"), "ratio": 0.5}
+    mixture = {"synthetic": str(trial.folder / "synthetic"), "ratio": 0.5, "labels": "none"}  # boxes only
     config = "cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml"
     small = yaml.safe_load((tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").read_text())
     small |= {"BALANCED_RESAMPLING": False}  # it divides by the number of objects of each class; the town has four
