@@ -1,6 +1,6 @@
 """What OpenPCDet's mixed datasets share: which sample is at a position, and what is refused before training."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ class Mixed:
     """
 
     _current: int | None = None  # the position whose sample is being made
+    _synthetic: Callable[[Scan], Any]  # processes a synthetic scan with the trainer's own augmentation
     mixed: Any = None
     dataset_cfg: Any
     class_names: Any
@@ -44,10 +45,6 @@ class Mixed:
         self.mixed = mix(super().__len__(), settings, lambda scan, rng: scan)  # type: ignore[misc]
         self._length = self.mixed.length(0)
         self._check_boxes({*self.class_names, *known})
-
-    def _synthetic(self, scan: Scan) -> Any:
-        """Process a synthetic scan with the trainer's own augmentation and processing."""
-        raise NotImplementedError
 
     def merge_all_iters_to_one_epoch(self, merge: bool = True, epochs: int | None = None) -> None:
         """Refuse to merge epochs of a mixture, which differ from one another.

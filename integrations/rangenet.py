@@ -67,7 +67,7 @@ def dataset_class(stock: Any) -> Any:
                 raise ConfigError("a mixture without labels (gt=False)", "gt=True, for training")
             _check_classes(self.learning_map, self.learning_map_inv)
             self.mixed = mix(len(self.scan_files), settings, lambda scan, rng: scan)
-            self._check_stripes()
+            check_stripes(self)
 
         def set_epoch(self, epoch: int) -> None:
             """Set the epoch, also for workers."""
@@ -105,32 +105,40 @@ def dataset_class(stock: Any) -> Any:
             mask: NDArray[Any] = scan.proj_range >= 0
             return mask
 
-        def _check_stripes(self) -> None:
-            """Refuse a width at which synthetic images have stripes of empty columns and real ones do not."""
-            synthetic = [self.mixed[int(i)] for i in np.flatnonzero(self.mixed.plan().domain)[:3]]
-            real = list(self.scan_files[:3])
-            if not (synthetic and real):
-                return
-
-            def measure(width: int) -> list[tuple[float, float]]:
-                kinds = [[self.image(source, width) for source in sources] for sources in (real, synthetic)]
-                return [(float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)]))) for k in kinds]
-
-            (real_fill, real_gaps), (fill, holes) = measure(width := self.sensor_img_W)
-            if holes - real_gaps <= STRIPES:
-                return
-            narrower = [w for w in (width // 2, width // 4, width // 8) if (m := measure(w))[1][1] - m[0][1] <= STRIPES]
-            fitting = narrower[0] if narrower else "the columns of the synthetic scans"
-            raise ConfigError(
-                f"synthetic scans in images of {self.sensor_img_H} x {width}: {fill:.0%} of the cells are filled, and "
-                f"{holes:.0%} of these have an empty cell to the right; in real scans {real_fill:.0%} and "
-                f"{real_gaps:.0%}",
-                "images of one density: a network tells these apart by the stripes",
-                f"Set dataset.sensor.img_prop.width: {fitting} in the architecture's YAML. Real and synthetic scans "
-                "are then projected to that width, in training, validation and inference.",
-            )
-
     return Mixed
+
+
+def check_stripes(dataset: Any) -> None:
+    """Refuse a width at which synthetic images have stripes of empty columns and real ones do not.
+
+    Args:
+        dataset: of ``dataset_class``.
+
+    Raises:
+        ConfigError: at such a width; the error names one that fits.
+    """
+    synthetic = [dataset.mixed[int(i)] for i in np.flatnonzero(dataset.mixed.plan().domain)[:3]]
+    real = list(dataset.scan_files[:3])
+    if not (synthetic and real):
+        return
+
+    def measure(width: int) -> list[tuple[float, float]]:
+        kinds = [[dataset.image(source, width) for source in sources] for sources in (real, synthetic)]
+        return [(float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)]))) for k in kinds]
+
+    (real_fill, real_gaps), (fill, holes) = measure(width := dataset.sensor_img_W)
+    if holes - real_gaps <= STRIPES:
+        return
+    narrower = [w for w in (width // 2, width // 4, width // 8) if (m := measure(w))[1][1] - m[0][1] <= STRIPES]
+    fitting = narrower[0] if narrower else "the columns of the synthetic scans"
+    raise ConfigError(
+        f"synthetic scans in images of {dataset.sensor_img_H} x {width}: {fill:.0%} of the cells are filled, and "
+        f"{holes:.0%} of these have an empty cell to the right; in real scans {real_fill:.0%} and "
+        f"{real_gaps:.0%}",
+        "images of one density: a network tells these apart by the stripes",
+        f"Set dataset.sensor.img_prop.width: {fitting} in the architecture's YAML. Real and synthetic scans "
+        "are then projected to that width, in training, validation and inference.",
+    )
 
 
 def make_parser(stock: Any, settings: Any = None) -> Any:

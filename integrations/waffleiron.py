@@ -36,29 +36,10 @@ _FILE_IDS = id_table(1, 0, np.int32)
 _IDS = id_table(0, 255, np.int32)
 
 
-@cache
-def register() -> Any:
-    """Register the dataset ``semantic_kitti_mixed`` with WaffleIron, and set its epoch, also when training resumes.
+def dataset_class(stock: Any) -> Any:
+    """Make a subclass of WaffleIron's ``SemanticKITTI`` (``stock``) that mixes real and synthetic scans."""
 
-    Returns:
-        The class.
-
-    Raises:
-        LibraryError: if WaffleIron is not on the path, or not the version that is known here.
-    """
-    try:
-        datasets = import_module("datasets")
-        manager = import_module("utils.trainer").TrainingManager
-        stock = datasets.LIST_DATASETS["semantic_kitti"]
-    except (ImportError, AttributeError, KeyError) as error:
-        raise LibraryError(
-            f"WaffleIron's datasets cannot be imported ({error!r})", "a clone of WaffleIron 0.3", "cd WaffleIron"
-        ) from error
-    missing = [n for n in ("load_pc", "__load_pc_internal__") if not hasattr(stock, n)]
-    if missing or not hasattr(manager, "one_epoch"):
-        raise LibraryError(f"WaffleIron without {missing or 'TrainingManager.one_epoch'}", "WaffleIron 0.3")
-
-    class Mixed(stock):  # type: ignore[misc, valid-type]
+    class Mixed(stock):  # type: ignore[misc]
         """WaffleIron's ``SemanticKITTI`` with synthetic scans in its training set."""
 
         mixed: Any = None  # while the stock class extracts instances, it has only real scans
@@ -99,12 +80,38 @@ def register() -> Any:
                 name = f"synthetic/{number}" if synthetic else self.real.im_idx[number]
             return points, labels, name
 
+    return Mixed
+
+
+@cache
+def register() -> Any:
+    """Register the dataset ``semantic_kitti_mixed`` with WaffleIron, and set its epoch, also when training resumes.
+
+    Returns:
+        The class.
+
+    Raises:
+        LibraryError: if WaffleIron is not on the path, or not the version that is known here.
+    """
+    try:
+        datasets = import_module("datasets")
+        manager = import_module("utils.trainer").TrainingManager
+        stock = datasets.LIST_DATASETS["semantic_kitti"]
+    except (ImportError, AttributeError, KeyError) as error:
+        raise LibraryError(
+            f"WaffleIron's datasets cannot be imported ({error!r})", "a clone of WaffleIron 0.3", "cd WaffleIron"
+        ) from error
+    missing = [n for n in ("load_pc", "__load_pc_internal__") if not hasattr(stock, n)]
+    if missing or not hasattr(manager, "one_epoch"):
+        raise LibraryError(f"WaffleIron without {missing or 'TrainingManager.one_epoch'}", "WaffleIron 0.3")
+
+    mixed = dataset_class(stock)
     train = manager.one_epoch
 
     @wraps(train)
     def one_epoch(self: Any, training: bool = True) -> Any:
         dataset = self.loader_train.dataset
-        if training and isinstance(dataset, Mixed):
+        if training and isinstance(dataset, mixed):
             dataset.set_epoch(self.current_epoch)
         return train(self, training)
 
@@ -118,9 +125,9 @@ def register() -> Any:
             if os.environ.get(CPU) != "1" or "accelerator device" not in str(error):
                 raise
 
-    datasets.LIST_DATASETS[NAME] = Mixed
+    datasets.LIST_DATASETS[NAME] = mixed
     manager.one_epoch, manager.load_state = one_epoch, load_state
-    return Mixed
+    return mixed
 
 
 def main() -> None:
