@@ -17,10 +17,10 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import SKIP_HINT
 from lidar_synth.geometry.scan import Scan
 
-STORED = {"label": "<u1", "raw_label": "<i4", "instance": "<i4", "ring": "<i4", "confidence": "<f4"}
+STORED = {"label": "<u1", "raw_label": "<i4", "instance": "<i4", "ring": "<i4", "confidence": "<f4", "time": "<f4"}
 """Type on disk of each field of a scan except reflectance."""
 
-IN_MEMORY = {"label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2", "confidence": "f4"}
+IN_MEMORY = {"label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2", "confidence": "f4", "time": "f4"}
 
 WANTED = ("x", "y", "z", "intensity", "reflectance", *STORED)
 """The fields that are read from a file; all others are ignored."""

@@ -34,7 +34,7 @@ BOX = "box_"
 
 TYPES = {
     "points": "f4", "reflectance": "f4", "label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2",
-    "confidence": "f4",
+    "confidence": "f4", "time": "f4",
 }  # fmt: skip
 """numpy types of a scan's fields."""
 

@@ -126,6 +126,7 @@ class Scan:
         instance: (N,) int32 instance ids, 0 = none.
         ring: (N,) int16 ring numbers if the file has them, 0 = highest.
         confidence: (N,) float32 in [0, 1], the confidence of ``label``.
+        time: (N,) float32 seconds from the moment of ``pose`` at which each point was measured.
         boxes: of the objects around the sensor, in the same frame.
         pose: (4, 4) float64, sensor to world, metres.
         image_path: the camera image taken with the scan.
@@ -154,6 +155,7 @@ class Scan:
     instance: NDArray[np.int32] | None = None
     ring: NDArray[np.int16] | None = None
     confidence: NDArray[np.float32] | None = None
+    time: NDArray[np.float32] | None = None
     boxes: Boxes | None = None
     pose: NDArray[np.float64] | None = None
     image_path: Path | None = None
@@ -181,7 +183,7 @@ class Scan:
         return {n: getattr(self, n) for n in POINT_FIELDS if getattr(self, n) is not None}
 
 
-POINT_FIELDS = ("reflectance", "label", "raw_label", "instance", "ring", "confidence")
+POINT_FIELDS = ("reflectance", "label", "raw_label", "instance", "ring", "confidence", "time")
 """The fields of a ``Scan`` that hold one value per point, and of a ``RangeImage`` per cell."""
 
 

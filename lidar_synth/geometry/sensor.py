@@ -6,7 +6,7 @@ range image do. Azimuth 0 is straight ahead, at the edge between columns W/2-1 a
 Row 0 is the highest beam.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -25,7 +25,9 @@ cell) or the upper left corner, as in the public code of R2Flow and LiDM."""
 MOST_CELLS = 1 << 22
 """Rows times columns of a sensor; the largest that are sold have 2^19."""
 
-_OPTIONAL = ("rows", "fov_up", "fov_down")
+_INTEGERS = ("columns", "rows", "firings", "reflectance_levels")
+_NUMBERS = ("range_min", "range_max", "fov_up", "fov_down", "range_step")
+_OPTIONAL = ("rows", "fov_up", "fov_down", "firings", "range_step", "reflectance_levels")
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,11 @@ class Sensor:
             first; the edges of a row lie halfway between the beams.
         beams: the measured elevation of each laser in degrees, highest first, if the rows only approximate it.
         heights: metres above the origin at which each laser starts, one per row; 0 by default.
+        firings: of each laser in one revolution; as many as columns by default.
+        azimuths: degrees, clockwise, by which each laser points away from the direction of its firing, one per row;
+            0 by default.
+        range_step: metres, the step in which the sensor gives ranges, if it is known.
+        reflectance_levels: number of values of reflectance, such as 256, if it is known.
         description: one line of text.
 
     Raises:
@@ -69,6 +76,10 @@ class Sensor:
     elevations: tuple[float, ...] | None = None
     beams: tuple[float, ...] | None = None
     heights: tuple[float, ...] | None = None
+    firings: int | None = None
+    azimuths: tuple[float, ...] | None = None
+    range_step: float | None = None
+    reflectance_levels: int | None = None
     description: str = ""
 
     def __post_init__(self) -> None:
@@ -92,11 +103,23 @@ class Sensor:
             raise self._error(f"heights = {self.heights}", f"one per row ({rows}), within 1 m of the origin")
         if self.columns < 2 or self.columns % 2:
             raise self._error(f"columns = {self.columns}", "an even number")
-        if rows * self.columns > MOST_CELLS:
-            raise self._error(f"{rows} rows and {self.columns} columns", f"at most {MOST_CELLS} cells")
+        if rows * max(self.columns, self.firings or 0) > MOST_CELLS:
+            given = f"{rows} rows, {self.columns} columns and {self.firings} firings"
+            raise self._error(given, f"at most {MOST_CELLS} cells")
+        self._check_firings(rows)
         if not 0 <= self.range_min < self.range_max:
             raise self._error(f"range_min, range_max = {self.range_min}, {self.range_max}",
                               "0 <= range_min < range_max, metres")  # fmt: skip
+
+    def _check_firings(self, rows: int) -> None:
+        if self.firings is not None and self.firings < 2:
+            raise self._error(f"firings = {self.firings}", "at least 2 per revolution")
+        if self.azimuths is not None and (len(self.azimuths) != rows or max(map(abs, self.azimuths)) > 180):
+            raise self._error(f"azimuths = {self.azimuths}", f"one per row ({rows}), within +-180 degrees")
+        if self.range_step is not None and not 0 < self.range_step <= 1:
+            raise self._error(f"range_step = {self.range_step}", "metres, 0 < range_step <= 1")
+        if self.reflectance_levels is not None and not 2 <= self.reflectance_levels <= 65536:
+            raise self._error(f"reflectance_levels = {self.reflectance_levels}", "2 to 65536")
 
     def _check_types(self) -> None:
         """Check that values are texts, integers or finite numbers; convert lists to tuples of float."""
@@ -105,12 +128,12 @@ class Sensor:
                 raise self._error(f"{key} = {getattr(self, key)!r}", "text")
         if not self.name:
             raise self._error("an empty name", "text, which files of its scans tell")
-        for key in ("columns", "range_min", "range_max", "rows", "fov_up", "fov_down"):
-            value, integer = getattr(self, key), key in ("columns", "rows")
+        for key in (*_INTEGERS, *_NUMBERS):
+            value, integer = getattr(self, key), key in _INTEGERS
             valid = _is_integer(value) if integer else _is_finite(value)
             if not valid and not (value is None and key in _OPTIONAL):
                 raise self._error(f"{key} = {value!r}", "a whole number" if integer else "a finite number")
-        for key in ("elevations", "beams", "heights"):
+        for key in ("elevations", "beams", "heights", "azimuths"):
             table = getattr(self, key)
             if table is None:
                 continue
@@ -171,6 +194,15 @@ class Sensor:
         fraction = (np.arange(self.columns) + offset) / self.columns
         return ((2 * fraction - 1) * np.pi).astype(np.float32)
 
+    def firing_azimuths(self) -> NDArray[np.float64]:
+        """(H, F) azimuth of each laser at each of its firings, radians, in the order of firing from behind the sensor.
+
+        Offsets can lead beyond +-pi: firing 0 of a laser with a negative offset belongs to the end of the turn.
+        """
+        count = self.firings or self.columns
+        firing = (2 * (np.arange(count) + 0.5) / count - 1) * np.pi
+        return firing + np.radians(self.azimuths if self.azimuths is not None else np.zeros(self.shape[0]))[:, None]
+
     def ray_angles(self, rays: Rays = "centre") -> NDArray[np.float32]:
         """(2, H, W) elevation and azimuth of every cell, radians."""
         grid = np.meshgrid(self.row_elevations(rays), self.column_azimuths(rays), indexing="ij")
@@ -184,8 +216,8 @@ class Sensor:
         """The same sensor with one row per laser at the laser's own elevation, for unfolded scans."""
         if self.beams is None:
             return self
-        return Sensor(f"{self.name}/beams", self.columns, self.range_min, self.range_max,
-                      elevations=self.beams, description=self.description)  # fmt: skip
+        return replace(self, name=f"{self.name}/beams", elevations=self.beams, beams=None,
+                       rows=None, fov_up=None, fov_down=None)  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
         """The arguments that are set, as plain values, with the keys of the YAML file."""
