@@ -4,12 +4,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from lidar_synth.town.fences import bar_fence, clipped_hedge, low_wall, wire_fence
+from lidar_synth.town.fences import bar_fence, clipped_hedge, low_wall, thicket, wire_fence
 from lidar_synth.town.furniture import StaticObject
 from lidar_synth.town.materials import Finish
 from lidar_synth.town.scene import Scene
 
-KINDS = ("hedge", "hedge", "wall", "bars", "boards", "wire", "wallhedge", "wallhedge", "wallbars", "none")
+KINDS = ("hedge", "hedge", "thicket", "thicket", "wall", "bars", "boards", "wire", "wallhedge", "none", "none")
 """Kinds of boundary; a kind that is listed twice is twice as frequent."""
 
 
@@ -48,6 +48,8 @@ def _piece(
     match kind:
         case "hedge":
             return [(clipped_hedge(length, rng), 0.0, 0.0)]
+        case "thicket":
+            return [(thicket(length, 2 * height, rng.uniform(1.2, 2.0), rng), 0.9, 0.0)]
         case "wall":
             return [(low_wall(length, height, stone), 0.0, 0.0)]
         case "bars":

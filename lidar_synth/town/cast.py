@@ -82,13 +82,15 @@ class Snapshot:
         Args:
             origins: (N, 3) metres, world frame.
             directions: (N, 3) unit vectors.
-            eye: (3,) a point within 0.3 m of every ray, such as the sensor; with it, the rays that can hit a mover
+            eye: (3,) a point near the origin of every ray, such as the sensor; with it, the rays that can hit a mover
                 are found faster.
         """
         distance, face, normal = self._solid.first(origins, directions)
         surface = np.where(face >= 0, self._faces[face], MISS)
         candidate_rays = (
-            self._candidates_of_any_rays(origins, directions) if eye is None else self._candidates(directions, eye)
+            self._candidates_of_any_rays(origins, directions)
+            if eye is None
+            else self._candidates(directions, eye, float(np.abs(origins - eye).sum(1).max(initial=0)))
         )
         for mover, is_candidate in zip(self.movers, candidate_rays, strict=True):
             candidates = np.flatnonzero(is_candidate)
@@ -105,11 +107,12 @@ class Snapshot:
         normal /= np.maximum(length, 1e-12)[:, None]
         return Hits(distance, surface, normal)
 
-    def _candidates(self, directions: Floats, eye: Floats) -> NDArray[np.bool_]:
-        """(M, N) which rays that start near ``eye`` can hit each mover's bounding sphere; may include a few more."""
+    def _candidates(self, directions: Floats, eye: Floats, margin: float) -> NDArray[np.bool_]:
+        """(M, N) which rays that start within ``margin`` metres of ``eye`` can hit each mover's bounding sphere; may
+        include a few more."""
         offset = self._middles - eye
         distance = np.linalg.norm(offset, axis=1, keepdims=True)
-        sine = np.minimum((self._radii[:, None] + 0.3) / np.maximum(distance, 1e-3), 1)
+        sine = np.minimum((self._radii[:, None] + margin) / np.maximum(distance, 1e-3), 1)
         smallest_cosine = np.where(sine < 0.95, np.sqrt(1 - sine * sine), -2).astype(np.float32)
         return np.asarray((offset / np.maximum(distance, 1e-3)) @ directions.T > smallest_cosine)
 

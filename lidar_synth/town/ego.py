@@ -55,10 +55,10 @@ def optics(sensor: Sensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 @lru_cache(maxsize=8)
 def free_rays(sensor: Sensor) -> NDArray[np.bool_]:
-    """(H, W) which rays of a sensor the ego vehicle does not block; read-only."""
+    """(H, F) which rays of a sensor's firings the ego vehicle does not block; read-only."""
     elevation, height = optics(sensor)
-    azimuth = sensor.column_azimuths().astype(float)
-    e, a = np.meshgrid(elevation, azimuth, indexing="ij")
+    a = sensor.firing_azimuths()
+    e = np.broadcast_to(elevation[:, None], a.shape)
     rays = np.stack([np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)], -1)
     side = np.where(np.arange(len(elevation)) % 2, _LASER_OFFSET, -_LASER_OFFSET)[:, None]
     start = np.stack([side * np.sin(a), side * np.cos(a), np.broadcast_to(height[:, None], a.shape)], -1)

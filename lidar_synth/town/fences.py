@@ -4,13 +4,22 @@ import numpy as np
 
 from lidar_synth.town.furniture import FENCE, GALVANISED, VEGETATION, StaticObject
 from lidar_synth.town.materials import RGB, Finish
-from lidar_synth.town.meshes import boxes, loft, merge, quads, tubes
+from lidar_synth.town.meshes import Mesh, boxes, loft, merge, quads, tubes
 from lidar_synth.town.plants import hedge
 
 
 def clipped_hedge(length: float, rng: np.random.Generator) -> StaticObject:
     """A clipped hedge of random height and depth along +x."""
-    mesh = hedge(length, rng.uniform(0.8, 1.9), rng.uniform(0.5, 0.9), rng)
+    return _leafy(hedge(length, rng.uniform(0.8, 1.9), rng.uniform(0.6, 1.1), True, rng), rng)
+
+
+def thicket(length: float, height: float, depth: float, rng: np.random.Generator) -> StaticObject:
+    """An uneven belt of shrubs along +x."""
+    return _leafy(hedge(length, height, depth, False, rng), rng)
+
+
+def _leafy(mesh: Mesh, rng: np.random.Generator) -> StaticObject:
+    """A hedge with a random shade of green."""
     green = rng.uniform(0.8, 1.2)
     inside = Finish("foliage", (0.10 * green, 0.18 * green, 0.05))
     return StaticObject(mesh, (Finish("leaf", (0.18 * green, 0.31 * green, 0.10)), inside), (VEGETATION, VEGETATION))

@@ -49,7 +49,7 @@ def _park_along(street: Street, lots: list[Lot], side: int, scene: Scene, rng: R
         return
     sign, edge = 2 * side - 1, street.edge[side]
     at = {"street": edge - 1.02, "bay": edge + 1.05, "kerb": edge + 0.25}[how]
-    density = rng.uniform(0.05, 0.65)
+    density = rng.uniform(0.0, 0.5)
     drives = [lot.driveway for lot in lots if lot.side == side and lot.driveway]
     kinds = vehicles()
     for low, high in street.gaps(side, 4.0):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lidar_synth.town import furniture
-from lidar_synth.town.fences import guard_rail
+from lidar_synth.town.fences import guard_rail, thicket
 from lidar_synth.town.paving import PLAZA_DEPTH
 from lidar_synth.town.people import CLOTHES, sitter, walker
 from lidar_synth.town.scene import Scene
@@ -15,19 +15,23 @@ Rng = np.random.Generator
 def edge_of_town(street: Street, side: int, scene: Scene, rng: Rng) -> None:
     """Put high grass, thickets, crash barriers and single trees beside a road at the edge of town."""
     sign, front = 2 * side - 1, street.front(side)
-    rail, thicket = rng.random() < 0.3, rng.uniform(0, 0.8)
+    rail, bushes, belt = rng.random() < 0.25, rng.uniform(0, 0.8), rng.random() < 0.6
+    depth, away = rng.uniform(2, 5), rng.uniform(2, 7)
     for low, high in street.gaps(side, 2.0):
         for s in np.arange(low, high - 8, 8.0):
             if rail:
                 scene.put(guard_rail(8.0), s, sign * (street.edge[side] + 0.9))
             scene.put(furniture.weeds(8.0, 1.6, rng.uniform(0.2, 0.6), rng), s, sign * (street.edge[side] + 2.2))
-            for _ in range(rng.poisson(3 * thicket)):
+            for _ in range(rng.poisson(3 * bushes)):
                 scene.put(
                     furniture.random_plant("bush", rng, rng.uniform(0.8, 1.7)),
                     s + rng.uniform(0, 8),
                     sign * (front + rng.uniform(1, 7)),
                 )
-            if rng.random() < 0.25:
+            if belt and rng.random() < 0.85:
+                shrubs = thicket(8.4, rng.uniform(0.25, 0.9) * depth, depth, rng)
+                scene.put(shrubs, s - 0.2, sign * (front + away + depth / 2))
+            if rng.random() < 0.45:
                 species = str(rng.choice(["round", "birch", "poplar", "spruce"]))
                 scene.put(
                     furniture.random_plant(species, rng), s + rng.uniform(0, 8), sign * (front + rng.uniform(1, 14))

@@ -12,20 +12,25 @@ from numpy.typing import NDArray
 from lidar_synth.town.materials import Finish
 from lidar_synth.town.meshes import Mesh, leaves, loft, merge, tube
 
-LEAF, BARK, TWIG = 0, 1, 2
-TREE_CLASSES = (70, 71, 70)
+LEAF, BARK, TWIG, CORE = 0, 1, 2, 3
+TREE_CLASSES = (70, 71, 70, 70)
 """SemanticKITTI's class id of each slot: leaves and branches are vegetation, the stem is trunk."""
 VARIANTS = 4
 """Number of prototypes of each species."""
 
 SPECIES: dict[str, tuple[Finish, ...]] = {
-    "round": (Finish("leaf", (0.20, 0.36, 0.10)), Finish("bark"), Finish("bark")),
-    "birch": (Finish("leaf", (0.34, 0.46, 0.15)), Finish("bark", (0.72, 0.70, 0.66)), Finish("bark")),
-    "spruce": (Finish("leaf", (0.10, 0.21, 0.11)), Finish("bark"), Finish("bark")),
-    "poplar": (Finish("leaf", (0.24, 0.40, 0.12)), Finish("bark"), Finish("bark")),
-    "fruit": (Finish("leaf", (0.25, 0.38, 0.13)), Finish("bark"), Finish("bark")),
-    "bush": (Finish("leaf", (0.22, 0.35, 0.11)), Finish("bark"), Finish("bark")),
-    "thuja": (Finish("leaf", (0.16, 0.29, 0.12)), Finish("bark"), Finish("bark")),
+    "round": (Finish("leaf", (0.20, 0.36, 0.10)), Finish("bark"), Finish("bark"), Finish("foliage")),
+    "birch": (
+        Finish("leaf", (0.34, 0.46, 0.15)),
+        Finish("bark", (0.72, 0.70, 0.66)),
+        Finish("bark"),
+        Finish("foliage"),
+    ),
+    "spruce": (Finish("leaf", (0.10, 0.21, 0.11)), Finish("bark"), Finish("bark"), Finish("foliage")),
+    "poplar": (Finish("leaf", (0.24, 0.40, 0.12)), Finish("bark"), Finish("bark"), Finish("foliage")),
+    "fruit": (Finish("leaf", (0.25, 0.38, 0.13)), Finish("bark"), Finish("bark"), Finish("foliage")),
+    "bush": (Finish("leaf", (0.22, 0.35, 0.11)), Finish("bark"), Finish("bark"), Finish("foliage")),
+    "thuja": (Finish("leaf", (0.16, 0.29, 0.12)), Finish("bark"), Finish("bark"), Finish("foliage")),
 }
 """The finishes of each species; the colour of the first one varies per plant."""
 
@@ -57,6 +62,13 @@ def _leaf_clusters(centres: NDArray[np.float64], spread: NDArray[np.float64] | f
     return leaves(middle, size * rng.uniform(0.6, 1.3, len(middle)), rng, LEAF)
 
 
+def _blob(centre: NDArray[np.float64], radius: float, rng: np.random.Generator) -> Mesh:
+    """A dense part of a crown: an uneven ball."""
+    polar, angle = np.linspace(0, np.pi, 5)[:, None], 2 * np.pi * np.arange(6) / 6
+    unit = np.stack([np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar) + 0 * angle], -1)
+    return loft(centre + radius * unit * rng.normal(1, 0.2, (5, 6, 1)), CORE, closed=True)
+
+
 def _ellipsoid_points(
     count: int, radii: tuple[float, float, float], middle: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
@@ -74,9 +86,8 @@ def _broadleaf(rng: np.random.Generator, height: float, clear: float, width: flo
     crown = _ellipsoid_points(46, (0.44 * width, 0.44 * width, 0.9 * up), middle, rng)
     branches = _branches(path[-1], crown[rng.permutation(len(crown))[:6]], 0.08)
     spread = np.array([0.42, 0.42, 0.34 + droop])
-    inside = (0, 0, middle) + 0.7 * (_ellipsoid_points(80, (width / 2, width / 2, up), 0, rng))
-    return merge([trunk, branches, _leaf_clusters(crown - (0, 0, droop), spread, 12, 1.06 * size, rng),
-                  leaves(inside, 0.11 * width, rng, LEAF)])  # fmt: skip
+    core = [_blob(0.82 * (c - (0, 0, middle)) + (0, 0, middle), 0.17 * width, rng) for c in crown[::3]]
+    return merge([trunk, branches, *core, _leaf_clusters(crown - (0, 0, droop), spread, 10, size, rng)])
 
 
 def _conifer(rng: np.random.Generator, height: float, clear: float, width: float) -> Mesh:
@@ -107,7 +118,8 @@ def _bush(rng: np.random.Generator, height: float, width: float) -> Mesh:
     """A bush; sizes in metres."""
     crown = _ellipsoid_points(14, (0.42 * width, 0.42 * width, 0.42 * height), 0.52 * height, rng)
     twigs = _branches(np.zeros(3), crown[:3], 0.025)
-    return merge([twigs, _leaf_clusters(crown, 0.18, 12, 0.16, rng), _leaf_clusters(crown * 0.5, 0.12, 3, 0.3, rng)])
+    core = [_blob(c, 0.2 * width, rng) for c in 0.72 * crown[::2]]
+    return merge([twigs, *core, _leaf_clusters(crown, 0.18, 11, 0.16, rng)])
 
 
 @cache
@@ -126,7 +138,7 @@ def coarse_plant(species: str, variant: int) -> Mesh:
 
 @cache
 def plant(species: str, variant: int) -> Mesh:
-    """Prototype number ``variant`` (0 to ``VARIANTS`` - 1) of a species; slots LEAF, BARK, TWIG."""
+    """Prototype number ``variant`` (0 to ``VARIANTS`` - 1) of a species; slots LEAF, BARK, TWIG, CORE."""
     rng = _rng(species, variant)
     match species:
         case "round":
@@ -144,31 +156,36 @@ def plant(species: str, variant: int) -> Mesh:
     return _bush(rng, rng.uniform(1.2, 2.8), rng.uniform(1.4, 2.8))
 
 
-def hedge(length: float, height: float, depth: float, rng: np.random.Generator) -> Mesh:
-    """A clipped hedge along +x from the origin, centred on the x axis; slot 0 = leaves, slot 1 = opaque core."""
-    steps = max(2, int(length / 0.5) + 1)
-    x = np.linspace(0, length, steps)
-    half, top = 0.36 * depth, height - 0.08
-    outline = np.array(
-        [
-            (-half, -0.1),
-            (-half, 0.55 * height),
-            (-0.8 * half, top),
-            (0.8 * half, top),
-            (half, 0.55 * height),
-            (half, -0.1),
-        ]
+_CLIPPED = ((-0.5, -0.05), (-0.5, 0.4), (-0.46, 0.8), (-0.3, 1.0), (0.3, 1.0), (0.46, 0.8), (0.5, 0.4), (0.5, -0.05))
+_WILD = ((-0.5, -0.05), (-0.44, 0.3), (-0.3, 0.66), (-0.1, 0.95), (0.12, 1.0), (0.3, 0.75), (0.44, 0.35), (0.5, -0.05))
+
+
+def hedge(length: float, height: float, depth: float, clipped: bool, rng: np.random.Generator) -> Mesh:
+    """A hedge along +x from the origin, centred on the x axis; slot 0 = leaves, slot 1 = opaque core.
+
+    Args:
+        length, height, depth: metres.
+        clipped: whether it is trimmed to an even profile; if not, it is rounded and grows unevenly.
+        rng: samples its growth.
+    """
+    profile, growth = np.array(_CLIPPED if clipped else _WILD), 0.05 if clipped else 0.16
+    steps = max(3, int(length / 0.6) + 1)
+    size = 1 + growth * np.convolve(rng.normal(0, 1.6, steps + 2), np.full(3, 1 / 3), "valid")[:, None]
+    bumps = rng.normal(0, growth, (2, steps, len(profile)))
+    x = np.linspace(0, length, steps)[:, None] + rng.normal(0, 0.04, (steps, len(profile)))
+    y = depth * (profile[:, 0] + 0.5 * bumps[0]) * np.sqrt(size)
+    z = height * (profile[:, 1] + 0.5 * bumps[1] * (profile[:, 1] > 0)) * size
+    core = np.stack([x, y, z], -1)
+    ends = [loft([core[i, :4], core[i, :3:-1]], 1) for i in (0, -1)]
+    count = int(length * (2 * height + depth) * 8)
+    row, column, way = (
+        rng.integers(0, steps - 1, count),
+        rng.integers(0, len(profile) - 1, count),
+        rng.random((2, count, 1)),
     )
-    core = np.concatenate(
-        [np.broadcast_to(x[:, None, None], (steps, 6, 1)), np.broadcast_to(outline, (steps, 6, 2))], 2
-    )
-    core = core + rng.normal(0, 0.03, core.shape)
-    count = int(length * (2 * height + depth) * 11)
-    face = rng.uniform(0, 2 * height + depth, count)
-    y = np.where(face < height, -depth / 2, np.where(face < 2 * height, depth / 2, face - 2 * height - depth / 2))
-    z = np.where(face < 2 * height, face % height, height)
-    centres = np.c_[rng.uniform(0, length, count), y + rng.normal(0, 0.03, count), z + rng.normal(0, 0.03, count)]
-    ends = [loft([core[i, :3], core[i, 5:2:-1]], 1) for i in (0, -1)]
+    near = core[row, column] * (1 - way[0]) + core[row, column + 1] * way[0]
+    far = core[row + 1, column] * (1 - way[0]) + core[row + 1, column + 1] * way[0]
+    centres = near * (1 - way[1]) + far * way[1] + rng.normal(0, 0.04 if clipped else 0.1, (count, 3))
     return merge([loft(core, 1), *ends, leaves(centres, rng.uniform(0.07, 0.15, count), rng, LEAF)])
 
 

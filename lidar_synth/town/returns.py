@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.town.cast import MISS, Hits, Snapshot
 from lidar_synth.town.materials import SurfaceTable, column
+from lidar_synth.town.relief import relief
 
 Floats = NDArray[np.float32]
 LEVELS = 256
@@ -21,15 +22,17 @@ LEVELS = 256
 
 _TRANSMISSION, _DROPOUT, _SPECKLE = column("transmission"), column("dropout"), column("speckle")
 _GLOSS, _ROUGHNESS = column("gloss"), column("roughness")
+_GRAZING, _RELIEF = column("grazing"), column("relief")
 _STEP = 0.25
-_RANGES = np.array([0, 4, 8, 20, 25, 35, 50, 70, 130])
+_RANGES = np.array([0, 5, 8, 12, 20, 25, 30, 35, 40, 50, 65, 80, 130])
 _DISTANCE_FACTOR = np.interp(
-    np.arange(0, 130, _STEP), _RANGES, [0.72, 0.82, 0.98, 0.98, 0.90, 0.64, 0.40, 0.22, 0.10]
+    np.arange(0, 130, _STEP), _RANGES, [1.0, 1.0, 1.0, 1.0, 1.0, 0.95, 0.87, 0.81, 0.77, 0.71, 0.65, 0.60, 0.45]
 ).astype(np.float32)
 """Factor of reflectance by distance, in steps of ``_STEP`` metres."""
-_DARK_LIMIT = 0.10
-"""Values below this are reduced further, to 0 at two thirds of it: the sensor measures 0 for dark surfaces."""
-_ZERO_SHARE = 0.025
+_KNEE, _SLOPE = 0.30, 3.0
+"""Below this value the measured reflectance falls ``_SLOPE`` times as fast, to 0: dark and distant surfaces give 0."""
+_TAIL = 0.8
+_ZERO_SHARE = 0.02
 """Share of returns whose reflectance is 0 at random."""
 
 
@@ -43,16 +46,16 @@ class Noise:
         threshold: signal strength at which half of the rays are dropped.
     """
 
-    range_std: float = 0.018
-    gain_std: float = 0.09
+    range_std: float = 0.008
+    gain_std: float = 0.045
     threshold: float = 0.0045
 
 
 def laser_gains(sensor: Sensor, noise: Noise) -> Floats:
     """(H,) gain of each laser, the same for every scan of a sensor; a few lasers are weak."""
     rng = np.random.Generator(np.random.Philox(key=sensor.shape[0]))
-    gains = rng.normal(1.15, noise.gain_std, sensor.shape[0])
-    gains[rng.random(sensor.shape[0]) < 0.08] *= 0.6
+    gains = rng.normal(1.0, noise.gain_std, sensor.shape[0])
+    gains[rng.random(sensor.shape[0]) < 0.1] *= 0.84
     return np.clip(gains, 0.4, 1.4).astype(np.float32)
 
 
@@ -99,6 +102,7 @@ def see_through(
 
 def measure(
     hits: Hits,
+    origins: Floats,
     directions: Floats,
     laser: NDArray[np.intp],
     surfaces: SurfaceTable,
@@ -110,6 +114,7 @@ def measure(
 
     Args:
         hits: the hits of N rays.
+        origins: (N, 3) metres, world frame.
         directions: (N, 3) unit vectors.
         laser: (N,) the laser of each ray.
         surfaces: the surfaces of the scene.
@@ -136,12 +141,19 @@ def measure(
         power[returned],
         facing[returned],
     )
-    gaussian = rng.standard_normal((2, len(hit)), np.float32)
-    speckled = power + _SPECKLE[material] * gaussian[0] * np.minimum(1, 4 * power)
+    gaussian = rng.standard_normal((3, len(hit)), np.float32)
     distance_bin = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1).astype(np.int32)
-    value = speckled * gains[laser[hit]] * _DISTANCE_FACTOR[distance_bin] * np.clip((facing - 0.015) / 0.075, 0, 1)
-    value = np.where(value < _DARK_LIMIT, 3 * value - 2 * _DARK_LIMIT, value)
+    slope = facing + _GRAZING[material]
+    value = power * gains[laser[hit]] * _DISTANCE_FACTOR[distance_bin] * np.clip((slope - 0.015) / 0.06, 0, 1)
+    value = np.maximum(np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0)
+    value += _SPECKLE[material] * gaussian[0] * np.minimum(1, 4 * value)
     value = value * (rng.random(len(hit), np.float32) > _ZERO_SHARE)
-    measured = distance + np.maximum(np.float32(noise.range_std), _ROUGHNESS[material]) * gaussian[1]
+    displaced = _ROUGHNESS[material] * gaussian[1] * np.exp(_TAIL * gaussian[2])
+    soft = np.flatnonzero(_RELIEF[material])
+    displaced[soft] += _RELIEF[material[soft]] * relief(
+        origins[hit[soft]] + distance[soft, None] * directions[hit[soft]]
+    )
+    shift = displaced / np.clip(slope, 0.06, 1)
+    measured = distance + np.clip(shift, -0.1 * distance, 0.1 * distance) + np.float32(noise.range_std) * gaussian[1]
     reflectance = np.floor(np.clip(value, 0, 0.995) * LEVELS) / LEVELS
     return hit, measured, reflectance.astype(np.float32)

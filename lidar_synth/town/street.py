@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 KINDS = ("residential", "main", "junction", "square", "edge")
-SHARES = (0.48, 0.18, 0.14, 0.09, 0.11)
+SHARES = (0.40, 0.15, 0.12, 0.08, 0.25)
 """Probability of each kind."""
 REACH = 88.0
 """Metres of detailed world in front of, behind and beside the ego vehicle: slightly more than the sensor's range."""

@@ -26,6 +26,8 @@ from lidar_synth.town.scene import Pose
 from lidar_synth.town.shading import render, sample_light
 from lidar_synth.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, rng_for
 
+REVOLUTION = 0.1
+"""Seconds of one turn of the sensor."""
 APART = 1000.0
 """Metres between the origins of two stretches in the world frame of the poses."""
 
@@ -71,16 +73,18 @@ class Town:
         self._scans, self._noise = scans, noise or Noise()
         self._worlds: OrderedDict[int, World] = OrderedDict()
         elevation, height = optics(self.sensor)
-        columns = self.sensor.columns
         # The order in which the sensor writes points: ring by ring from the top, counter-clockwise from straight ahead.
-        order = np.r_[columns // 2 - 1 : -1 : -1, columns - 1 : columns // 2 - 1 : -1]
-        self._laser, column = np.nonzero(free_rays(self.sensor)[:, order])
-        azimuth = self.sensor.column_azimuths().astype(float)[order][column]
+        azimuths = self.sensor.firing_azimuths()
+        order = np.argsort(-azimuths % (2 * np.pi), axis=1)
+        self._laser, place = np.nonzero(np.take_along_axis(free_rays(self.sensor), order, 1))
+        azimuth = azimuths[self._laser, order[self._laser, place]]
         tilt = elevation[self._laser]
         self._rays = np.stack(
             [np.cos(azimuth) * np.cos(tilt), -np.sin(azimuth) * np.cos(tilt), np.sin(tilt)], 1
         ).astype(np.float32)
         self._heights = height[self._laser].astype(np.float32)
+        # It turns counter-clockwise and looks straight ahead at the moment of the pose.
+        self._turned = (-(azimuth + np.pi) % (2 * np.pi) / (2 * np.pi) - 0.5).astype(np.float32)
         self._gains = laser_gains(self.sensor, self._noise)
 
     def __reduce__(self) -> tuple[type["Town"], tuple[object, ...]]:
@@ -137,7 +141,7 @@ class Town:
         """
         snapshot, pose, rng = self.moment(self._checked(index))
         world = self.world(index)
-        laser, surface, points, reflectance = self._turn(snapshot, pose, world.surfaces, rng)
+        laser, surface, points, reflectance = self._turn(snapshot, pose, self._travelled(index), world.surfaces, rng)
         raw, instance = world.surfaces.raw[surface], world.surfaces.instance[surface]
         returned = np.bincount(instance, minlength=world.scene.instances + 1)
         objects = [o for o in (*world.scene.placed, *snapshot.movers) if o.prototype.name and returned[o.instance]]
@@ -157,19 +161,38 @@ class Town:
             domain=SYNTHETIC,
         )
 
+    def _travelled(self, index: int) -> NDArray[np.float32]:
+        """(3,) metres that the ego vehicle drives during the revolution of a scan, in the world frame."""
+        world, time = self.world(index), index % STRETCH_FRAMES * self.interval
+        still = np.zeros(2)
+        ends = [ego_pose(world.street, world.scene, time + t, HEIGHT, still) for t in (-REVOLUTION / 2, REVOLUTION / 2)]
+        return (ends[1] - ends[0])[:3, 3].astype(np.float32)
+
     def _turn(
-        self, snapshot: Snapshot, pose: Pose, surfaces: SurfaceTable, rng: np.random.Generator
+        self,
+        snapshot: Snapshot,
+        pose: Pose,
+        travelled: NDArray[np.float32],
+        surfaces: SurfaceTable,
+        rng: np.random.Generator,
     ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-        """Laser, surface number, point in the sensor frame and reflectance of each return of one revolution."""
+        """Laser, surface number, point in the sensor frame and reflectance of each return of one revolution.
+
+        The vehicle moves while the sensor turns; the points are in the frame of ``pose``, as motion compensated scans.
+        """
         turn = pose[:3, :3].astype(np.float32)
         directions = self._rays @ turn.T
-        origins = pose[:3, 3].astype(np.float32) + self._heights[:, None] * turn[:, 2]
-        eye = origins.mean(0)
+        moved = self._turned[:, None] * travelled
+        eye = pose[:3, 3].astype(np.float32)
+        origins = eye + moved + self._heights[:, None] * turn[:, 2]
         hits = snapshot.cast(origins, directions, eye)
         see_through(snapshot, hits, origins, directions, eye, surfaces, rng)
-        back, far, reflectance = measure(hits, directions, self._laser, surfaces, self._gains, self._noise, rng)
+        back, far, reflectance = measure(
+            hits, origins, directions, self._laser, surfaces, self._gains, self._noise, rng
+        )
         points = far[:, None] * self._rays[back]
         points[:, 2] += self._heights[back]
+        points += moved[back] @ turn
         distance = np.sqrt(np.einsum("ij,ij->i", points, points))
         kept = np.flatnonzero((distance >= self.sensor.range_min) & (distance <= self.sensor.range_max))
         return self._laser[back[kept]], hits.surface[back[kept]], points[kept], reflectance[kept]
