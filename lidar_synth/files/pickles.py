@@ -13,8 +13,8 @@ from typing import Any
 from lidar_synth.errors import DataError, shorten
 from lidar_synth.files.disk import SKIP_HINT
 
-MOST_STEPS = 500_000
-"""Maximum number of opcodes; a table with 1,000 rows of text has 50,000."""
+MOST_STEPS = 200_000
+"""Maximum number of opcodes; PandaSet's tables have up to a few thousand."""
 
 
 @dataclass(frozen=True)

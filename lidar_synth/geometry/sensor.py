@@ -308,7 +308,7 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
     if path.suffix == ".json":
         return Sensor.from_dict(read_metadata(path))
     if path.suffix not in (".yaml", ".yml"):
-        expected = f"one of {', '.join(presets())}, a .yaml file, or an Ouster's metadata .json"
+        expected = f"one of {', '.join(presets())}, the metadata .json of an Ouster, or a .yaml file"
         raise ConfigError(f"sensor {str(sensor)!r}", expected)
     entries = _entries(read_yaml(path, "a file with a sensor, such as sensors.yaml"), str(path))
     if len(entries) != 1:
