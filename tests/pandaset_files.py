@@ -63,6 +63,7 @@ def array(values: Any, *, dtype: str | None = None, shape: tuple[int, ...] | Non
 def table(columns: dict[str, Any]) -> Call:
     """A table as pandas 0.25 pickles it: columns of one type in one block."""
     names, arrays = list(columns), [np.asarray(values) for values in columns.values()]
+    arrays = [values.astype(object) if values.dtype.kind == "U" else values for values in arrays]
     blocks = []
     for kind in sorted({values.dtype.str for values in arrays}):
         places = [i for i, values in enumerate(arrays) if values.dtype.str == kind]
@@ -155,6 +156,5 @@ def write_pandaset(root: Path, count: int = 3) -> list[Path]:
         write_table(path, dict(zip("xyzit", rows.T, strict=False)) | {"d": rows[:, 5].astype(np.int64)})
         classes = np.random.default_rng(i).integers(1, 43, len(rows))
         write_table(folder / "annotations" / "semseg" / path.name, {"class": classes})
-        columns = {k: np.array(v, object if isinstance(v[0], str | None) else None) for k, v in CUBOIDS.items()}
-        write_table(folder / "annotations" / "cuboids" / path.name, columns)
+        write_table(folder / "annotations" / "cuboids" / path.name, CUBOIDS)
     return paths

@@ -64,7 +64,7 @@ def parse_pickle(content: bytes, known: Collection[str], where: str, expected: s
         [value] = machine.stack if not machine.below else []
     except _Unknown as error:
         raise DataError(
-            f"{where} would call {shorten(str(error), 200)} when loaded, and was not loaded",
+            f"{where} would {error} when loaded, and was not loaded",
             expected,
             "A pickle that contains code can do anything: get the file from the dataset's own release page.",
         ) from None
@@ -77,7 +77,7 @@ def parse_pickle(content: bytes, known: Collection[str], where: str, expected: s
 
 
 class _Unknown(Exception):
-    """A name that is not known."""
+    """A name or an opcode that a table does not have."""
 
 
 class _Machine:
@@ -97,7 +97,7 @@ class _Machine:
         elif opcode in _STEPS:
             _STEPS[opcode](self, argument)
         elif opcode not in ("PROTO", "FRAME", "STOP"):
-            raise _Unknown(f"the opcode {opcode}")
+            raise _Unknown(f"run the opcode {opcode}")
 
     def since_mark(self) -> list[Any]:
         """The values above the last mark, which are taken off the stack."""
@@ -119,7 +119,7 @@ class _Machine:
 
     def name(self, text: str) -> None:
         if text not in self.known:
-            raise _Unknown(repr(text))
+            raise _Unknown(f"call {shorten(repr(text), 200)}")
         self.stack.append(Name(text))
 
     def stack_name(self, _: Any) -> None:

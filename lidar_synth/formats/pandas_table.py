@@ -86,6 +86,22 @@ def read_table(path: Path, columns: Iterable[str], optional: Iterable[str] = ())
     return table
 
 
+def require_numbers(table: dict[str, NDArray[Any]], columns: Iterable[str], path: Path, kinds: str = "iuf") -> None:
+    """Refuse columns of another type.
+
+    Args:
+        table: as ``read_table`` gives it.
+        columns: names of columns of numbers.
+        path: of the table, for the error.
+        kinds: numpy's letters of the types that are accepted; by default integers and floating-point numbers.
+
+    Raises:
+        DataError: on a column of another type.
+    """
+    if wrong := [f"{name} of type {table[name].dtype}" for name in columns if table[name].dtype.kind not in kinds]:
+        raise DataError(f"{path} has columns {', '.join(wrong)}", "numbers" if "f" in kinds else "whole numbers")
+
+
 def _gunzip(content: bytes, path: Path) -> bytes:
     stream = zlib.decompressobj(wbits=31)
     try:

@@ -28,7 +28,7 @@ from lidar_synth.datasets.classes import PANDASET
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import list_files, naming
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.pandas_table import read_table
+from lidar_synth.formats.pandas_table import read_table, require_numbers
 from lidar_synth.formats.pandaset_cuboids import read_cuboids
 from lidar_synth.formats.pandaset_tracks import FORWARD, MOUNTS, Track, read_intrinsics, read_track
 from lidar_synth.formats.point_labels import mismatch
@@ -107,6 +107,7 @@ class PandaSet(ScanFiles):
         track = self._track(folder / "lidar")
         number = track.number(frame, path)
         table = read_table(path, "xyzitd")
+        require_numbers(table, "xyzitd", path)
         kept = table["d"] == self._device
         world = np.stack([table[axis][kept] for axis in "xyz"], axis=-1).astype(np.float64)
         time = table["t"][kept].astype(np.float64)
@@ -163,11 +164,11 @@ class PandaSet(ScanFiles):
         path = folder / "annotations" / "semseg" / f"{frame}{SUFFIX}"
         if not path.parent.is_dir():
             return {}
-        raw = read_table(path, ["class"])["class"]
+        table = read_table(path, ["class"])
+        require_numbers(table, ["class"], path, "iu")
+        raw = table["class"]
         if len(raw) != len(kept):
             raise mismatch(path, len(raw), points, len(kept))
-        if raw.dtype.kind not in "iu":
-            raise DataError(f"{path} has classes of type {raw.dtype}", "whole numbers")
         return {"label": PANDASET.decode(raw[kept], str(path)), "raw_label": raw[kept].astype(np.uint32)}
 
     def _boxes(self, path: Path, pose: NDArray[np.float64]) -> Boxes | None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.formats.pandas_table import read_table
+from lidar_synth.formats.pandas_table import read_table, require_numbers
 from lidar_synth.geometry.motion import from_world
 from lidar_synth.geometry.scan import Boxes
 
@@ -41,8 +41,7 @@ def read_cuboids(path: Path, pose: NDArray[np.float64], other_sensor: int) -> Bo
     """
     numbers = ("position.x", "position.y", "position.z", "dimensions.y", "dimensions.x", "dimensions.z", "yaw")
     table = read_table(path, (*numbers, "label", "uuid"), ("cuboids.sensor_id", "attributes.rider_status"))
-    if not all(table[name].dtype.kind in "iuf" for name in numbers):
-        raise DataError("positions, dimensions or yaws that are not numbers", "a table of PandaSet's cuboids")
+    require_numbers(table, numbers, path)
     labels = table["label"].tolist()
     if unknown := sorted({str(label) for label in labels} - BOXES.keys()):
         raise DataError(f"boxes of class {unknown[:5]}", "classes of PandaSet")
@@ -53,7 +52,8 @@ def read_cuboids(path: Path, pose: NDArray[np.float64], other_sensor: int) -> Bo
     kept &= table.get("cuboids.sensor_id", np.full(len(labels), -1)) != other_sensor
     values = np.stack([table[name] for name in numbers], axis=-1).astype(np.float64)[kept]
     # PandaSet's yaw turns a box whose length is along y.
-    heading = np.stack([-np.sin(values[:, 6]), np.cos(values[:, 6]), np.zeros(len(values))], -1) @ pose[:3, :3]
+    with np.errstate(invalid="ignore"):  # Boxes refuses what is not finite
+        heading = np.stack([-np.sin(values[:, 6]), np.cos(values[:, 6]), np.zeros(len(values))], -1) @ pose[:3, :3]
     values[:, :3] = from_world(values[:, :3], pose)
     values[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
     instance = [crc32(str(uuid).encode("utf-8", "replace")) >> 1 for uuid in table["uuid"][kept]]
