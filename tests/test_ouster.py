@@ -6,9 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from layouts import some_scan, write_all
 from ouster_files import LIFT, ouster_metadata
 
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID, Taxonomy
 from lidar_synth.errors import LidarSynthError
+from lidar_synth.formats import SemanticKITTI, open_scans
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -140,3 +143,20 @@ def test_text_that_is_no_json_is_refused(tmp_path: Path) -> None:
     path.write_text("[" * (1 << 21))
     with pytest.raises(LidarSynthError, match=r"mine.json is longer than"):
         load_sensor(path)
+
+
+def test_scans_of_another_sensor_in_semantic_kittis_layout(tmp_path: Path) -> None:
+    """SemanticTHAB and SemanticPOSS have this layout; the latter has class ids of its own."""
+    path = written(tmp_path, ouster_metadata())
+    write_all("semantic_kitti", tmp_path / "data", [some_scan(sensor=str(path))])
+    [labels] = (tmp_path / "data").rglob("*.label")
+    scan = open_scans(tmp_path / "data", sensor=path)[0]
+    assert scan.sensor == load_sensor(path) and project(scan).range.shape == (8, 1024)
+    own = np.arange(len(scan), dtype="<u4") % 3
+    own.tofile(labels)
+    with pytest.raises(LidarSynthError, match=r"unknown class ids \[2\]; expected class ids of SemanticKITTI"):
+        open_scans(tmp_path / "data", sensor=path)[0]
+    mine = Taxonomy("mine", {0: IGNORE, 1: TRAIN_ID["person"], 2: TRAIN_ID["car"]})
+    scan = SemanticKITTI(tmp_path / "data", sensor=path, taxonomy=mine)[0]
+    assert np.array_equal(scan.label, np.array([IGNORE, TRAIN_ID["person"], TRAIN_ID["car"]])[own])
+    assert np.array_equal(scan.raw_label, own)

@@ -69,7 +69,7 @@ class PandaSet(ScanFiles):
         >>> from lidar_synth import PandaSet
         >>> scans = PandaSet("PandaSet")
         >>> scans.ids[0], scans.sensor.name
-        ('002/00', 'pandar64')
+        ('007/00', 'pandar64')
         >>> list(scans[0].fields())
         ['reflectance', 'label', 'raw_label', 'ring', 'time']
     """
