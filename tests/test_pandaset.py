@@ -78,7 +78,7 @@ def test_every_class_is_mapped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sensor", "names"), [("pandar64", ("Car", "Pedestrian")), ("pandar_gt", ("Car", "Cyclist", "Truck"))]
+    ("sensor", "names"), [("pandar64", ("Car", "Pedestrian")), ("pandar_gt", ("Cyclist", "Truck"))]
 )
 def test_boxes_are_those_that_the_sensor_saw(root: Path, sensor: str, names: tuple[str, ...]) -> None:
     boxes = PandaSet(root, sensor=sensor)[1].boxes

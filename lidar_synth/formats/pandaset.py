@@ -41,6 +41,8 @@ from lidar_synth.geometry.sensor import Sensor
 FRAMES = "lidar/*.pkl.gz"
 SUFFIX = ".pkl.gz"
 INTENSITY_MAX = 255.0
+VIEW = np.radians(32)
+"""The forward sensor sees objects up to this angle to the left and to the right."""
 IMAGE_SIZE = (1920, 1080)
 CAMERAS = ("front_camera", "front_left_camera", "front_right_camera", "left_camera", "right_camera", "back_camera")
 
@@ -175,7 +177,9 @@ class PandaSet(ScanFiles):
         if not path.is_file():
             return None
         with naming(path):
-            return read_cuboids(path, pose, other_sensor=1 - self._device)
+            boxes = read_cuboids(path, pose, other_sensor=1 - self._device)
+        ahead = abs(np.arctan2(boxes.values[:, 1], boxes.values[:, 0])) < VIEW
+        return boxes[ahead] if self._device else boxes
 
 
 def _rings(points: NDArray[np.float64], sensor: Sensor) -> NDArray[np.int16]:

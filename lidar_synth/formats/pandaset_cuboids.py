@@ -33,7 +33,7 @@ def read_cuboids(path: Path, pose: NDArray[np.float64], other_sensor: int) -> Bo
         path: the table.
         pose: (4, 4) sensor to world.
         other_sensor: 0 = Pandar64 or 1 = PandarGT. Of an object in the view of both, each sensor has a box of its own;
-            -1 in the table stands for a box of both.
+            -1 in the table stands for all other objects.
 
     Raises:
         FileError: if it cannot be read.
