@@ -193,7 +193,8 @@ def _dtype(value: Any) -> np.dtype[Any]:
         return np.dtype(object)
     if text not in TYPES:
         raise ValueError(f"an array of {text!r}")
-    return np.dtype(order + text)
+    dtype: np.dtype[Any] = np.dtype(f"{order}{text}")
+    return dtype
 
 
 def _objects(values: Any) -> NDArray[Any]:

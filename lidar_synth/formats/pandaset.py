@@ -188,4 +188,5 @@ def _rings(points: NDArray[np.float64], sensor: Sensor) -> NDArray[np.int16]:
         elevation = np.arctan2(points[:, 2], np.linalg.norm(points[:, :2], axis=1))
     beams = sensor.laser_elevations.astype(np.float64)
     between = (beams[1:] + beams[:-1]) / 2
-    return (len(between) - np.searchsorted(between[::-1], elevation)).astype(np.int16)
+    below: NDArray[np.int64] = np.searchsorted(between[::-1], elevation)
+    return (len(between) - below).astype(np.int16)
