@@ -138,6 +138,8 @@ def test_sequences_and_cameras_are_chosen(tmp_path: Path) -> None:
     (tmp_path / "007").rename(tmp_path / "019")
     write_pandaset(tmp_path, 3)
     assert PandaSet(tmp_path).ids == ("007/00", "007/01", "007/02", "019/00", "019/01")
+    with pytest.raises(DataError, match="has no sequence 019; expected some of none"):
+        PandaSet(tmp_path / "019", sequences=("019",))
     assert PandaSet(tmp_path, sequences=("019",)).ids == open_scans(tmp_path / "019").ids == ("019/00", "019/01")
     with pytest.raises(DataError, match="has no sequence 020; expected some of 007, 019"):
         PandaSet(tmp_path, sequences=("020",))

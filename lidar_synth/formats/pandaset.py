@@ -89,7 +89,7 @@ class PandaSet(ScanFiles):
         if camera not in CAMERAS:
             raise ConfigError(f"camera {camera!r} of PandaSet", f"one of {', '.join(CAMERAS)}")
         root = Path(root)
-        if any(root.glob(FRAMES)):
+        if sequences is None and any(root.glob(FRAMES)):
             root, sequences = root.resolve().parent, (root.resolve().name,)
         existing = sorted({path.parents[1].name for path in root.glob(f"*/{FRAMES}")})
         wanted = existing if sequences is None else list(sequences)
