@@ -30,6 +30,7 @@ _HOME = {
     "MixedStream": "mixing",
     "NuScenes": "formats",
     "ObjectBank": "labels",
+    "PandaSet": "formats",
     "RangeImage": "geometry.scan",
     "RollingBank": "mixing.service",
     "Scan": "geometry.scan",
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from lidar_synth.formats import KITTIObject as KITTIObject
     from lidar_synth.formats import KITTIRaw as KITTIRaw
     from lidar_synth.formats import NuScenes as NuScenes
+    from lidar_synth.formats import PandaSet as PandaSet
     from lidar_synth.formats import SemanticKITTI as SemanticKITTI
     from lidar_synth.formats import open_scans as open_scans
     from lidar_synth.generate.generator import Generator as Generator

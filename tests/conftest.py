@@ -45,6 +45,12 @@ def real_scans() -> Path:
     return _folder("LIDAR_SYNTH_REAL_SCANS")
 
 
+@pytest.fixture(scope="session")
+def labelled_scans() -> Path:
+    """Folder with labelled real scans of SemanticKITTI and PandaSet; skips where there is none."""
+    return _folder("LIDAR_SYNTH_LABELLED_SCANS")
+
+
 class Golden:
     """Numbers from running the peers' code: small files in tests/golden, larger ones where LIDAR_SYNTH_GOLDEN says."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from banks import write_bank
 from conftest import random_scan
+from pandaset_files import write_pandaset
 
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.calibration import AXES_CAMERA_FROM_SENSOR, Calibration
@@ -150,6 +151,7 @@ MAKERS: dict[str, Callable[[Path], list[Path]]] = {
     "png": lambda root: write_all("png", root, [some_scan(i) for i in range(3)]),
     "webdataset": write_tars,
     "nuscenes": write_nuscenes,
+    "pandaset": write_pandaset,
     "kitti_raw": write_kitti_raw,
 }
 """By layout: write three scans under a folder; the file of each."""

@@ -18,6 +18,7 @@ import pytest
 import torch
 from commands import NEVER_RUN, WrongCommand, check, parts_of
 from documents import PAGES, Block, blocks_of, commands_of, name_of, reduced, spans_of
+from pandaset_files import write_pandaset
 from snippets import check_python, check_yaml
 
 from lidar_synth.bake import BakeJob, bake, make_plan
@@ -57,6 +58,7 @@ DATASETS: dict[str, Callable[[Path], object]] = {
     "SemanticKITTI": _semantic_kitti,
     "KITTI-360": _town("kitti360"),
     "KITTI": _town("kitti"),
+    "PandaSet": write_pandaset,
 }
 """What pages name without making it: town and bank as ``make demo`` leaves them, and a dataset in each layout."""
 

@@ -8,6 +8,7 @@ from pkgutil import resolve_name
 
 import pytest
 from layouts import write_kitti_raw, write_nuscenes
+from pandaset_files import write_pandaset
 from project import ROOT
 
 import lidar_synth
@@ -74,6 +75,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> Path:
         export_town(Town(0, scans=3), root / out, layout, camera=False, progress=False)
     write_kitti_raw(root / "KITTI-raw")
     write_nuscenes(root / "nuScenes")
+    write_pandaset(root / "PandaSet")
     bake(make_plan(root / "demo_out" / "bank", BakeJob(count=4, seed=1)), progress=False)
     return root
 

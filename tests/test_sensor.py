@@ -12,11 +12,31 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
 
 DESIGN = {"hdl64e_kitti360", "hdl64e_kitti", "hdl32e_nuscenes", "os1_128", "town"}
 
+LASERS = {"vlp16": (16, 15.0, -15.0), "hdl32e": (32, 10.67, -30.67), "vls128": (128, 15.0, -25.0),
+          "pandar64": (64, 14.87, -24.909)}  # fmt: skip
+"""{sensor: number of lasers, highest and lowest elevation in degrees} by the manuals."""
+
 
 def test_all_required_presets_exist() -> None:
     assert set(presets()) >= DESIGN
     values = {k: v for k, v in presets()["town"].to_dict().items() if k not in ("name", "description")}
     assert values == {k: presets()["hdl64e_kitti360"].to_dict()[k] for k in values}
+
+
+@pytest.mark.parametrize("name", LASERS)
+def test_tables_of_beams_are_those_of_the_manuals(name: str) -> None:
+    sensor, (rows, highest, lowest) = presets()[name], LASERS[name]
+    assert sensor.elevations is not None and sensor.shape[0] == rows
+    assert (sensor.elevations[0], sensor.elevations[-1]) == (highest, lowest)
+
+
+def test_lasers_beside_each_other_point_apart() -> None:
+    """The VLS-128 fires eight lasers at once, in eight directions; each direction has 16 lasers."""
+    azimuths = presets()["vls128"].azimuths
+    assert azimuths is not None
+    values, counts = np.unique(azimuths, return_counts=True)
+    assert values.tolist() == [-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354] and set(counts) == {16}
+    assert dict(zip(presets()["vls128"].elevations or (), azimuths, strict=True))[-11.742] == 6.354
 
 
 def test_a_sensor_is_unchanged_by_yaml_copies_and_files(sensor: Sensor, tmp_path: Path) -> None:

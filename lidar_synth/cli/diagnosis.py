@@ -66,6 +66,7 @@ DATA_ROOTS = {
     "SEMANTICKITTI_ROOT": ("sequences/*/velodyne/*.bin", ()),
     "KITTI_ROOT": ("training/velodyne/*.bin", ("training/label_2", "training/calib")),
     "NUSCENES_ROOT": ("samples/LIDAR_TOP/*.pcd.bin", ()),
+    "PANDASET_ROOT": ("*/lidar/*.pkl.gz", ()),
     "LIDAR_SYNTH_REAL_SCANS": ("manifest.csv", ()),
     "LIDAR_SYNTH_GOLDEN": ("*.npz", ()),
 }

@@ -2,8 +2,8 @@
 
 Inside the package a label is a train id 0..18 as uint8, or ``IGNORE`` (255) for unlabelled points.
 The sources are http://www.semantic-kitti.org/dataset.html (``semantic-kitti.yaml``),
-https://www.cvlibs.net/datasets/kitti-360/documentation.php and
-https://www.nuscenes.org/nuscenes#lidarseg.
+https://www.cvlibs.net/datasets/kitti-360/documentation.php,
+https://www.nuscenes.org/nuscenes#lidarseg and PandaSet's ``classes.json``.
 """
 
 from collections.abc import Mapping
@@ -170,3 +170,20 @@ NUSCENES = Taxonomy(
 )  # fmt: skip
 """nuScenes-lidarseg's 32 ids. Lossy: ``static.manmade`` is building, poles and signs alike; a
 motorcycle or bicycle holds its rider; barriers become fence."""
+
+PANDASET = Taxonomy(
+    "PandaSet",
+    _by_name(
+        {
+            "car": (13,), "bicycle": (26,), "motorcycle": (18, 25), "truck": (14, 15, 16),
+            "other-vehicle": (17, 19, 20, 21, 22, 23, 27, 28, 29), "person": (30, 31), "road": (7, 8, 9, 10),
+            "sidewalk": (11, 12), "building": (41,), "fence": (35, 39), "vegetation": (5,), "terrain": (6,),
+            "traffic-sign": (36, 38),
+        },
+        range(43),
+    ),
+)  # fmt: skip
+"""PandaSet's 42 classes, 0 = none. Lossy: a bicycle or motorcycle holds its rider, and vegetation the trunks; markings
+are road, driveways are sidewalk and pickups are trucks as in SemanticKITTI; barriers become fence. Ignored: smoke,
+exhaust, spray and reflections (1 to 4), personal mobility devices (24), animals (32, 33), pylons and cones (34, 37),
+rolling containers (40) and *other static object* (42), which holds poles, walls and fences alike."""

@@ -19,6 +19,7 @@ from lidar_synth.formats.kitti360 import KITTI360, KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObject, KITTIObjectWriter
 from lidar_synth.formats.kitti_raw import DRIVES, KITTIRaw
 from lidar_synth.formats.nuscenes import SUFFIX, NuScenes
+from lidar_synth.formats.pandaset import FRAMES, PandaSet
 from lidar_synth.formats.png import PNGWriter, RangePNG
 from lidar_synth.formats.range_images import RangeImages, RangeWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
@@ -39,6 +40,7 @@ __all__ = [
     "KITTIRaw",
     "NuScenes",
     "OnBad",
+    "PandaSet",
     "RangeImages",
     "RangePNG",
     "ScanFiles",
@@ -55,6 +57,7 @@ READERS: dict[str, type[ScanFiles]] = {
     "kitti_object": KITTIObject,
     "kitti_raw": KITTIRaw,
     "nuscenes": NuScenes,
+    "pandaset": PandaSet,
     "bank": BankScans,
     "webdataset": WebDataset,
     "range": RangeImages,
@@ -84,6 +87,7 @@ SIGNS: dict[str, Callable[[Path], bool]] = {
     "nuscenes": lambda root: (
         root.name.endswith(SUFFIX) or any(any(root.glob(p)) for p in (f"*{SUFFIX}", f"samples/LIDAR_TOP/*{SUFFIX}"))
     ),
+    "pandaset": lambda root: any(any(root.glob(p)) for p in (FRAMES, f"*/{FRAMES}")),
     "kitti_raw": lambda root: any(any(root.glob(p)) for p in ("velodyne_points/data", DRIVES, f"*/{DRIVES}")),
     "bank": is_bank,
     "webdataset": lambda root: root.suffix == TAR or any(root.glob(f"*{TAR}")),

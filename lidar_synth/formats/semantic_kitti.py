@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import SEMANTIC_KITTI
+from lidar_synth.datasets.classes import SEMANTIC_KITTI, Taxonomy
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import (
     list_files,
@@ -64,6 +64,7 @@ class SemanticKITTI(ScanFiles):
         root: the folder that holds ``sequences``.
         split: ``train``, ``val``, ``test`` or ``all``.
         sensor: a preset's name, a YAML file or a ``Sensor``.
+        taxonomy: the class ids of the labels, for datasets in this layout with classes of their own.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -85,9 +86,11 @@ class SemanticKITTI(ScanFiles):
         split: str = "all",
         *,
         sensor: str | Path | Sensor = "hdl64e_semantic_kitti",
+        taxonomy: Taxonomy = SEMANTIC_KITTI,
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
+        self.taxonomy = taxonomy
         wanted = choose("SemanticKITTI split", split, SPLITS)
         existing = sorted(p.parent.name for p in (root / "sequences").glob("*/velodyne"))
         sequences = [s for s in existing if wanted is None or s in wanted]
@@ -109,7 +112,7 @@ class SemanticKITTI(ScanFiles):
         points = read_points(path)
         labels = {}
         if sequence in self._labelled:
-            labels = read_labels(folder / "labels" / f"{frame}.label", path, len(points), SEMANTIC_KITTI)
+            labels = read_labels(folder / "labels" / f"{frame}.label", path, len(points), self.taxonomy)
         image = folder / "image_2" / f"{frame}.png"
         return Scan(
             points[:, :3],

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, shorten
 from lidar_synth.files.parsing import parse_yaml, read_yaml
+from lidar_synth.geometry.ouster import read_metadata
 
 Rays = Literal["centre", "corner"]
 """The point of a cell through which its ray passes: the centre (so that unprojected points project back to the same
@@ -276,16 +277,17 @@ def presets() -> dict[str, Sensor]:
 
 
 def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
-    """Load a sensor: a preset by name, or one of your own from a YAML file.
+    """Load a sensor: a preset by name, or one of your own from a YAML file or from an Ouster's metadata.
 
     Args:
         sensor: a name of ``presets()``; the path of a YAML file with one entry, whose keys are those of
-            ``sensors.yaml``; or a ``Sensor``, which is returned as it is.
+            ``sensors.yaml``; the path of the metadata JSON of an Ouster sensor; or a ``Sensor``, which is returned as
+            it is.
 
     Raises:
         ConfigError: on an unknown name, or a file without exactly one sensor.
         FileError: on a path that cannot be read.
-        DataError: on a file that is not UTF-8, or longer than a sensor's.
+        DataError: on a file that is not UTF-8, or longer than a sensor's, or JSON that is no Ouster's.
 
     Example:
         >>> from lidar_synth import load_sensor
@@ -303,8 +305,11 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
     if str(sensor) in presets():
         return presets()[str(sensor)]
     path = Path(sensor)
+    if path.suffix == ".json":
+        return Sensor.from_dict(read_metadata(path))
     if path.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"sensor {str(sensor)!r}", f"one of {', '.join(presets())}, or a .yaml file")
+        expected = f"one of {', '.join(presets())}, the metadata .json of an Ouster, or a .yaml file"
+        raise ConfigError(f"sensor {str(sensor)!r}", expected)
     entries = _entries(read_yaml(path, "a file with a sensor, such as sensors.yaml"), str(path))
     if len(entries) != 1:
         raise ConfigError(f"{path} holds {len(entries)} sensors", "exactly one entry: its name, then its values")

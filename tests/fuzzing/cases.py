@@ -7,7 +7,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from random import Random
 
-from fuzzing import arrays, containers, hdf5, pictures, text, weights  # noqa: F401 - they enter their mutators
+from fuzzing import arrays, containers, hdf5, pickled, pictures, text, weights  # noqa: F401 - they enter their mutators
 from fuzzing.mutators import mutate
 from fuzzing.targets import Target
 

@@ -14,6 +14,8 @@ import torch
 import yaml
 from banks import SENSOR, some_image, write_bank
 from layouts import some_camera, some_scan, write_kitti_raw, write_nuscenes
+from ouster_files import ouster_metadata
+from pandaset_files import write_pandaset
 
 from lidar_synth.bank import ShardReader
 from lidar_synth.files.disk import write_named_matrices
@@ -159,6 +161,8 @@ def make_sensors(root: Path) -> None:
     table = {"elevations": [4.0, 2.5, 0.0, -10.0], "beams": [4.1, 2.4, 0.1, -9.0], "heights": [0.1, 0.1, 0.0, 0.0],
              "columns": 32, "range_min": 0.5, "range_max": 120.0, "description": "a table"}  # fmt: skip
     (root / "linear.yaml").write_text(yaml.safe_dump({"linear": linear}))
+    (root / "grouped.json").write_text(json.dumps(ouster_metadata()))
+    (root / "flat.json").write_text(json.dumps(ouster_metadata(flat=True)))
     (root / "table.yaml").write_text("# a comment\n" + yaml.safe_dump({"table": table}))
 
 
@@ -202,7 +206,7 @@ def read_shard(root: Path) -> list[Any]:
 
 def read_sensors(root: Path) -> list[Any]:
     """The sensors, after their rays were made."""
-    found = [load_sensor(path) for path in (root / "linear.yaml", root / "table.yaml")]
+    found = [load_sensor(root / name) for name in ("linear.yaml", "table.yaml", "grouped.json", "flat.json")]
     for sensor in found:
         sensor.ray_directions()
     return [*found]
@@ -254,6 +258,7 @@ TARGETS: dict[str, Target] = {
     "kitti_raw": Target(make_kitti_raw, partial(read, "kitti_raw")),
     "kitti360": Target(partial(write, "kitti360"), partial(read, "kitti360")),
     "nuscenes": Target(partial(write_nuscenes, count=2), partial(read, "nuscenes")),
+    "pandaset": Target(partial(write_pandaset, count=2), partial(read, "pandaset")),
     "bank": Target(make_bank, partial(read, "bank"), files=("*.h5", "index.json"), mend=mend_index),
     "bank_index": Target(make_bank, partial(read, "bank"), files=("index.json",), mend=mend_index),
     "bank_shard": Target(make_bank, read_shard, files=("shard-00000.h5",)),

@@ -1,0 +1,93 @@
+"""The motion of a sensor during a scan: poses interpolated at the times of points, and points in the frames of poses.
+
+A rotating sensor measures a scan over 0.1 s, in which a car drives one or two metres. With poses before and after, each
+point has a pose of its own, the one at the time of its measurement.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+
+FARTHEST = 1.0
+"""Maximum time in seconds before the first pose or after the last one for which a pose is extrapolated."""
+
+
+def interpolate_poses(
+    times: NDArray[np.float64], poses: NDArray[np.float64], at: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The poses at other times: between two poses, velocity and angular velocity are constant.
+
+    Before the first pose and after the last one, the motion of the nearest interval continues.
+
+    Args:
+        times: (P,) seconds, increasing.
+        poses: (P, 4, 4) rigid transforms.
+        at: (N,) seconds.
+
+    Returns:
+        (N, 4, 4) float64.
+
+    Raises:
+        DataError: on times that do not increase or do not fit the poses, fewer than two poses, or a time more than
+            ``FARTHEST`` outside.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth.geometry.motion import interpolate_poses
+        >>> poses = np.tile(np.eye(4), (2, 1, 1))
+        >>> poses[1, 0, 3] = 10.0
+        >>> interpolate_poses(np.array([0.0, 1.0]), poses, np.array([0.25]))[0, :3, 3]
+        array([2.5, 0. , 0. ])
+    """
+    if len(times) < 2 or poses.shape != (len(times), 4, 4) or not (np.diff(times) > 0).all():
+        raise DataError(f"{len(times)} times for {len(poses)} poses", "two or more poses with increasing times")
+    if len(at) and not times[0] - FARTHEST <= at.min() <= at.max() <= times[-1] + FARTHEST:
+        raise DataError(
+            f"times from {at.min() - times[0]:g} s to {at.max() - times[0]:g} s after the first pose",
+            f"-{FARTHEST:g} s to {times[-1] - times[0] + FARTHEST:g} s: poses of the same recording",
+        )
+    start = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+    fraction = (at - times[start]) / np.diff(times)[start]
+    steps = poses[:-1, :3, :3].swapaxes(-1, -2) @ poses[1:, :3, :3]
+    axes, angles = _axes_and_angles(steps)
+    result = np.tile(np.eye(4), (len(at), 1, 1))
+    result[:, :3, :3] = poses[start, :3, :3] @ _rotations(axes[start], fraction * angles[start])
+    result[:, :3, 3] = poses[start, :3, 3] + fraction[:, None] * np.diff(poses[:, :3, 3], axis=0)[start]
+    return result
+
+
+def from_world(points: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points of the world in the frame of a pose each.
+
+    Args:
+        points: (N, 3) metres, in the world frame.
+        poses: (N, 4, 4) from each point's frame to the world, or (4, 4) for all points.
+
+    Returns:
+        (N, 3) float64 metres.
+    """
+    moved = points - poses[..., :3, 3]
+    return np.asarray(np.einsum("...ji,...j->...i", poses[..., :3, :3], moved), np.float64)
+
+
+def _axes_and_angles(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(P, 3) unit axes and (P,) angles in [0, pi], radians, of (P, 3, 3) rotations between poses."""
+    twice_sine = np.stack(
+        [rotations[:, 2, 1] - rotations[:, 1, 2], rotations[:, 0, 2] - rotations[:, 2, 0],
+         rotations[:, 1, 0] - rotations[:, 0, 1]], -1
+    )  # fmt: skip
+    length = np.linalg.norm(twice_sine, axis=1)
+    angles = np.arctan2(length, np.trace(rotations, axis1=1, axis2=2) - 1)
+    if (angles > 3).any():
+        raise DataError("poses that turn by half a circle from one to the next", "poses at least ten times a second")
+    return twice_sine / np.maximum(length, 1e-300)[:, None], angles
+
+
+def _rotations(axes: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3, 3) rotations about unit axes by angles, by Rodrigues' formula."""
+    cross = np.zeros((len(axes), 3, 3))
+    cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0] = axes.T
+    cross -= cross.swapaxes(-1, -2)
+    sine, versine = np.sin(angles)[:, None, None], (1 - np.cos(angles))[:, None, None]
+    return np.eye(3) + sine * cross + versine * (cross @ cross)
