@@ -4,6 +4,7 @@ from pathlib import Path
 
 from lidar_synth.bank import Bank
 from lidar_synth.errors import ConfigError
+from lidar_synth.formats.description import Description
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -28,7 +29,7 @@ class BankScans(ScanFiles):
         self.bank = Bank(root)
         if sensor is not None and load_sensor(sensor).shape != self.bank.sensor.shape:
             raise ConfigError(f"sensor {sensor} for {root}", f"{self.bank.sensor.name!r}, whose scans it holds")
-        super().__init__(Path(root), self.bank.ids, self.bank.sensor, on_bad)
+        super().__init__(Path(root), self.bank.ids, None, on_bad, stored=Description(self.bank.sensor))
 
     def read(self, index: int) -> Scan:
         return self.bank[index]
