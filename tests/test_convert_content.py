@@ -41,6 +41,9 @@ def test_conversion_unfolds_scans(tmp_path: Path) -> None:
     for scan, expected in zip(read, scans, strict=True):
         assert np.allclose(project(scan).range, unfold(expected).range, rtol=3e-7)
         assert np.array_equal(project(scan).sensor.row_elevations(), expected.sensor.laser_elevations)
+    for report in (Report(written=3), Report(kept=3)):  # points on the beams, described beside them
+        again = convert(open_scans(tmp_path / "in"), WRITERS["kitti"](tmp_path / "b"), unfold=True, progress=False)
+        assert again == report and open_scans(tmp_path / "b").sensor == scans[0].sensor.by_beams()
     write_all("kitti", tmp_path / "shuffled", [scans[0][np.random.default_rng(0).permutation(len(scans[0]))]])
     with pytest.raises(DataError, match="ring by ring"):
         convert(open_scans(tmp_path / "shuffled"), WRITERS["npz"](tmp_path / "no"), unfold=True, progress=False)

@@ -104,7 +104,9 @@ def convert(
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
     if isinstance(source, ScanFiles):
-        source.check_sensor()  # first, so that a wrong sensor leaves no settings behind
+        source.check_sensor()  # both first, so that a wrong sensor leaves no settings behind
+        target = as_sensor or source.sensor
+        writer.require_grid(target.by_beams() if unfold else target)
     claim(writer.root / SETTINGS, _settings(source, writer, as_sensor, unfold))
     missing, report = _compare(source, writer, on_bad)
     if isinstance(source, ScanFiles):

@@ -22,6 +22,7 @@ from lidar_synth.formats.description import NAME, Description, Origin, read_desc
 from lidar_synth.formats.points import write_points
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 
 Image = NDArray[np.uint8]
 Picture = Image | Path
@@ -94,12 +95,21 @@ class Writer(ABC):
             FileError: if the folder cannot be written or the disk is full.
             DataError: on a scan that the layout cannot represent.
         """
+        self.require_grid(scan.sensor)
+        picture = scan.image_path if image is None else image
+        self._put(scan, self.path(index, name), picture, calibration or self.calibration)
+
+    def require_grid(self, sensor: Sensor) -> None:
+        """Refuse a sensor if the folder is described (``scans.json``) as holding scans on another grid.
+
+        Raises:
+            ConfigError: if it is.
+            FileError, DataError: if the description cannot be read or is damaged.
+        """
         if self._description is None and (self.root / NAME).is_file():
             self._description = read_description(self.root)
         if self._description is not None:
-            require_grid(self.root, self._description, scan.sensor)
-        picture = scan.image_path if image is None else image
-        self._put(scan, self.path(index, name), picture, calibration or self.calibration)
+            require_grid(self.root, self._description, sensor)
 
     def _write_points(self, path: Path, scan: Scan) -> None:
         """Write the points of a scan as ``.bin``, which has no room for a description: it is recorded beside them."""
