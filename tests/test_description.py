@@ -308,3 +308,16 @@ def test_recording_again_changes_nothing(tmp_path: Path) -> None:
     again = record(tmp_path, replace(SENSORS["own"], name="another name"), ORIGINS["town"])
     assert (tmp_path / NAME).read_bytes() == before and again.sensor == SENSORS["own"]
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
+
+
+@pytest.mark.parametrize("to", [name for name in WRITERS if name not in BESIDE])
+def test_files_that_describe_themselves_may_differ(tmp_path: Path, to: str) -> None:
+    scans = [a_scan(origin=origin, seed=seed) for seed, origin in enumerate(reversed(ORIGINS.values()))]
+    write_all(to, tmp_path, scans)
+    assert [Origin.of(scan) for scan in open_scans(tmp_path)] == list(reversed(ORIGINS.values()))
+
+
+@pytest.mark.parametrize("to", ["npz", "pcd", "ply", "webdataset"])
+def test_a_folder_may_hold_files_of_several_sensors(tmp_path: Path, to: str) -> None:
+    write_all(to, tmp_path, [a_scan(sensor) for sensor in SENSORS.values()])
+    assert [scan.sensor for scan in open_scans(tmp_path)] == list(SENSORS.values())

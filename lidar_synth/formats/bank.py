@@ -4,7 +4,6 @@ from pathlib import Path
 
 from lidar_synth.bank import Bank
 from lidar_synth.errors import ConfigError
-from lidar_synth.formats.description import Description
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -29,7 +28,7 @@ class BankScans(ScanFiles):
         self.bank = Bank(root)
         if sensor is not None and load_sensor(sensor).shape != self.bank.sensor.shape:
             raise ConfigError(f"sensor {sensor} for {root}", f"{self.bank.sensor.name!r}, whose scans it holds")
-        super().__init__(Path(root), self.bank.ids, None, on_bad, stored=Description(self.bank.sensor))
+        super().__init__(Path(root), self.bank.ids, None, on_bad, stored=self.bank.sensor)
 
     def read(self, index: int) -> Scan:
         return self.bank[index]

@@ -9,7 +9,6 @@ Files in subfolders are included; a scan's id is its relative path without the s
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import Description
-from lidar_synth.formats.npz import check_numbers, decode_scan, read_npz_description, write_scan
+from lidar_synth.formats.npz import check_numbers, decode_scan, stored_sensor, write_scan
 from lidar_synth.formats.pcd import read_pcd, read_pcd_description, write_pcd
 from lidar_synth.formats.ply import read_ply, read_ply_description, write_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
@@ -65,10 +64,7 @@ class Folder(ScanFiles):
         root = Path(root)
         base, self._paths = scan_paths(root, SUFFIXES)
         ids = [path.relative_to(base).with_suffix("").as_posix() for path in self._paths]
-        first, stored = self._paths[0], None
-        with suppress(DataError, FileError):  # reading the scan will raise it
-            stored = _description(first)
-        super().__init__(root, ids, sensor, on_bad, stored=stored)
+        super().__init__(root, ids, sensor, on_bad, stored=_named_sensor(self._paths[0]))
         self._fields, self._reflectance_max = fields, reflectance_max
 
     def read(self, index: int) -> Scan:
@@ -111,18 +107,28 @@ def _columns(path: Path) -> dict[str, NDArray[Any]]:
 ARRAYS: dict[str, Callable[[Path], dict[str, NDArray[Any]]]] = {".npy": _columns, ".pcd": read_pcd, ".ply": read_ply}
 """{suffix: reader of a scan's arrays}."""
 
-DESCRIPTIONS: dict[str, Callable[[Path], Description | None]] = {
-    ".npz": read_npz_description,
+HEADERS: dict[str, Callable[[Path], Description | None]] = {
     ".pcd": read_pcd_description,
     ".ply": read_ply_description,
 }
-"""{suffix: reader of what a file says about its scan}."""
+"""{suffix: reader of what the header of a file says about its scan}."""
 
 
 def _description(path: Path) -> Description | None:
-    """What a file says about its scan; None if it says nothing."""
-    read = DESCRIPTIONS.get(path.suffix.lower())
+    """What the header of a file says about its scan; None if it says nothing."""
+    read = HEADERS.get(path.suffix.lower())
     return None if read is None else read(path)
+
+
+def _named_sensor(path: Path) -> Sensor | None:
+    """The sensor that a file names; None if it names none, or if reading the scan will raise an error."""
+    if path.suffix.lower() == ".npz":
+        return stored_sensor(path)
+    try:
+        said = _description(path)
+    except (DataError, FileError):
+        return None
+    return None if said is None else said.sensor
 
 
 def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]:

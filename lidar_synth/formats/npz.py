@@ -25,7 +25,7 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError, LidarSynthError
 from lidar_synth.files.disk import SKIP_HINT, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
-from lidar_synth.formats.description import Description, check_provenance
+from lidar_synth.formats.description import check_provenance
 from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -41,10 +41,10 @@ TYPES = {
 """numpy types of a scan's fields."""
 
 
-def read_npz_description(path: Path) -> Description | None:
+def stored_sensor(path: Path) -> Sensor | None:
     """The sensor that is stored in an ``.npz`` file, without reading its other arrays; None if there is none."""
     try:
-        return Description(_sensor(read_arrays(path, only=["sensor"])))
+        return _sensor(read_arrays(path, only=["sensor"]))
     except (LidarSynthError, KeyError):
         return None  # reading the scan will raise the error
 

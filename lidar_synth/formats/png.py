@@ -23,7 +23,7 @@ from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import SKIP_HINT, list_files, write_file
 from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.description import Description, check_provenance
+from lidar_synth.formats.description import check_provenance
 from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -58,7 +58,7 @@ class RangePNG(ScanFiles):
         root = Path(root)
         paths = [root] if root.is_file() else list_files(root / "range", ".png")
         base = root.absolute().parents[1] if root.is_file() else root
-        stored = _description(paths[0]) if paths else None
+        stored = _stored_sensor(paths[0]) if paths else None
         super().__init__(base, [path.stem for path in paths], None, on_bad, stored=stored)
         self._given = None if sensor is None else load_sensor(sensor)
 
@@ -99,11 +99,11 @@ class RangePNG(ScanFiles):
             raise DataError(f"{path}: {error}", "a range image written by this package") from error
 
 
-def _description(path: Path) -> Description | None:
+def _stored_sensor(path: Path) -> Sensor | None:
     """The sensor that a file names; None if it cannot be read, so that reading the scan raises the error."""
     try:
         facts = parse_json(read_png(path)[1].get(TEXT, ""), str(path))
-        return Description(Sensor.from_dict(facts["sensor"]))
+        return Sensor.from_dict(facts["sensor"])
     except (FileError, ValueError, KeyError, TypeError):
         return None
 

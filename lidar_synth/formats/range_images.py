@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.description import Description
 from lidar_synth.formats.folder import scan_paths
 from lidar_synth.formats.npz import (
     check_numbers,
     decode_range_image,
     range_image,
-    read_npz_description,
+    stored_sensor,
     write_range_image,
 )
 from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
@@ -94,8 +93,8 @@ class RangeImages(ScanFiles):
         self._base, paths = scan_paths(root, SUFFIXES)
         ids = [path.relative_to(self._base).with_suffix("").as_posix() for path in paths]
         given = None if sensor is None else load_sensor(sensor)
-        grid = Description(given or load_sensor(self._convention.sensor))
-        super().__init__(root, ids, None, on_bad, stored=read_npz_description(paths[0]) or grid)
+        grid = stored_sensor(paths[0]) or given or load_sensor(self._convention.sensor)
+        super().__init__(root, ids, None, on_bad, stored=grid)
         self._suffix, self._given = paths[0].suffix, given
 
     def image(self, index: int) -> RangeImage:

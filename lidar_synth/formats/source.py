@@ -9,7 +9,7 @@ from typing import ClassVar, Literal, TypeVar, get_args
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.description import FORMAT, NAME, Description, read_description, same_grid
+from lidar_synth.formats.description import FORMAT, NAME, read_description, same_grid
 from lidar_synth.formats.points import bad_points_kept, without_bad_points
 from lidar_synth.geometry.agreement import MOST_OUTSIDE, agreement
 from lidar_synth.geometry.scan import Scan
@@ -40,14 +40,14 @@ class ScanFiles(ABC):
             scan (after the last, the first one), iteration skips bad scans, and ``skipped`` lists them. With
             ``"drop-points"``, points that are NaN or infinite are dropped with their labels, and ``dropped`` counts
             them; any other fault raises.
-        stored: what the files themselves say; by default what stands beside them (``description.py``).
+        stored: the sensor that the files themselves name; None to read what stands beside them (``description.py``).
 
     If the user names another sensor than the files, the user's is taken, with a warning. If the files name none, the
     first scan that is read is compared with the sensor (``check_sensor``).
 
     Attributes:
         default_sensor: of the layout.
-        description: what the files say about their scans; None if they say nothing.
+        description: what stands beside the files about all of their scans; None if there is nothing.
         skipped: {id: reason} of the scans that this process could not read.
         dropped: {id: number of points} that this process has dropped.
 
@@ -65,7 +65,7 @@ class ScanFiles(ABC):
         sensor: str | Path | Sensor | None = None,
         on_bad: OnBad = "error",
         *,
-        stored: Description | None = None,
+        stored: Sensor | None = None,
     ) -> None:
         if on_bad not in get_args(OnBad):
             raise ConfigError(f"on_bad={on_bad!r}", f"one of {get_args(OnBad)}")
@@ -73,8 +73,8 @@ class ScanFiles(ABC):
             raise DataError(f"{root} holds no scan", (self.__doc__ or "").splitlines()[0].rstrip("."))
         self.root = root
         self.ids = tuple(ids)
-        self.description = stored or read_description(root)
-        named = None if self.description is None else self.description.sensor
+        self.description = read_description(root) if stored is None else None
+        named = stored if self.description is None else self.description.sensor
         self._given = None if sensor is None else load_sensor(sensor)
         self.sensor = self._given or named or load_sensor(self.default_sensor)
         if named is not None and not same_grid(self.sensor, named):

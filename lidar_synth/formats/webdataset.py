@@ -32,7 +32,6 @@ from lidar_synth.errors import ConfigError, DataError, shorten
 from lidar_synth.files.disk import SKIP_HINT, list_files, unreadable, write_file
 from lidar_synth.files.parsing import parse_json, parse_npy
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.description import Description
 from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -65,7 +64,7 @@ class WebDataset(ScanFiles):
         self._places = [(path, *place) for path in paths for place in _scans(path)]
         stored = None
         with suppress(DataError):  # reading the scan will raise it
-            stored = Description(_decode(*self._places[0], None).sensor) if self._places else None
+            stored = _decode(*self._places[0], None).sensor if self._places else None
         super().__init__(root, [unquote(key) for _, key, _ in self._places], sensor, on_bad, stored=stored)
 
     def read(self, index: int) -> Scan:
