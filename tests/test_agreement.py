@@ -109,6 +109,11 @@ def test_points_of_another_sensor(name: str) -> None:
     assert found and re.search(message, found), found
 
 
+def test_a_tilt_puts_no_point_outside_of_the_field_of_view() -> None:
+    """A beam of a scan that leans forward looks up behind the sensor, as all beams of real scans do a little."""
+    assert agreement(street(HDL64, tilt=0.9), HDL64).outside == 0 < agreement(street(HDL64, tilt=2.5), HDL64).outside
+
+
 def test_shares_do_not_depend_on_the_order_of_points() -> None:
     points = street(OS1)
     other = agreement(points[np.random.default_rng(0).permutation(len(points))], HDL64)
