@@ -99,16 +99,16 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
         >>> agreement(points, load_sensor("hdl64e_kitti")).above > 0.2
         True
     """
-    points = points[:: max(1, len(points) // (2 * _COMPARED))].astype(np.float64)
-    points = points[np.isfinite(points).all(axis=1)]
-    distance = np.sqrt(np.einsum("ij,ij->i", points, points))
-    points, distance = points[distance > 0.05], distance[distance > 0.05]
-    if len(points) < _FEWEST:
+    some = points[:: max(1, len(points) // (2 * _COMPARED))].astype(np.float64)
+    some = some[np.isfinite(some).all(axis=1)]
+    distance = np.sqrt(np.einsum("ij,ij->i", some, some))
+    some, distance = some[distance > 0.05], distance[distance > 0.05]
+    if len(some) < _FEWEST:
         return Agreement()
     near = float((distance < sensor.range_min - 0.5).mean())
     far = float((distance > 1.02 * sensor.range_max + 0.5).mean())
-    points = points[distance > NEAR]
-    if len(points) < _FEWEST:
+    some = some[distance > NEAR]
+    if len(some) < _FEWEST:
         return Agreement(near=near, far=far)
     # Points may lie on the sensor's lasers, or on the rows of its grid if they come from a range image.
     rows = np.degrees(sensor.row_elevations().astype(np.float64))
@@ -117,7 +117,7 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
         lasers = np.degrees(sensor.laser_elevations.astype(np.float64))
         tables.append((lasers, np.asarray(sensor.heights or np.zeros(len(rows)))))
     exact = sensor.beams is not None or sensor.elevations is not None
-    shares = [_compare(points, table[::-1], heights[::-1], exact) for table, heights in tables]
+    shares = [_compare(some, table[::-1], heights[::-1], exact) for table, heights in tables]
     above, below, gaps, unused, between = np.min(shares, axis=0).tolist()
     return Agreement(above, below, near, far, gaps, unused, between)
 
