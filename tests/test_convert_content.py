@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.formats.convert import Report, convert
-from lidar_synth.formats.domain import mark_synthetic
+from lidar_synth.formats.description import MARK
 from lidar_synth.geometry.projection import project, unfold, unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import load_sensor
@@ -41,6 +41,9 @@ def test_conversion_unfolds_scans(tmp_path: Path) -> None:
     for scan, expected in zip(read, scans, strict=True):
         assert np.allclose(project(scan).range, unfold(expected).range, rtol=3e-7)
         assert np.array_equal(project(scan).sensor.row_elevations(), expected.sensor.laser_elevations)
+    for report in (Report(written=3), Report(kept=3)):  # points on the beams, described beside them
+        again = convert(open_scans(tmp_path / "in"), WRITERS["kitti"](tmp_path / "b"), unfold=True, progress=False)
+        assert again == report and open_scans(tmp_path / "b").sensor == scans[0].sensor.by_beams()
     write_all("kitti", tmp_path / "shuffled", [scans[0][np.random.default_rng(0).permutation(len(scans[0]))]])
     with pytest.raises(DataError, match="ring by ring"):
         convert(open_scans(tmp_path / "shuffled"), WRITERS["npz"](tmp_path / "no"), unfold=True, progress=False)
@@ -145,8 +148,7 @@ def test_real_scans_stay_real(tmp_path: Path) -> None:
     MAKERS["kitti360"](tmp_path / "in")
     convert(open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
     assert {scan.domain for scan in open_scans(tmp_path / "out")} == {REAL}
-    assert not list((tmp_path / "out").glob("synthetic*"))
-    mark_synthetic(tmp_path)  # above a dataset, not beside it
+    (tmp_path / MARK).write_text("{}")  # above a dataset, not beside it
     assert open_scans(tmp_path / "out")[0].domain == REAL
 
 

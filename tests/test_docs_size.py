@@ -33,6 +33,7 @@ LIMITS = {
     "docs/reference/command-line.md": 60,
     "docs/reference/recipes.md": 200,
     "docs/bank-format.md": 500,
+    "docs/reference/descriptions.md": 360,
     "docs/reliability.md": 300,
     "docs/explanation/method.md": 450,
     "docs/explanation/determinism.md": 250,

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,17 @@ import yaml
 from banks import some_image, write_bank
 from click.testing import Result
 from conftest import random_scan
+from layouts import some_scan, write_all
 from typer.testing import CliRunner
 
 from lidar_synth.cli import app
 from lidar_synth.datasets.recordings import NOTE, frames_of
 from lidar_synth.errors import ConfigError
 from lidar_synth.evaluate import PROTOCOLS
-from lidar_synth.evaluate.leakage import seen_by
-from lidar_synth.formats import WRITERS
+from lidar_synth.evaluate.leakage import recordings_of, seen_by, town
+from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.town.export import SETTINGS
 
@@ -245,3 +248,10 @@ def test_a_run_records_the_frames_that_it_saw(kitti360: Path, fake: Path, tmp_pa
     writer.finish()
     (fake / NOTE).write_text((scans / NOTE).read_text())
     assert refused(judge(later, fake, "--split", "lidm/val")) is None
+
+
+def test_a_town_is_recognised_in_every_format(tmp_path: Path) -> None:
+    made = {"made_by": "town", "seed": 9, "interval": 0.4}
+    for to in ("kitti", "npz", "range"):
+        write_all(to, tmp_path / to, [replace(some_scan(), domain=SYNTHETIC, provenance=made)])
+        assert recordings_of(open_scans(tmp_path / to), "folder", tmp_path / to) == town(9)

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.generator import load_generator
+from lidar_synth.geometry.scan import SYNTHETIC
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +34,11 @@ def test_sample_writes_every_format_and_resumes(form: str, path: Path, tmp_path:
 
     assert "2 scans written, 0 were there already" in sample("--count", "2", "--seed", "4")
     assert "1 scans written, 2 were there already" in sample("--count", "3", "--seed", "4")
+    written, generator = open_scans(tmp_path / "out"), load_generator(path)
+    made = {"made_by": "model", "model": "small", "checkpoint": generator.hash, "seed": 4}
+    assert written.sensor == SENSOR and written[2].provenance == made and written[2].domain == SYNTHETIC
     if form in ("npz", "semantic_kitti", "kitti", "webdataset"):
-        written = open_scans(tmp_path / "out", sensor=SENSOR)
-        expected = load_generator(path).scans(4, range(3))
+        expected = generator.scans(4, range(3))
         assert len(written) == 3
         for a, b in zip(written, expected, strict=True):
             assert np.allclose(a.points, b.points, atol=1e-4)

@@ -13,7 +13,7 @@ from lidar_synth.bank.shard import ShardReader
 from lidar_synth.bank.storage import RemoteFile, is_url, open_storage
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, made_by_model
 from lidar_synth.geometry.sensor import Sensor
 
 _OPEN = 64  # shards kept open at a time
@@ -96,7 +96,8 @@ class Bank:
             raise IndexError(f"scan {number} of {len(self)}")
         shard, position = _place(self.index, number % len(self))
         image = self.facts.encoding.decode(self.shard(shard).read(position))
-        return replace(unproject(image), id=_name(self.index, shard, position), domain=SYNTHETIC)
+        name, made = _name(self.index, shard, position), _provenance(self.index, shard)
+        return replace(unproject(image), id=name, domain=SYNTHETIC, provenance=made)
 
     def image(self, number: int) -> RangeImage:
         """The range image of a scan, 0 <= number < len; raises as ``__getitem__``."""
@@ -182,6 +183,13 @@ def _name(index: Index, shard: int, position: int) -> str:
     """A scan's name."""
     entry = index.shards[shard]
     return f"{index.sources[entry.source].model}/{entry.seed}/{entry.first + position}"
+
+
+def _provenance(index: Index, shard: int) -> dict[str, Any]:
+    """What made the scans of a shard, as ``Scan.provenance``."""
+    entry = index.shards[shard]
+    facts = index.sources[entry.source]
+    return made_by_model(facts.model, facts.checkpoint, entry.seed)
 
 
 def _read_index(root: str | Path) -> bytes:

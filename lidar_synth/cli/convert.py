@@ -16,7 +16,9 @@ def convert(
             help="format: kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | png | webdataset"
         ),
     ],
-    sensor: Annotated[str | None, typer.Option(help="sensor of the input: a preset or a YAML file")] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="sensor of the input: a preset or a YAML file [named by the files]")
+    ] = None,
     layout: Annotated[str | None, typer.Option(help="layout of the input [detected]")] = None,
     split: Annotated[str | None, typer.Option(help="split of the input, for instance r2flow/train")] = None,
     as_sensor: Annotated[str | None, typer.Option(help="re-project to this sensor: a preset or a YAML file")] = None,

@@ -51,7 +51,6 @@ def sample(
     from lidar_synth.bake.conditions import conditions, conditions_for
     from lidar_synth.evaluate.leakage import seen_by
     from lidar_synth.formats import WRITERS
-    from lidar_synth.formats.domain import mark_synthetic
     from lidar_synth.formats.source import choose
     from lidar_synth.formats.writer import claim
     from lidar_synth.generate.generator import load_generator
@@ -68,7 +67,6 @@ def sample(
     provenance = generator.header.provenance
     trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}
     claim(writer.root / NOTE, settings | trained)
-    mark_synthetic(out)
     missing = [i for i in range(count) if not writer.complete(i)]
     with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
         for first in range(0, len(missing), generator.batch):

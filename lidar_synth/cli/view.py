@@ -16,7 +16,7 @@ def view(
     index: Annotated[int, typer.Option(help="number of the first scan, from 0; -1 is the last one")] = 0,
     count: Annotated[int, typer.Option(min=1, max=256, help="number of scans")] = 1,
     out: Annotated[Path | None, typer.Option(help="file to write: .png (sheet) or .html (interactive page)")] = None,
-    sensor: Annotated[str | None, typer.Option(help="sensor: a preset or a YAML file")] = None,
+    sensor: Annotated[str | None, typer.Option(help="sensor: a preset or a YAML file [named by the files]")] = None,
 ) -> None:
     """Shows scans as range image, bird's-eye view and 3-D points.
 

@@ -84,6 +84,9 @@ def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recording
     settings = Path(os.path.expandvars(path)) / SETTINGS
     if settings.is_file():  # a town has the layout and the names of a dataset
         return town(json.loads(read_text(settings)).get("seed", 0))
+    made = next(iter(source)).provenance  # of all scans, or of the first one
+    if made.get("made_by") == "town":  # converted to another format
+        return town(made.get("seed", 0))
     if isinstance(source, BankScans):  # includes the training data of its model
         return whole(FILES, [str(path)]) | _of_bank(source.bank)
     return frames_of(layout, source.ids) if layout in PLACES else whole(FILES, [str(path)])

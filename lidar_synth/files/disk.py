@@ -111,6 +111,19 @@ def read_file(path: Path, expected: str = "a file of the dataset", at_most: int 
     return content
 
 
+def read_start(path: Path, size: int) -> str:
+    """The first ``size`` bytes of a file, as Latin-1 text.
+
+    Raises:
+        FileError: if it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(size).decode("latin-1")
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
     """Write an ``.npz`` file that is the same with every version of numpy; nothing is pickled.
 

@@ -18,11 +18,11 @@ from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import OnBad, ScanFiles, Writer
-from lidar_synth.formats.domain import mark_synthetic
+from lidar_synth.formats.description import NAME, Origin, add_origin
 from lidar_synth.formats.writer import claim
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.projection import unfold as unfold_rings
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, Source
+from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 
 CHUNK = 8
@@ -59,13 +59,13 @@ class Outcome(NamedTuple):
         number: its index in the source.
         skipped: the reason why it was not written; "" if it was.
         dropped: number of points that were dropped.
-        domain: domain of the scan; None if it was not read.
+        origin: where the scan comes from; None if it was not written.
     """
 
     number: int
     skipped: str = ""
     dropped: int = 0
-    domain: int | None = None
+    origin: Origin | None = None
 
 
 def convert(
@@ -96,27 +96,28 @@ def convert(
         Number of scans written and kept, skipped scans with reasons, and what was left out.
 
     Raises:
-        ConfigError: on fewer than one job, or an output folder with the scans of another conversion.
+        ConfigError: on fewer than one job, an output folder with the scans of another conversion or sensor, or a source
+            whose points are not those of its sensor.
         FileError: if the output cannot be written, for any ``on_bad``.
         DataError: on a bad scan, unless ``on_bad="skip"``.
     """
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
+    if isinstance(source, ScanFiles):
+        source.check_sensor()  # both first, so that a wrong sensor leaves no settings behind
+        target = as_sensor or source.sensor
+        writer.require_grid(target.by_beams() if unfold else target)
     claim(writer.root / SETTINGS, _settings(source, writer, as_sensor, unfold))
     missing, report = _compare(source, writer, on_bad)
     if isinstance(source, ScanFiles):
         report.left_out = writer.carry(source)
     grid = partial(reproject, sensor=as_sensor, unfold=unfold) if unfold or as_sensor is not None else None
     work = partial(convert_one, source, writer, grid, on_bad)
-    domains: set[int | None] = set()
-    try:
-        with in_processes(work, missing, jobs, CHUNK) as results:
-            for done in tqdm(results, total=len(missing), unit="scan", disable=not (progress and missing)):
-                _count(report, done, name_of(source, done.number) or str(done.number))
-                domains.add(done.domain)
-    finally:
-        if SYNTHETIC in domains and REAL not in domains:
-            mark_synthetic(writer.root)
+    with in_processes(work, missing, jobs, CHUNK) as results:
+        for done in tqdm(results, total=len(missing), unit="scan", disable=not (progress and missing)):
+            _count(report, done, name_of(source, done.number) or str(done.number))
+            if done.origin is not None and jobs > 1 and (writer.root / NAME).is_file():
+                add_origin(writer.root, done.origin)  # again: two workers may have added theirs at the same moment
     writer.finish()
     return report
 
@@ -185,7 +186,7 @@ def convert_one(
         if on_bad != "skip":
             raise
         return Outcome(index, str(error))
-    return Outcome(index, "", dropped, scan.domain)
+    return Outcome(index, "", dropped, Origin.of(scan))
 
 
 def reproject(scan: Scan, sensor: Sensor | None = None, unfold: bool = False) -> Scan:
@@ -202,7 +203,7 @@ def reproject(scan: Scan, sensor: Sensor | None = None, unfold: bool = False) ->
         DataError: on a scan that cannot be unfolded.
     """
     seen = unproject((unfold_rings if unfold else project)(scan, sensor))
-    for name in ("boxes", "pose", "image_path", "id", "domain"):
+    for name in ("boxes", "pose", "image_path", "id", "domain", "provenance"):
         setattr(seen, name, getattr(scan, name))
     return seen
 

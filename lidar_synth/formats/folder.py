@@ -19,15 +19,16 @@ from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.description import Description
 from lidar_synth.formats.npz import check_numbers, decode_scan, stored_sensor, write_scan
-from lidar_synth.formats.pcd import read_pcd, write_pcd
-from lidar_synth.formats.ply import read_ply, write_ply
+from lidar_synth.formats.pcd import read_pcd, read_pcd_description, write_pcd
+from lidar_synth.formats.ply import read_ply, read_ply_description, write_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
-from lidar_synth.formats.points import check_scan, read_points, write_points
+from lidar_synth.formats.points import check_scan, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import FileWriter, Picture
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry.sensor import Sensor
 
 SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 
@@ -37,7 +38,8 @@ class Folder(ScanFiles):
 
     Args:
         root: the folder or the file.
-        sensor: the sensor that recorded the scans; an ``.npz`` file names its own.
+        sensor: the sensor that recorded the scans; by default the one that the files name (``.npz``, ``.pcd`` and
+            ``.ply`` files of this package), or ``scans.json`` beside them, or else ``hdl64e_kitti``.
         fields: floats per point of ``.bin`` files.
         reflectance_max: maximum of the reflectance in the files; values are divided by it.
         on_bad: see ``ScanFiles``.
@@ -62,10 +64,7 @@ class Folder(ScanFiles):
         root = Path(root)
         base, self._paths = scan_paths(root, SUFFIXES)
         ids = [path.relative_to(base).with_suffix("").as_posix() for path in self._paths]
-        first = self._paths[0]
-        own = stored_sensor(first) if sensor is None and first.suffix.lower() == ".npz" else None
-        super().__init__(root, ids, sensor or own or "hdl64e_kitti", on_bad)
-        self._given = None if sensor is None else load_sensor(sensor)
+        super().__init__(root, ids, sensor, on_bad, stored=_named_sensor(self._paths[0]))
         self._fields, self._reflectance_max = fields, reflectance_max
 
     def read(self, index: int) -> Scan:
@@ -86,7 +85,9 @@ class Folder(ScanFiles):
             return scan
         else:
             arrays: dict[str, Any] = ARRAYS[suffix](path)
-            scan = Scan(sensor=self.sensor, **arrays)
+            said = _description(path)
+            scan = Scan(sensor=self._given or (said.sensor if said else None) or self.sensor, **arrays)
+            scan = said.origin.apply(scan) if said else scan
             check_scan(scan, str(path), self._reflectance_max)
         if self._reflectance_max != 1:
             scan.reflectance = scan.reflectance / np.float32(self._reflectance_max)
@@ -105,6 +106,29 @@ def _columns(path: Path) -> dict[str, NDArray[Any]]:
 
 ARRAYS: dict[str, Callable[[Path], dict[str, NDArray[Any]]]] = {".npy": _columns, ".pcd": read_pcd, ".ply": read_ply}
 """{suffix: reader of a scan's arrays}."""
+
+HEADERS: dict[str, Callable[[Path], Description | None]] = {
+    ".pcd": read_pcd_description,
+    ".ply": read_ply_description,
+}
+"""{suffix: reader of what the header of a file says about its scan}."""
+
+
+def _description(path: Path) -> Description | None:
+    """What the header of a file says about its scan; None if it says nothing."""
+    read = HEADERS.get(path.suffix.lower())
+    return None if read is None else read(path)
+
+
+def _named_sensor(path: Path) -> Sensor | None:
+    """The sensor that a file names; None if it names none, or if reading the scan will raise an error."""
+    if path.suffix.lower() == ".npz":
+        return stored_sensor(path)
+    try:
+        said = _description(path)
+    except (DataError, FileError):
+        return None
+    return None if said is None else said.sensor
 
 
 def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]:
@@ -138,7 +162,7 @@ class KITTIWriter(FileWriter):
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         write_labels(path.with_suffix(".label"), encode_labels(scan, SEMANTIC_KITTI))
-        write_points(path, scan)
+        self._write_points(path, scan)
 
 
 class NPZWriter(FileWriter):

@@ -38,7 +38,7 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES, WorldBoxes, read_boxes, write_boxes
 from lidar_synth.formats.kitti360_poses import CAMERA, read_calibration, read_poses, write_calibration, write_poses
 from lidar_synth.formats.point_labels import decode_labels, encode_labels, mismatch, write_labels
-from lidar_synth.formats.points import read_points, write_points
+from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
 from lidar_synth.geometry.scan import Boxes, Scan
@@ -57,7 +57,8 @@ class KITTI360(ScanFiles):
     Args:
         root: the folder that holds ``data_3d_raw``.
         split: the full name of a split, such as ``r2flow/train``, or ``all``.
-        sensor: a preset's name, a YAML file or a ``Sensor``.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
+            else ``hdl64e_kitti360``.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -75,12 +76,14 @@ class KITTI360(ScanFiles):
         (True, (4, 4))
     """
 
+    default_sensor = "hdl64e_kitti360"
+
     def __init__(
         self,
         root: str | Path,
         split: str = "all",
         *,
-        sensor: str | Path | Sensor = "hdl64e_kitti360",
+        sensor: str | Path | Sensor | None = None,
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
@@ -172,7 +175,7 @@ class KITTI360Writer(Writer):
         if scan.label is not None:
             labels = self.root / "data_3d_semantics_scan" / drive / "labels" / f"{frame}.label"
             write_labels(labels, _with_global_instances(encode_labels(scan, CLASSES), scan))
-        write_points(path, scan)
+        self._write_points(path, scan)
 
     def finish(self) -> None:
         for folder in sorted((self.root / "data_poses").glob("*")):

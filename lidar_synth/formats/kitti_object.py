@@ -29,7 +29,7 @@ from lidar_synth.files.disk import (
 )
 from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
 from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
-from lidar_synth.formats.points import read_points, write_points
+from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import Picture, Writer, write_image
 from lidar_synth.geometry.scan import Scan
@@ -58,7 +58,8 @@ class KITTIObject(ScanFiles):
         split: ``train``, ``val``, ``trainval``, ``test`` (as listed in ``ImageSets/<split>.txt``) or ``all``. Without
             ``ImageSets``, ``trainval`` is all of ``training`` and ``test`` all of ``testing``.
         reduced: read ``velodyne_reduced``, the points in the view of camera 2.
-        sensor: a preset's name, a YAML file or a ``Sensor``.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
+            else ``hdl64e_kitti``.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -75,13 +76,15 @@ class KITTIObject(ScanFiles):
         ('Car', 7, 4)
     """
 
+    default_sensor = "hdl64e_kitti"
+
     def __init__(
         self,
         root: str | Path,
         split: str = "all",
         *,
         reduced: bool = False,
-        sensor: str | Path | Sensor = "hdl64e_kitti",
+        sensor: str | Path | Sensor | None = None,
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
@@ -170,7 +173,7 @@ class KITTIObjectWriter(Writer):
         write_calibration(folder / "calib" / f"{frame}.txt", camera)
         if folder.name == "training" and scan.boxes is not None:
             write_label_2(folder / "label_2" / f"{frame}.txt", scan.boxes, camera)
-        write_points(path, scan)
+        self._write_points(path, scan)
 
     def finish(self) -> None:
         for split, (part, *_) in SPLITS.items():

@@ -36,7 +36,8 @@ class KITTIRaw(ScanFiles):
 
     Args:
         root: the folder that holds the dates, the folder of one date, or the folder of one drive.
-        sensor: a preset's name, a YAML file or a ``Sensor``.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
+            else ``hdl64e_kitti``.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -51,9 +52,9 @@ class KITTIRaw(ScanFiles):
         ('Person_sitting',)
     """
 
-    def __init__(
-        self, root: str | Path, *, sensor: str | Path | Sensor = "hdl64e_kitti", on_bad: OnBad = "error"
-    ) -> None:
+    default_sensor = "hdl64e_kitti"
+
+    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
         root = Path(root)
         own = [root] if (root / "velodyne_points" / "data").is_dir() else []
         found = own or [p.parent.parent for pattern in (DRIVES, f"*/{DRIVES}") for p in sorted(root.glob(pattern))]

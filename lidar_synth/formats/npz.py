@@ -4,6 +4,7 @@ Arrays of both (numpy's format, never pickled)::
 
     sensor                       JSON, the keys of sensors.yaml
     id, domain                   text; 0 real, 1 synthetic
+    provenance                   JSON, what made the scan (``Scan.provenance``), if known
     pose                         (4, 4) float64, if known
     box_values, box_names ...    the fields of ``Boxes``, if there are any
 
@@ -24,10 +25,11 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError, LidarSynthError
 from lidar_synth.files.disk import SKIP_HINT, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
+from lidar_synth.formats.description import check_provenance
 from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
-FACTS = ("sensor", "id", "domain", "pose")
+FACTS = ("sensor", "id", "domain", "provenance", "pose")
 """Names in a file that are not channels of a range image, like those that begin with ``BOX``."""
 
 BOX = "box_"
@@ -63,13 +65,13 @@ def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | No
     Args:
         arrays: the result of ``read_arrays``.
         where: name of the file in the error.
-        sensor: used if the file has no sensor.
+        sensor: takes precedence over the file's own sensor.
 
     Raises:
         DataError: if points, reflectance or the sensor is missing, or has a wrong shape or type.
     """
     try:
-        facts = _known(arrays, sensor)
+        facts = _known(arrays, sensor) | ({} if sensor is None else {"sensor": sensor})
         known: dict[str, Any] = {name: arrays[name] for name in POINT_FIELDS if name in arrays}
         _check_types({"points": arrays["points"], **known})
         return Scan(arrays["points"], **known, **facts)
@@ -98,6 +100,8 @@ def decode_range_image(
     """
     try:
         facts = _known(arrays, sensor)
+        if sensor is not None and sensor.shape != facts["sensor"].shape:
+            raise ValueError(f"it was made for sensor {facts['sensor'].name!r}, not for {sensor.name!r}")
         channels = {n: a for n, a in arrays.items() if n not in ("range", *FACTS) and not n.startswith(BOX)}
         _check_types(channels)
         return range_image(arrays["range"], facts["sensor"], channels, where), facts
@@ -157,6 +161,8 @@ def _facts(scan: Scan, sensor: Sensor | None = None) -> dict[str, Any]:
         "id": np.array(scan.id),
         "domain": np.array(scan.domain),
     }
+    if scan.provenance:
+        facts["provenance"] = np.array(json.dumps(dict(scan.provenance)))
     if scan.pose is not None:
         facts["pose"] = scan.pose
     if scan.boxes is not None:
@@ -166,12 +172,8 @@ def _facts(scan: Scan, sensor: Sensor | None = None) -> dict[str, Any]:
 
 
 def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, Any]:
-    """The inverse of ``_facts``; a file's own sensor takes precedence, and its shape must match the given one."""
-    known: dict[str, Any] = {"sensor": sensor}
-    if "sensor" in arrays:
-        known["sensor"] = _sensor(arrays)
-        if sensor is not None and sensor.shape != known["sensor"].shape:
-            raise ValueError(f"it was made for sensor {known['sensor'].name!r}, not for {sensor.name!r}")
+    """The inverse of ``_facts``, with the given sensor if the file has none."""
+    known: dict[str, Any] = {"sensor": _sensor(arrays) if "sensor" in arrays else sensor}
     if known["sensor"] is None:
         raise KeyError("it has no sensor: pass one")
     for name, kinds in (("id", "U"), ("domain", "iu")):
@@ -181,6 +183,8 @@ def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, 
             known[name] = arrays[name].item()
     if known.get("domain", REAL) not in (REAL, SYNTHETIC):
         raise ValueError(f"domain is {known['domain']}, not {REAL} (real) or {SYNTHETIC} (synthetic)")
+    if "provenance" in arrays:
+        known["provenance"] = check_provenance(parse_json(str(arrays["provenance"]), "its provenance"))
     if "pose" in arrays:
         known["pose"] = check_pose(arrays["pose"])
     if BOX + "values" in arrays:

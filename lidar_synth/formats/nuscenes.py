@@ -41,7 +41,8 @@ class NuScenes(ScanFiles):
 
     Args:
         root: the dataset's folder, a folder of ``.pcd.bin`` files, or one file.
-        sensor: a preset's name, a YAML file or a ``Sensor``.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
+            else ``hdl32e_nuscenes``.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -56,9 +57,9 @@ class NuScenes(ScanFiles):
         ['reflectance', 'label', 'raw_label', 'ring']
     """
 
-    def __init__(
-        self, root: str | Path, *, sensor: str | Path | Sensor = "hdl32e_nuscenes", on_bad: OnBad = "error"
-    ) -> None:
+    default_sensor = "hdl32e_nuscenes"
+
+    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
         root = Path(root)
         folder = root / "samples" / "LIDAR_TOP"
         paths = [root] if root.is_file() else list_files(folder if folder.is_dir() else root, SUFFIX)

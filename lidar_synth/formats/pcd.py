@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import SKIP_HINT, read_file, write_file
+from lidar_synth.files.disk import SKIP_HINT, read_file, read_start, write_file
 from lidar_synth.formats.cloud import Field, check_fields, check_size, from_records, from_text, to_arrays, to_records
+from lidar_synth.formats.description import Description, from_comments, to_comments
 from lidar_synth.geometry.scan import Scan
 
 LONGEST_HEADER = 1 << 16
@@ -39,6 +40,7 @@ def write_pcd(path: Path, scan: Scan) -> None:
     types = [records.dtype[name] for name in records.dtype.names or ()]
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
+        *(f"# {line}" for line in to_comments(scan)),
         "VERSION 0.7",
         f"FIELDS {' '.join(records.dtype.names or ())}",
         f"SIZE {' '.join(str(t.itemsize) for t in types)}",
@@ -75,6 +77,17 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
         raise DataError(f"{where} holds {end[1].decode('latin-1')!r} data", "ascii, binary or binary_compressed")
     check_size(body, size, where)
     return to_arrays(from_records(body, fields, count))
+
+
+def read_pcd_description(path: Path) -> Description | None:
+    """What the comments of a ``.pcd`` file say about its scan; None if they say nothing.
+
+    Raises:
+        FileError: if it cannot be read.
+        DataError: on a damaged description.
+    """
+    lines = read_start(path, LONGEST_HEADER).split("\nDATA", 1)[0].splitlines()
+    return from_comments((line[1:] for line in lines if line.startswith("#")), str(path))
 
 
 def _header(text: str, where: str) -> tuple[list[Field], int]:

@@ -12,7 +12,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import SKIP_HINT, read_file, write_file
+from lidar_synth.files.disk import SKIP_HINT, read_file, read_start, write_file
 from lidar_synth.formats.cloud import (
     Field,
     check_fields,
@@ -23,6 +23,7 @@ from lidar_synth.formats.cloud import (
     to_arrays,
     to_records,
 )
+from lidar_synth.formats.description import Description, from_comments, to_comments
 from lidar_synth.geometry.scan import Scan
 
 LONGEST_HEADER = 1 << 16
@@ -60,7 +61,8 @@ def write_ply(path: Path, scan: Scan) -> None:
     """
     records = to_records(scan)
     names = {kind: name for name, kind in reversed(TYPES.items())}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(records)}"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in to_comments(scan))]
+    lines += [f"element vertex {len(records)}"]
     lines += [f"property {names[records.dtype[n].str[1:]]} {n}" for n in records.dtype.names or ()]
     write_file(path, "\n".join([*lines, "end_header\n"]).encode() + records.tobytes())
 
@@ -92,6 +94,17 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
     check_size(body, size, where, more=any(e.lists for e in elements))
     start = sum(e.size for e in elements[:position])
     return to_arrays(from_records(body[start : start + vertex.size], vertex.fields, vertex.count))
+
+
+def read_ply_description(path: Path) -> Description | None:
+    """What the comments of a ``.ply`` file say about its scan; None if they say nothing.
+
+    Raises:
+        FileError: if it cannot be read.
+        DataError: on a damaged description.
+    """
+    lines = read_start(path, LONGEST_HEADER).split("\nend_header", 1)[0].splitlines()
+    return from_comments((line.removeprefix("comment") for line in lines if line.startswith("comment")), str(path))
 
 
 def _header(text: str, where: str) -> tuple[str, list[Element]]:

@@ -19,17 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import COLOURS, IGNORE
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import SKIP_HINT, list_files, write_file
 from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.description import check_provenance
 from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import Picture, Writer
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 STEPS = 65535
 """The largest 16-bit value: ``range_max`` in range, 1 in reflectance."""
@@ -57,8 +58,9 @@ class RangePNG(ScanFiles):
         root = Path(root)
         paths = [root] if root.is_file() else list_files(root / "range", ".png")
         base = root.absolute().parents[1] if root.is_file() else root
-        super().__init__(base, [path.stem for path in paths], sensor or "hdl64e_kitti360", on_bad)
-        self._given = None if sensor is None else self.sensor
+        stored = _stored_sensor(paths[0]) if paths else None
+        super().__init__(base, [path.stem for path in paths], None, on_bad, stored=stored)
+        self._given = None if sensor is None else load_sensor(sensor)
 
     def image(self, index: int) -> RangeImage:
         """The range image at ``index``.
@@ -72,6 +74,7 @@ class RangePNG(ScanFiles):
         image, facts = self._decode(index)
         scan = unproject(image)
         scan.id, scan.domain = self.ids[index], int(facts["domain"])
+        scan.provenance = facts.get("provenance", {})
         check_scan(scan, str(channel_path(self.root, "range", self.ids[index])))
         return scan
 
@@ -85,6 +88,7 @@ class RangePNG(ScanFiles):
                 raise ValueError(f"it was made for sensor {sensor.name!r}, not for {self._given.name!r}")
             if facts["domain"] not in (REAL, SYNTHETIC) or not 0 < scale < 1:
                 raise ValueError(f"domain {facts['domain']!r} and scale {scale}")
+            check_provenance(facts.get("provenance", {}))
             channels = {"reflectance": (_steps(reflectance) / np.float32(STEPS)).astype(np.float32)}
             if label.is_file():
                 channels["label"] = read_png(label)[0]
@@ -93,6 +97,15 @@ class RangePNG(ScanFiles):
             return range_image(_steps(path, steps) * np.float32(scale), sensor, channels, str(path)), facts
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise DataError(f"{path}: {error}", "a range image written by this package") from error
+
+
+def _stored_sensor(path: Path) -> Sensor | None:
+    """The sensor that a file names; None if it cannot be read, so that reading the scan raises the error."""
+    try:
+        facts = parse_json(read_png(path)[1].get(TEXT, ""), str(path))
+        return Sensor.from_dict(facts["sensor"])
+    except (FileError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _steps(path: Path, values: NDArray[Any] | None = None) -> NDArray[Any]:
@@ -114,6 +127,7 @@ class PNGWriter(Writer):
         image = project(scan)
         scale = image.sensor.range_max / STEPS
         facts = {"scale": scale, "sensor": image.sensor.to_dict(), "id": scan.id, "domain": scan.domain}
+        facts |= {"provenance": dict(scan.provenance)} if scan.provenance else {}
         if image.label is not None:
             write_png(channel_path(self.root, "label", path.stem), image.label, palette=True)
         reflectance = image.channels["reflectance"] * STEPS

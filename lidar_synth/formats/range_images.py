@@ -20,7 +20,13 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.folder import scan_paths
-from lidar_synth.formats.npz import check_numbers, decode_range_image, range_image, write_range_image
+from lidar_synth.formats.npz import (
+    check_numbers,
+    decode_range_image,
+    range_image,
+    stored_sensor,
+    write_range_image,
+)
 from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
@@ -86,9 +92,10 @@ class RangeImages(ScanFiles):
         self._convention = choose("convention", convention, CONVENTIONS)
         self._base, paths = scan_paths(root, SUFFIXES)
         ids = [path.relative_to(self._base).with_suffix("").as_posix() for path in paths]
-        super().__init__(root, ids, self._convention.sensor if sensor is None else sensor, on_bad)
-        self._suffix = paths[0].suffix
-        self._given = None if sensor is None else load_sensor(sensor)
+        given = None if sensor is None else load_sensor(sensor)
+        grid = stored_sensor(paths[0]) or given or load_sensor(self._convention.sensor)
+        super().__init__(root, ids, None, on_bad, stored=grid)
+        self._suffix, self._given = paths[0].suffix, given
 
     def image(self, index: int) -> RangeImage:
         """The range image at ``index``.

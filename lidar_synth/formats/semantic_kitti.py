@@ -33,7 +33,7 @@ from lidar_synth.files.disk import (
 )
 from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneous, ideal_camera
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
-from lidar_synth.formats.points import read_points, write_points
+from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
 from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
 from lidar_synth.geometry.scan import Scan
@@ -63,7 +63,8 @@ class SemanticKITTI(ScanFiles):
     Args:
         root: the folder that holds ``sequences``.
         split: ``train``, ``val``, ``test`` or ``all``.
-        sensor: a preset's name, a YAML file or a ``Sensor``.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
+            else ``hdl64e_semantic_kitti``.
         taxonomy: the class ids of the labels, for datasets in this layout with classes of their own.
         on_bad: see ``ScanFiles``.
 
@@ -80,12 +81,14 @@ class SemanticKITTI(ScanFiles):
         ['reflectance', 'label', 'raw_label', 'instance']
     """
 
+    default_sensor = "hdl64e_semantic_kitti"
+
     def __init__(
         self,
         root: str | Path,
         split: str = "all",
         *,
-        sensor: str | Path | Sensor = "hdl64e_semantic_kitti",
+        sensor: str | Path | Sensor | None = None,
         taxonomy: Taxonomy = SEMANTIC_KITTI,
         on_bad: OnBad = "error",
     ) -> None:
@@ -162,7 +165,7 @@ class SemanticKITTIWriter(Writer):
         if picture is not None:
             write_image(folder / "image_2" / f"{frame}.png", picture)
         write_labels(folder / "labels" / f"{frame}.label", encode_labels(scan, SEMANTIC_KITTI))
-        write_points(path, scan)
+        self._write_points(path, scan)
 
     def carry(self, source: ScanFiles) -> list[str]:
         if not isinstance(source, SemanticKITTI):

@@ -3,15 +3,16 @@
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from contextlib import suppress
 from pathlib import Path
-from typing import Literal, TypeVar, get_args
+from typing import ClassVar, Literal, TypeVar, get_args
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.domain import domain_of
+from lidar_synth.formats.description import FORMAT, NAME, read_description, same_grid
 from lidar_synth.formats.points import bad_points_kept, without_bad_points
-from lidar_synth.geometry.scan import SYNTHETIC, Scan
+from lidar_synth.geometry.agreement import MOST_OUTSIDE, agreement
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 OnBad = Literal["error", "skip", "drop-points"]
@@ -20,6 +21,12 @@ are NaN or infinite and count them."""
 
 Choice = TypeVar("Choice")
 
+_TRIED = 8  # scans of which the first readable one is compared with the sensor
+_NAME_IT = (
+    "Name the sensor that recorded the scans, even if it is this one: --sensor NAME|FILE.yaml (sensor=...), or "
+    f'{{"format": "{FORMAT}", "sensor": "NAME"}} in {NAME} in their folder. If no preset fits: lidar-synth sensor fit.'
+)
+
 
 class ScanFiles(ABC):
     """An indexable source of scans on disk; subclasses read one scan of their dataset.
@@ -27,34 +34,59 @@ class ScanFiles(ABC):
     Args:
         root: the folder of the files.
         ids: the scans' names, unique in the source, in order.
-        sensor: a preset's name, a YAML file or a ``Sensor``.
+        sensor: the sensor that the user names: a preset's name, a YAML file or a ``Sensor``; None to take the one that
+            the files name, or else ``default_sensor``.
         on_bad: ``"error"`` raises on a scan that cannot be read. With ``"skip"``, ``source[i]`` is the next readable
             scan (after the last, the first one), iteration skips bad scans, and ``skipped`` lists them. With
             ``"drop-points"``, points that are NaN or infinite are dropped with their labels, and ``dropped`` counts
             them; any other fault raises.
+        stored: the sensor that the files themselves name; None to read what stands beside them (``description.py``).
+
+    If the user names another sensor than the files, the user's is taken, with a warning. If the files name none, the
+    first scan that is read is compared with the sensor (``check_sensor``).
 
     Attributes:
+        default_sensor: of the layout.
+        description: what stands beside the files about all of their scans; None if there is nothing.
         skipped: {id: reason} of the scans that this process could not read.
         dropped: {id: number of points} that this process has dropped.
-        domain: ``SYNTHETIC`` if the folder is marked as synthetic; otherwise each scan has its own domain.
 
     Raises:
-        ConfigError: on an unknown ``on_bad``.
-        DataError: if there is no scan.
+        ConfigError: on an unknown ``on_bad`` or sensor.
+        DataError: if there is no scan, or what the files say is damaged.
     """
 
-    def __init__(self, root: Path, ids: Sequence[str], sensor: str | Path | Sensor, on_bad: OnBad = "error") -> None:
+    default_sensor: ClassVar[str] = "hdl64e_kitti"
+
+    def __init__(
+        self,
+        root: Path,
+        ids: Sequence[str],
+        sensor: str | Path | Sensor | None = None,
+        on_bad: OnBad = "error",
+        *,
+        stored: Sensor | None = None,
+    ) -> None:
         if on_bad not in get_args(OnBad):
             raise ConfigError(f"on_bad={on_bad!r}", f"one of {get_args(OnBad)}")
         if not ids:
             raise DataError(f"{root} holds no scan", (self.__doc__ or "").splitlines()[0].rstrip("."))
         self.root = root
         self.ids = tuple(ids)
-        self.sensor = load_sensor(sensor)
+        self.description = read_description(root) if stored is None else None
+        named = stored if self.description is None else self.description.sensor
+        self._given = None if sensor is None else load_sensor(sensor)
+        self.sensor = self._given or named or load_sensor(self.default_sensor)
+        if named is not None and not same_grid(self.sensor, named):
+            warnings.warn(
+                f"{root} says that its scans are of sensor {named.name!r}; they are read as those of "
+                f"{self.sensor.name!r}, which was given",
+                stacklevel=3,
+            )
+        self._unchecked = named is None
         self.on_bad = on_bad
         self.skipped: dict[str, str] = {}
         self.dropped: dict[str, int] = {}
-        self.domain = domain_of(root)
 
     @abstractmethod
     def read(self, index: int) -> Scan:
@@ -65,7 +97,7 @@ class ScanFiles(ABC):
         """
 
     def load(self, index: int, drop_points: bool | None = None) -> Scan:
-        """Read a scan, drop its bad points if required, and set the domain of the folder.
+        """Read a scan, drop its bad points if required, and set the origin that the folder names.
 
         Args:
             index: 0 <= index < len.
@@ -73,6 +105,7 @@ class ScanFiles(ABC):
 
         Raises:
             DataError, FileError: as ``read``; also if all points are dropped.
+            ConfigError: as ``check_sensor``, for the first scan that is read.
         """
         if drop_points if drop_points is not None else self.on_bad == "drop-points":
             with bad_points_kept():
@@ -82,7 +115,33 @@ class ScanFiles(ABC):
                 self.dropped[self.ids[index]] = len(read) - len(scan)
         else:
             scan = self.read(index)
-        return scan if self.domain != SYNTHETIC or scan.domain == SYNTHETIC else replace(scan, domain=SYNTHETIC)
+        if self._unchecked:
+            self._compare(scan)
+        return scan if self.description is None else self.description.origin.apply(scan)
+
+    def check_sensor(self) -> None:
+        """Compare the first readable scan with the sensor, if the files name no sensor and no scan was read before.
+
+        Points beside the beams are reported by a warning, as is everything about a sensor that the user named.
+
+        Raises:
+            ConfigError: if the sensor is the layout's own, and more than ``agreement.MOST_OUTSIDE`` of the points lie
+                outside of its field of view or its range limits.
+        """
+        for index in range(min(len(self), _TRIED)):
+            if not self._unchecked:
+                return
+            with suppress(DataError, FileError), bad_points_kept():
+                self._compare(self.read(index))
+
+    def _compare(self, scan: Scan) -> None:
+        shares = agreement(scan.points, self.sensor)
+        if faults := shares.faults(self.sensor):
+            given = f"scan {scan.id} of {self.root}, read as one of sensor {self.sensor.name!r}: {'; '.join(faults)}"
+            if self._given is None and shares.outside > MOST_OUTSIDE:
+                raise ConfigError(given, "points of that sensor", _NAME_IT)
+            warnings.warn(f"{given}. {_NAME_IT}", stacklevel=4)
+        self._unchecked = False
 
     def calibration(self, index: int) -> Calibration | None:
         """The camera calibration of scan ``index``; None if the dataset has none."""

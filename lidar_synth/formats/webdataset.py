@@ -4,8 +4,8 @@ The members of a scan are stored consecutively; their names begin with its key, 
 as %2E and %25::
 
     scans-000000.tar          the first 1000 scans, and so on
-      KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml); if known also pose
-                              (4 x 4, sensor to world) and names of the boxes
+      KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml); if known also
+                              provenance, pose (4 x 4, sensor to world) and names of the boxes
       KEY.points.npy          (N, 4) float32: x, y, z in metres, reflectance in [0, 1]
       KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always written, so that samples have the same keys
       KEY.confidence.npy      and other known fields per point: raw_label, instance, ring
@@ -19,7 +19,7 @@ import os
 import tarfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -37,7 +37,7 @@ from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import NOTES, Picture, Writer, clear_notes
 from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry.sensor import Sensor
 
 SUFFIX = ".tar"
 
@@ -50,7 +50,7 @@ class WebDataset(ScanFiles):
 
     Args:
         root: the folder or the file.
-        sensor: the expected sensor; by default the one stored in the files.
+        sensor: takes precedence over the sensor that the files name.
         on_bad: see ``ScanFiles``; a tar file whose headers are damaged always raises an error.
 
     Raises:
@@ -62,9 +62,10 @@ class WebDataset(ScanFiles):
         root = Path(root)
         paths = [root] if root.is_file() else list_files(root, SUFFIX)
         self._places = [(path, *place) for path in paths for place in _scans(path)]
-        self._given = None if sensor is None else load_sensor(sensor)
-        first = self._given or (_decode(*self._places[0], None).sensor if self._places else "hdl64e_kitti")
-        super().__init__(root, [unquote(key) for _, key, _ in self._places], first, on_bad)
+        stored = None
+        with suppress(DataError):  # reading the scan will raise it
+            stored = _decode(*self._places[0], None).sensor if self._places else None
+        super().__init__(root, [unquote(key) for _, key, _ in self._places], sensor, on_bad, stored=stored)
 
     def read(self, index: int) -> Scan:
         return _decode(*self._places[index], self._given)
@@ -127,6 +128,7 @@ def _key(index: int, name: str | None) -> str:
 def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
     """Names and contents of a scan's members; ``_decode`` is the inverse."""
     facts: dict[str, Any] = {"id": scan.id, "domain": scan.domain, "sensor": scan.sensor.to_dict()}
+    facts |= {"provenance": dict(scan.provenance)} if scan.provenance else {}
     facts |= {} if scan.pose is None else {"pose": scan.pose.tolist()}
     facts |= {} if scan.boxes is None else {"names": list(scan.boxes.names)}
     fields = {"label": np.full(len(scan), IGNORE, np.uint8)} | scan.fields()
@@ -156,7 +158,8 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
         boxes = Boxes(arrays.pop("boxes"), _texts(facts["names"])) if "boxes" in arrays else None
         points = arrays.pop("points")
         arrays |= {"points": points[:, :3], "reflectance": points[:, 3]}
-        arrays |= {"sensor": np.array(json.dumps(facts["sensor"]))}
+        texts = {name: json.dumps(facts[name]) for name in ("sensor", "provenance") if name in facts}
+        arrays |= {name: np.array(text) for name, text in texts.items()}
         arrays |= {name: np.array(facts[name]) for name in ("id", "domain", "pose") if name in facts}
     except (ValueError, KeyError, IndexError, TypeError, RecursionError) as error:
         raise DataError(f"{where}: {error!r}", "the members that this package writes", SKIP_HINT) from error

@@ -18,8 +18,11 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import inside, list_files, read_file, read_text, refuse_links, write_file
 from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.description import NAME, Description, Origin, read_description, record, require_grid
+from lidar_synth.formats.points import write_points
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 
 Image = NDArray[np.uint8]
 Picture = Image | Path
@@ -42,6 +45,7 @@ class Writer(ABC):
         self.root = Path(root)
         self.calibration = calibration
         self._without_links = False
+        self._description: Description | None = None
 
     @property
     def _base(self) -> Path:
@@ -87,11 +91,32 @@ class Writer(ABC):
             calibration: the camera of this scan; by default the writer's.
 
         Raises:
+            ConfigError: if the folder holds scans on another grid.
             FileError: if the folder cannot be written or the disk is full.
             DataError: on a scan that the layout cannot represent.
         """
+        self.require_grid(scan.sensor)
         picture = scan.image_path if image is None else image
         self._put(scan, self.path(index, name), picture, calibration or self.calibration)
+
+    def require_grid(self, sensor: Sensor) -> None:
+        """Refuse a sensor if the folder is described (``scans.json``) as holding scans on another grid.
+
+        Raises:
+            ConfigError: if it is.
+            FileError, DataError: if the description cannot be read or is damaged.
+        """
+        if self._description is None and (self.root / NAME).is_file():
+            self._description = read_description(self.root)
+        if self._description is not None:
+            require_grid(self.root, self._description, sensor)
+
+    def _write_points(self, path: Path, scan: Scan) -> None:
+        """Write the points of a scan as ``.bin``, which has no room for a description: it is recorded beside them."""
+        origin = Origin.of(scan)
+        if self._description is None or origin not in self._description.origins:
+            self._description = record(self.root, scan.sensor, origin)
+        write_points(path, scan)
 
     @abstractmethod
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:

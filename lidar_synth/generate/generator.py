@@ -26,7 +26,7 @@ from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, b
 from lidar_synth.generate.devices import checked_device
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, made_by_model
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.noise import gaussian, uniform
 
@@ -162,8 +162,9 @@ class Generator:
         and its ``domain`` is ``SYNTHETIC``.
         """
         images = self.range_images(seed, indices, condition, **options)
+        made = made_by_model(self.name, self.hash, seed)
         return [
-            replace(unproject(image), id=f"{self.name}/{seed}/{index}", domain=SYNTHETIC)
+            replace(unproject(image), id=f"{self.name}/{seed}/{index}", domain=SYNTHETIC, provenance=made)
             for index, image in zip(indices, images, strict=True)
         ]
 

@@ -3,6 +3,7 @@
 All of them are in the sensor frame: right-handed, x forward, y left, z up, metres, float32.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -132,6 +133,9 @@ class Scan:
         image_path: the camera image taken with the scan.
         id: a name that is unique in its source.
         domain: ``REAL`` (0) or ``SYNTHETIC`` (1).
+        provenance: what made a synthetic scan, as short texts and numbers: ``made_by`` (``"model"`` or ``"town"``),
+            ``seed``, and for a model its name ``model`` and ``checkpoint``; empty if it is not known. Scans of one
+            origin have the same.
 
     Raises:
         DataError: on shapes that do not match each other.
@@ -161,6 +165,7 @@ class Scan:
     image_path: Path | None = None
     id: str = ""
     domain: int = REAL
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -185,6 +190,17 @@ class Scan:
 
 POINT_FIELDS = ("reflectance", "label", "raw_label", "instance", "ring", "confidence", "time")
 """The fields of a ``Scan`` that hold one value per point, and of a ``RangeImage`` per cell."""
+
+
+def made_by_model(name: str, checkpoint: str, seed: int) -> dict[str, Any]:
+    """The provenance of scans that a model generated.
+
+    Args:
+        name: the name of the checkpoint.
+        checkpoint: its hash.
+        seed: the seed of generation.
+    """
+    return {"made_by": "model", "model": name, "checkpoint": checkpoint, "seed": seed}
 
 
 @dataclass

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.disk import write_file
 from lidar_synth.formats.convert import in_processes
-from lidar_synth.formats.domain import TOWN
+from lidar_synth.formats.description import TOWN
 from lidar_synth.formats.kitti360 import KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter

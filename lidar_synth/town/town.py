@@ -159,6 +159,7 @@ class Town:
             pose=placed,
             id=f"town-{self.seed}-{index:06d}",
             domain=SYNTHETIC,
+            provenance={"made_by": "town", "seed": self.seed, "interval": self.interval},
         )
 
     def _travelled(self, index: int) -> NDArray[np.float32]:

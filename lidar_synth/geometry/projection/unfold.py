@@ -56,7 +56,7 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         >>> scan = open_scans("demo_out/town")[0]
         >>> image = unfold(scan)
         >>> image.range.shape, image.sensor.name
-        ((64, 1024), 'hdl64e_semantic_kitti/beams')
+        ((64, 1024), 'town/beams')
     """
     lasers = (sensor or scan.sensor).by_beams()
     height, width = lasers.shape

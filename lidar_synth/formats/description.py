@@ -1,0 +1,296 @@
+"""``Description``: what files say about their scans: the sensor, its grid, and where the scans come from.
+
+Formats with room hold it in each file: ``.npz``, PCD and PLY (as comments), PNG, WebDataset, and banks. For all others
+it stands in ``scans.json`` in the root of their folder::
+
+    {"format": "lidar-synth-scans/1",
+     "sensor": {"name": "os1_128", "rows": 128, ...},            the keys of sensors.yaml
+     "grid": [128, 1024],                                        rows and columns of the sensor
+     "origins": [{"domain": "synthetic", "made_by": "model", "model": "town", "checkpoint": "9f...", "seed": 7}]}
+
+An origin is the domain of some of the scans (``real`` or ``synthetic``) with their ``Scan.provenance``. A folder has
+several if scans of several were written into it; then it does not say which scan has which.
+
+For your own folder, ``{"format": "lidar-synth-scans/1", "sensor": "os1_128"}`` is enough: the name of a preset, or the
+keys of ``sensors.yaml``. Without ``origins`` the scans are real.
+
+Folders of earlier versions have ``synthetic.json`` or ``town.json`` instead, which are read too.
+"""
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.errors import ConfigError, DataError, shorten
+from lidar_synth.files.disk import read_text, write_file
+from lidar_synth.files.parsing import parse_json
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
+from lidar_synth.geometry.sensor import Sensor, presets
+
+NAME = "scans.json"
+"""File in the root of a folder that describes its scans."""
+
+FORMAT = "lidar-synth-scans/1"
+
+MARK = "synthetic.json"
+"""File by which earlier versions marked all scans of a folder as synthetic."""
+
+TOWN = "town.json"
+"""File in the root of a town, with its settings."""
+
+DOMAINS = {"real": REAL, "synthetic": SYNTHETIC}
+
+LEVELS = 6
+"""Number of folders above a scan that are searched for a description."""
+
+LONGEST = 1 << 20
+"""Maximum number of bytes of a description."""
+
+LINE = 100
+"""Number of characters of a comment: readers of PCD and PLY limit the length of a line."""
+
+_MOST_FACTS, _LONGEST_TEXT = 32, 1000
+
+_OF_A_LAYOUT = re.compile(
+    r"velodyne(_points|_reduced)?|data|data_3d_raw|2013_05_28_drive_\d{4}_sync|sequences|\d\d|training|testing"
+)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where scans come from.
+
+    Args:
+        domain: ``REAL`` or ``SYNTHETIC``.
+        provenance: as ``Scan.provenance``.
+    """
+
+    domain: int = REAL
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, scan: Scan) -> "Origin":
+        """The origin of a scan."""
+        return cls(scan.domain, scan.provenance)
+
+    def apply(self, scan: Scan) -> Scan:
+        """The scan with this origin, as far as the scan has none of its own."""
+        domain, provenance = max(scan.domain, self.domain), scan.provenance or self.provenance
+        if (domain, provenance) == (scan.domain, scan.provenance):
+            return scan
+        return replace(scan, domain=domain, provenance=provenance)
+
+
+@dataclass(frozen=True)
+class Description:
+    """What files say about their scans.
+
+    Args:
+        sensor: the sensor that recorded them or that they imitate; None if it is not known.
+        origins: where they come from, at least one.
+    """
+
+    sensor: Sensor | None
+    origins: tuple[Origin, ...] = (Origin(),)
+
+    @property
+    def origin(self) -> Origin:
+        """What all scans have in common: synthetic if all of them are, and the provenance if there is only one."""
+        if len(self.origins) == 1:
+            return self.origins[0]
+        return Origin(min(origin.domain for origin in self.origins))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; ``from_dict`` is the inverse."""
+        names = {number: name for name, number in DOMAINS.items()}
+        sensor = {} if self.sensor is None else {"sensor": self.sensor.to_dict(), "grid": list(self.sensor.shape)}
+        origins = [{"domain": names[origin.domain], **origin.provenance} for origin in self.origins]
+        return {"format": FORMAT, **sensor, "origins": origins}
+
+    @classmethod
+    def from_dict(cls, values: Any) -> "Description":
+        """Make a description from the values of ``to_dict``, which may be hostile.
+
+        Raises:
+            ValueError: on another format, a missing or contradictory value, or one of a wrong type.
+        """
+        if not isinstance(values, dict) or values.get("format") != FORMAT:
+            given = values.get("format") if isinstance(values, dict) else type(values).__name__
+            raise ValueError(f"its format is {shorten(repr(given), 100)}, not {FORMAT!r}")
+        sensor = _sensor(values["sensor"]) if "sensor" in values else None
+        if sensor is not None and values.get("grid", list(sensor.shape)) != list(sensor.shape):
+            raise ValueError(f"its grid is {shorten(repr(values['grid']), 100)}, but its sensor has {sensor.shape}")
+        origins = values.get("origins", [{"domain": "real"}])
+        if not isinstance(origins, list) or not origins or not all(isinstance(origin, dict) for origin in origins):
+            raise ValueError("its origins are not a list of mappings")
+        if any(not isinstance(o.get("domain"), str) or o["domain"] not in DOMAINS for o in origins):
+            raise ValueError(f"the domain of an origin is not one of {', '.join(DOMAINS)}")
+        facts = [{key: value for key, value in origin.items() if key != "domain"} for origin in origins]
+        pairs = zip(origins, facts, strict=True)
+        return cls(sensor, tuple(Origin(DOMAINS[o["domain"]], check_provenance(kept)) for o, kept in pairs))
+
+
+def _sensor(value: Any) -> Sensor:
+    """A sensor from its keys, or a preset from its name."""
+    return presets()[value] if isinstance(value, str) and value in presets() else Sensor.from_dict(value)
+
+
+def check_provenance(values: Any) -> dict[str, Any]:
+    """Check a provenance from a file: a few short texts and numbers by name.
+
+    Raises:
+        ValueError: on anything else.
+    """
+    if not isinstance(values, dict) or len(values) > _MOST_FACTS:
+        raise ValueError(f"a provenance that is not a mapping of at most {_MOST_FACTS} values")
+    for key, value in values.items():
+        texts = [text for text in (key, value) if isinstance(text, str)]
+        valid = isinstance(value, str | None) or (isinstance(value, int | float) and abs(value) < 1e300)
+        if not valid or any(len(text) > _LONGEST_TEXT for text in texts):
+            raise ValueError(f"a provenance with {shorten(repr(key), 100)} that is not a short text or a number")
+    return values
+
+
+def same_grid(a: Sensor, b: Sensor) -> bool:
+    """Whether two sensors have the same rows and columns, whatever their names, beams and range limits."""
+    return a is b or (a.shape == b.shape and bool(np.allclose(a.edges, b.edges, rtol=0, atol=1e-5)))
+
+
+def read_description(root: Path) -> Description | None:
+    """The description beside scans, or above the folders of their layout; None if there is none.
+
+    Args:
+        root: a dataset's root, one of its folders, or one scan.
+
+    Raises:
+        FileError, DataError: if there is one that cannot be read, or is damaged.
+    """
+    root = root.resolve()
+    folder = root.parent if root.is_file() else root
+    for _ in range(LEVELS):
+        for name, read in ((NAME, _current), (TOWN, _of_town), (MARK, _of_mark)):
+            if (folder / name).is_file():
+                return read(folder / name)
+        if not _OF_A_LAYOUT.fullmatch(folder.name):
+            break
+        folder = folder.parent
+    return None
+
+
+def _current(path: Path) -> Description:
+    expected = f"a description of scans that this package wrote ({FORMAT})"
+    try:
+        return Description.from_dict(parse_json(read_text(path, expected, LONGEST), str(path), expected))
+    except ValueError as error:
+        raise DataError(
+            f"{path} is damaged ({error})",
+            expected,
+            "Restore it; or remove it and name the sensor: --sensor (sensor=...).",
+        ) from error
+
+
+def _of_mark(path: Path) -> Description:
+    return Description(None, (Origin(SYNTHETIC),))
+
+
+def _of_town(path: Path) -> Description:
+    """The description in the settings of a town, which earlier versions wrote without ``scans.json``."""
+    expected = "the settings of a town"
+    settings = parse_json(read_text(path, expected, LONGEST), str(path), expected)
+    facts = settings if isinstance(settings, dict) else {}
+    provenance = {"made_by": "town"} | {key: facts[key] for key in ("seed", "interval") if key in facts}
+    try:
+        sensor = Sensor.from_dict(facts["sensor"]) if "sensor" in facts else None
+        return Description(sensor, (Origin(SYNTHETIC, check_provenance(provenance)),))
+    except ValueError as error:
+        raise DataError(f"{path} is damaged ({error})", expected) from error
+
+
+def record(root: Path, sensor: Sensor, origin: Origin) -> Description:
+    """Write the sensor and the origin of a scan into the description of its folder, which may exist already.
+
+    Args:
+        root: the folder.
+        sensor: the scan's sensor; that of the folder's first scan is written.
+        origin: where the scan comes from.
+
+    Returns:
+        The description, with this origin.
+
+    Raises:
+        ConfigError: if the folder holds scans on another grid.
+        DataError: if the existing description is damaged.
+        FileError: if it cannot be read or written.
+    """
+    if not (root / NAME).is_file():  # another process may create it at the same time
+        write_file(root / NAME, _encode(Description(sensor, (origin,))), overwrite=False)
+    require_grid(root, _current(root / NAME), sensor)
+    return add_origin(root, origin)
+
+
+def add_origin(root: Path, origin: Origin) -> Description:
+    """Add an origin to the description of a folder, and return it.
+
+    If two processes add one at the same moment, one of the two is lost: the process that started them adds it again.
+
+    Raises:
+        DataError, FileError: if the description is damaged, or cannot be read or written.
+    """
+    there = _current(root / NAME)
+    if origin not in there.origins:
+        there = replace(there, origins=(*there.origins, origin))
+        write_file(root / NAME, _encode(there))
+    return there
+
+
+def require_grid(root: Path, there: Description, sensor: Sensor) -> None:
+    """Refuse a scan of another sensor than those of a folder.
+
+    Raises:
+        ConfigError: if the grids differ.
+    """
+    if there.sensor is not None and not same_grid(sensor, there.sensor):
+        raise ConfigError(
+            f"a scan of {_named(sensor)} for {root}, which holds scans of {_named(there.sensor)}",
+            "scans on one grid in one folder",
+            f"Choose another folder, or convert them with --as-sensor {there.sensor.name} (as_sensor=...).",
+        )
+
+
+def _named(sensor: Sensor) -> str:
+    return f"sensor {sensor.name!r} ({sensor.shape[0]} x {sensor.shape[1]})"
+
+
+def _encode(description: Description) -> bytes:
+    return (json.dumps(description.to_dict(), indent=1) + "\n").encode()
+
+
+def to_comments(scan: Scan) -> list[str]:
+    """The description of a scan as lines of a header, of at most ``LINE`` ASCII characters each and a prefix."""
+    text = json.dumps(Description(scan.sensor, (Origin.of(scan),)).to_dict(), separators=(",", ":"))
+    text = text.replace(" ", r"\u0020")  # so that no program that trims or splits a line changes it
+    return [f"lidar_synth {text[i : i + LINE]}" for i in range(0, len(text), LINE)]
+
+
+def from_comments(lines: Iterable[str], where: str) -> Description | None:
+    """The inverse of ``to_comments``; other comments are ignored. None if there is no description.
+
+    Raises:
+        DataError: on a damaged one.
+    """
+    words = [line.split() for line in lines]
+    parts = [word[1] for word in words if len(word) == 2 and word[0] == "lidar_synth"]
+    if not parts:
+        return None
+    expected = f"a description of the scan that this package wrote ({FORMAT})"
+    try:
+        return Description.from_dict(parse_json("".join(parts), f"{where}: its description", expected))
+    except DataError:
+        raise
+    except ValueError as error:
+        raise DataError(f"{where}: its description is damaged ({error})", expected) from error
