@@ -171,7 +171,7 @@ class KITTI360Writer(Writer):
             write_image(image_path(self.root, drive, frame), picture)
         if scan.label is not None:
             labels = self.root / "data_3d_semantics_scan" / drive / "labels" / f"{frame}.label"
-            write_labels(labels, _with_global_instances(encode_labels(scan, CLASSES), scan))
+            write_labels(labels, label_values(scan))
         write_points(path, scan)
 
     def finish(self) -> None:
@@ -190,8 +190,13 @@ class KITTI360Writer(Writer):
             clear_notes(folder)
 
 
-def _with_global_instances(labels: NDArray[np.uint32], scan: Scan) -> NDArray[np.uint32]:
-    """Convert instance numbers below 1000 to KITTI-360's id * 1000 + n, which labels and boxes use."""
+def label_values(scan: Scan) -> NDArray[np.uint32]:
+    """(N,) values of a scan's label file: KITTI-360's id, and above it id * 1000 + n, which labels and boxes use.
+
+    Raises:
+        DataError: on a train id or an instance that the file cannot hold.
+    """
+    labels = encode_labels(scan, CLASSES)
     if labels is scan.raw_label:
         return labels
     ids, instances = labels & 0xFFFF, labels >> 16

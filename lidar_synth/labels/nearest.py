@@ -1,0 +1,203 @@
+"""Labels of points from their nearest neighbours in a labelled cloud.
+
+The cloud is divided into vertical columns, in which the points are sorted by height. The neighbours of a point lie in
+the columns around it, between two heights. Points of the same class that share a cube of ``VOXEL`` are reduced to one.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+VOXEL = 0.05
+"""Side of the cubes in which points of one class are reduced to one point, metres."""
+
+NEIGHBOURS = 5
+"""Maximum number of neighbours that vote on a label."""
+
+_SIDE = 4  # cubes along the side of a column
+_COLUMN = VOXEL * _SIDE
+_CLASSES = 1 << 8
+_FLOORS = 1 << 14  # maximum number of cubes in a column
+_SIDE_OF_CUBE = np.float32(VOXEL)
+_NEAR = np.float32(0.02)  # distance, metres, below which a neighbour weighs no more
+
+
+class Vote(NamedTuple):
+    """The result for N points.
+
+    Args:
+        value: (N,) uint32 value with most weight among the neighbours; 0 where there is no neighbour.
+        share: (N,) float32 in [0, 1], its share in the weight of all neighbours, times its mean confidence.
+        distance: (N,) float32 metres, distance of its nearest neighbour; infinite where there is none.
+    """
+
+    value: NDArray[np.uint32]
+    share: NDArray[np.float32]
+    distance: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class NearestLabels:
+    """A labelled cloud in which neighbours are found fast; ``index_cloud`` makes it.
+
+    Args:
+        low: (3,) lower corner of the indexed volume, metres.
+        columns: numbers of columns in x and y.
+        starts: (columns + 1,) position of the first point of each column.
+        points: (M, 3) float32 relative to ``low``, sorted by column, then by cube from below.
+        values: (M,) uint32 label values; the lower 8 bits are the class.
+        confidence: (M,) float32 in [0, 1].
+    """
+
+    low: NDArray[np.float64]
+    columns: tuple[int, int]
+    starts: NDArray[np.int64]
+    points: NDArray[np.float32]
+    values: NDArray[np.uint32]
+    confidence: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def vote(self, points: NDArray[np.float64], radius: float, neighbours: int = NEIGHBOURS) -> Vote:
+        """The value on which the nearest points agree.
+
+        A neighbour's weight is its confidence divided by its distance.
+
+        Args:
+            points: (N, 3) metres, in the frame of the cloud.
+            radius: maximum distance of a neighbour, metres.
+            neighbours: maximum number of neighbours that vote.
+        """
+        reach = int(np.ceil(radius / _COLUMN))
+        steps = [(x, y) for x in range(-reach, reach + 1) for y in range(-reach, reach + 1)]
+        order = np.array(sorted(steps, key=lambda s: s[0] ** 2 + s[1] ** 2), np.int64)
+        local = (points - self.low).astype(np.float32)
+        count = len(local)
+        vote = Vote(np.zeros(count, np.uint32), np.zeros(count, np.float32), np.full(count, np.inf, np.float32))
+        cloud = (self.points, self.values, self.confidence, self.starts, self.columns)
+        _vote(local, *cloud, order, np.float32(radius), neighbours, *vote)
+        return vote
+
+
+Chunk = tuple[NDArray[np.floating], NDArray[np.uint32], NDArray[np.float32]]
+"""Points (N, 3), label values (N,) and confidence (N,)."""
+
+
+def index_cloud(
+    chunks: Iterable[Chunk], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> NearestLabels:
+    """Index the part of a cloud that lies in a volume.
+
+    Args:
+        chunks: the cloud in parts, so that it need not fit into memory.
+        low, high: (3,) corners of the volume, metres; it is at most 800 m high. Points outside are left out.
+    """
+    columns = tuple(int(n) for n in np.maximum(np.ceil((high - low)[:2] / _COLUMN), 1))
+    empty = np.zeros(0, np.int64), np.zeros((0, 3), np.float32), np.zeros(0, np.uint32), np.zeros(0, np.float32)
+    kept = [empty]
+    for points, values, confidence in chunks:
+        local = (points - low).astype(np.float32)
+        inside = ((local >= 0) & (local < (high - low).astype(np.float32))).all(axis=1)
+        local, values, confidence = local[inside], values[inside], confidence[inside]
+        keys = np.empty(len(local), np.int64)
+        _keys(local, values, columns[1], keys)
+        keys, first = np.unique(keys, return_index=True)
+        kept.append((keys, local[first], values[first], confidence[first]))
+    keys, points, values, confidence = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+    keys, first = np.unique(keys, return_index=True)
+    column = keys // (_FLOORS * _SIDE * _SIDE * _CLASSES)
+    starts = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=columns[0] * columns[1]))])
+    return NearestLabels(low, columns, starts, points[first], values[first], confidence[first])
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _keys(points, values, across, keys):  # type: ignore[no-untyped-def]
+    """The key by which points are sorted: column, height, cube in the column, class."""
+    for i in range(len(points)):
+        x, y, z = int(points[i, 0] / VOXEL), int(points[i, 1] / VOXEL), int(points[i, 2] / VOXEL)
+        column = (x // _SIDE) * across + y // _SIDE
+        cube = (z * _SIDE + x % _SIDE) * _SIDE + y % _SIDE
+        keys[i] = (column * (_FLOORS * _SIDE * _SIDE) + cube) * _CLASSES + (values[i] & (_CLASSES - 1))
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")  # type: ignore[misc]
+def _insert(p, points, qx, qy, qz, found, squared, count, worst):  # type: ignore[no-untyped-def]
+    """Insert a point into the sorted neighbours if it is near enough; return their number and the largest distance."""
+    ex, ey, ez = points[p, 0] - qx, points[p, 1] - qy, points[p, 2] - qz
+    d = ex * ex + ey * ey + ez * ez
+    if d < worst:
+        at = min(count, len(found) - 1)
+        while at > 0 and squared[at - 1] > d:
+            squared[at], found[at] = squared[at - 1], found[at - 1]
+            at -= 1
+        squared[at], found[at] = d, p
+        count = min(count + 1, len(found))
+        if count == len(found):
+            worst = squared[count - 1]
+    return count, worst
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[misc]
+def _vote(queries, points, values, confidence, starts, columns, order, radius, k, value, share, distance):  # type: ignore[no-untyped-def]
+    found = np.empty(k, np.int64)
+    squared = np.empty(k, np.float32)
+    for i in range(len(queries)):
+        qx, qy, qz = queries[i, 0], queries[i, 1], queries[i, 2]
+        cx, cy = int(np.floor(qx / _COLUMN)), int(np.floor(qy / _COLUMN))
+        count = 0
+        worst = radius * radius
+        for s in range(len(order)):
+            x, y = cx + order[s, 0], cy + order[s, 1]
+            if x < 0 or y < 0 or x >= columns[0] or y >= columns[1]:
+                continue
+            column = x * columns[1] + y
+            begin, end = starts[column], starts[column + 1]
+            if begin == end:
+                continue
+            dx = max(x * np.float32(_COLUMN) - qx, qx - (x + 1) * np.float32(_COLUMN), np.float32(0))
+            dy = max(y * np.float32(_COLUMN) - qy, qy - (y + 1) * np.float32(_COLUMN), np.float32(0))
+            if dx * dx + dy * dy >= worst:
+                continue
+            left, right = begin, end
+            while left < right:
+                middle = (left + right) // 2
+                if points[middle, 2] < qz:
+                    left = middle + 1
+                else:
+                    right = middle
+            # Outwards from the point's own height, up and then down, until no nearer neighbour can come: heights are
+            # sorted up to the side of a cube.
+            for p in range(left, end):
+                dz = points[p, 2] - qz
+                if dz > _SIDE_OF_CUBE and (dz - _SIDE_OF_CUBE) ** 2 > worst:
+                    break
+                count, worst = _insert(p, points, qx, qy, qz, found, squared, count, worst)
+            for p in range(left - 1, begin - 1, -1):
+                dz = qz - points[p, 2]
+                if dz > _SIDE_OF_CUBE and (dz - _SIDE_OF_CUBE) ** 2 > worst:
+                    break
+                count, worst = _insert(p, points, qx, qy, qz, found, squared, count, worst)
+        if count:
+            _count_votes(found[:count], squared[:count], values, confidence, i, value, share, distance)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[misc]
+def _count_votes(found, squared, values, confidence, i, value, share, distance):  # type: ignore[no-untyped-def]
+    total = best = np.float32(0)
+    for a in range(len(found)):
+        own, weight, trust = values[found[a]], np.float32(0), np.float32(0)
+        total += 1 / (np.sqrt(squared[a]) + _NEAR)
+        for b in range(len(found)):
+            if values[found[b]] == own:
+                w = 1 / (np.sqrt(squared[b]) + _NEAR)
+                weight += w
+                trust += w * confidence[found[b]]
+        if trust > best:
+            best = trust
+            value[i], distance[i] = own, np.sqrt(squared[a])
+    share[i] = best / total
