@@ -119,7 +119,7 @@ class Recovery:
         values, share, distance = vote
         moving = self._vote_of_movers(placed, frame, *vote)
         far, disputed = ~np.isfinite(distance), share < AGREEMENT
-        confidence = share * (1 - distance / (2 * RADIUS))
+        confidence = share * (1 - np.minimum(distance, RADIUS) / (2 * RADIUS))
         confidence[far | disputed] = 0
         values[far | disputed] = 0
         boxed = self._label_boxed(placed, frame, values, confidence, far)

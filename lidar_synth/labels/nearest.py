@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 VOXEL = 0.05
 """Side of the cubes in which points of one class are reduced to one point, metres."""
 
-NEIGHBOURS = 5
+NEIGHBOURS = 3
 """Maximum number of neighbours that vote on a label."""
 
 _SIDE = 4  # cubes along the side of a column
 _COLUMN = VOXEL * _SIDE
 _CLASSES = 1 << 8
 _FLOORS = 1 << 14  # maximum number of cubes in a column
-_SIDE_OF_CUBE = np.float32(VOXEL)
+_SIDE_OF_CUBE, _SIDE_OF_COLUMN = np.float32(VOXEL), np.float32(_COLUMN)
 _NEAR = np.float32(0.02)  # distance, metres, below which a neighbour weighs no more
 
 
@@ -74,13 +74,14 @@ class NearestLabels:
             neighbours: maximum number of neighbours that vote.
         """
         reach = int(np.ceil(radius / _COLUMN))
-        steps = [(x, y) for x in range(-reach, reach + 1) for y in range(-reach, reach + 1)]
-        order = np.array(sorted(steps, key=lambda s: s[0] ** 2 + s[1] ** 2), np.int64)
+        steps = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
+        bounds = ((np.maximum(np.abs(steps) - 1, 0) * _COLUMN) ** 2).sum(axis=1).astype(np.float32)
+        order = np.lexsort([np.abs(steps).sum(axis=1), bounds])  # nearest columns first
         local = (points - self.low).astype(np.float32)
         count = len(local)
         vote = Vote(np.zeros(count, np.uint32), np.zeros(count, np.float32), np.full(count, np.inf, np.float32))
         cloud = (self.points, self.values, self.confidence, self.starts, self.columns)
-        _vote(local, *cloud, order, np.float32(radius), neighbours, *vote)
+        _vote(local, *cloud, steps[order], bounds[order], np.float32(radius), neighbours, *vote)
         return vote
 
 
@@ -143,7 +144,7 @@ def _insert(p, points, qx, qy, qz, found, squared, count, worst):  # type: ignor
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[misc]
-def _vote(queries, points, values, confidence, starts, columns, order, radius, k, value, share, distance):  # type: ignore[no-untyped-def]
+def _vote(queries, points, values, confidence, starts, columns, order, bounds, radius, k, value, share, distance):  # type: ignore[no-untyped-def]
     found = np.empty(k, np.int64)
     squared = np.empty(k, np.float32)
     for i in range(len(queries)):
@@ -152,17 +153,14 @@ def _vote(queries, points, values, confidence, starts, columns, order, radius, k
         count = 0
         worst = radius * radius
         for s in range(len(order)):
+            if bounds[s] >= worst:
+                break
             x, y = cx + order[s, 0], cy + order[s, 1]
-            if x < 0 or y < 0 or x >= columns[0] or y >= columns[1]:
+            dx = max(x * _SIDE_OF_COLUMN - qx, qx - (x + 1) * _SIDE_OF_COLUMN, np.float32(0))
+            dy = max(y * _SIDE_OF_COLUMN - qy, qy - (y + 1) * _SIDE_OF_COLUMN, np.float32(0))
+            if dx * dx + dy * dy >= worst or x < 0 or y < 0 or x >= columns[0] or y >= columns[1]:
                 continue
-            column = x * columns[1] + y
-            begin, end = starts[column], starts[column + 1]
-            if begin == end:
-                continue
-            dx = max(x * np.float32(_COLUMN) - qx, qx - (x + 1) * np.float32(_COLUMN), np.float32(0))
-            dy = max(y * np.float32(_COLUMN) - qy, qy - (y + 1) * np.float32(_COLUMN), np.float32(0))
-            if dx * dx + dy * dy >= worst:
-                continue
+            begin, end = starts[x * columns[1] + y], starts[x * columns[1] + y + 1]
             left, right = begin, end
             while left < right:
                 middle = (left + right) // 2
@@ -189,14 +187,13 @@ def _vote(queries, points, values, confidence, starts, columns, order, radius, k
 @numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[misc]
 def _count_votes(found, squared, values, confidence, i, value, share, distance):  # type: ignore[no-untyped-def]
     total = best = np.float32(0)
+    weights = 1 / (np.sqrt(squared) + _NEAR)
     for a in range(len(found)):
-        own, weight, trust = values[found[a]], np.float32(0), np.float32(0)
-        total += 1 / (np.sqrt(squared[a]) + _NEAR)
+        total += weights[a]
+        own, trust = values[found[a]], np.float32(0)
         for b in range(len(found)):
             if values[found[b]] == own:
-                w = 1 / (np.sqrt(squared[b]) + _NEAR)
-                weight += w
-                trust += w * confidence[found[b]]
+                trust += weights[b] * confidence[found[b]]
         if trust > best:
             best = trust
             value[i], distance[i] = own, np.sqrt(squared[a])
