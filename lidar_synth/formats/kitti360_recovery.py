@@ -174,7 +174,7 @@ class Recovery:
         distance = np.linalg.norm(points, axis=1)
         upright = np.flatnonzero((points[:, 2] > _UPRIGHT) & (distance > _PROBED[0]) & (distance < _PROBED[1]))
         probes = placed[upright[:: max(1, len(upright) // _PROBES)]]
-        nearest = self._static.vote(probes, _ABOUT, 1).distance
+        nearest = self._static.vote(probes, _ABOUT).distance
         return int((nearest < _CLOSE).sum()), int(np.isfinite(nearest).sum())
 
 

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 VOXEL = 0.05
 """Side of the cubes in which points of one class are reduced to one point, metres."""
 
-NEIGHBOURS = 3
-"""Maximum number of neighbours that vote on a label."""
-
 _SIDE = 4  # cubes along the side of a column
 _COLUMN = VOXEL * _SIDE
 _CLASSES = 1 << 8
 _FLOORS = 1 << 14  # maximum number of cubes in a column
 _SIDE_OF_CUBE, _SIDE_OF_COLUMN = np.float32(VOXEL), np.float32(_COLUMN)
+_LINEAR = 4  # number of points that are not searched by halves
+_FAR = np.float32(1e6)  # metres, beyond every radius
 _NEAR = np.float32(0.02)  # distance, metres, below which a neighbour weighs no more
 
 
@@ -63,15 +62,14 @@ class NearestLabels:
     def __len__(self) -> int:
         return len(self.values)
 
-    def vote(self, points: NDArray[np.float64], radius: float, neighbours: int = NEIGHBOURS) -> Vote:
-        """The value on which the nearest points agree.
+    def vote(self, points: NDArray[np.float64], radius: float) -> Vote:
+        """The value on which the three nearest points agree.
 
         A neighbour's weight is its confidence divided by its distance.
 
         Args:
             points: (N, 3) metres, in the frame of the cloud.
             radius: maximum distance of a neighbour, metres.
-            neighbours: maximum number of neighbours that vote.
         """
         reach = int(np.ceil(radius / _COLUMN))
         steps = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
@@ -80,8 +78,10 @@ class NearestLabels:
         local = (points - self.low).astype(np.float32)
         count = len(local)
         vote = Vote(np.zeros(count, np.uint32), np.zeros(count, np.float32), np.full(count, np.inf, np.float32))
-        cloud = (self.points, self.values, self.confidence, self.starts, self.columns)
-        _vote(local, *cloud, steps[order], bounds[order], np.float32(radius), neighbours, *vote)
+        found, squared = np.empty((count, 3), np.int64), np.empty((count, 3), np.float32)
+        cloud = (self.points, self.starts, self.columns)
+        _three_nearest(local, *cloud, steps[order], bounds[order], np.float32(radius), found, squared)
+        _count_votes(found, squared, self.values, self.confidence, *vote)
         return vote
 
 
@@ -126,75 +126,80 @@ def _keys(points, values, across, keys):  # type: ignore[no-untyped-def]
         keys[i] = (column * (_FLOORS * _SIDE * _SIDE) + cube) * _CLASSES + (values[i] & (_CLASSES - 1))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")  # type: ignore[misc]
-def _insert(p, points, qx, qy, qz, found, squared, count, worst):  # type: ignore[no-untyped-def]
-    """Insert a point into the sorted neighbours if it is near enough; return their number and the largest distance."""
-    ex, ey, ez = points[p, 0] - qx, points[p, 1] - qy, points[p, 2] - qz
-    d = ex * ex + ey * ey + ez * ez
-    if d < worst:
-        at = min(count, len(found) - 1)
-        while at > 0 and squared[at - 1] > d:
-            squared[at], found[at] = squared[at - 1], found[at - 1]
-            at -= 1
-        squared[at], found[at] = d, p
-        count = min(count + 1, len(found))
-        if count == len(found):
-            worst = squared[count - 1]
-    return count, worst
-
-
 @numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[misc]
-def _vote(queries, points, values, confidence, starts, columns, order, bounds, radius, k, value, share, distance):  # type: ignore[no-untyped-def]
-    found = np.empty(k, np.int64)
-    squared = np.empty(k, np.float32)
+def _three_nearest(queries, points, starts, columns, steps, bounds, radius, found, squared):  # type: ignore[no-untyped-def]
+    """Fill ``found`` and ``squared`` (N, 3) with the nearest points and their squared distances; -1 = none.
+
+    The three are kept in scalars, because arrays of three are twice as slow.
+    """
     for i in range(len(queries)):
         qx, qy, qz = queries[i, 0], queries[i, 1], queries[i, 2]
-        cx, cy = int(np.floor(qx / _COLUMN)), int(np.floor(qy / _COLUMN))
-        count = 0
-        worst = radius * radius
-        for s in range(len(order)):
-            if bounds[s] >= worst:
+        cx, cy = int(np.floor(qx / _SIDE_OF_COLUMN)), int(np.floor(qy / _SIDE_OF_COLUMN))
+        rx, ry = qx - np.float32(cx) * _SIDE_OF_COLUMN, qy - np.float32(cy) * _SIDE_OF_COLUMN
+        d0 = d1 = d2 = radius * radius
+        i0 = i1 = i2 = -1
+        for s in range(len(steps)):
+            if bounds[s] >= d2:
                 break
-            x, y = cx + order[s, 0], cy + order[s, 1]
-            dx = max(x * _SIDE_OF_COLUMN - qx, qx - (x + 1) * _SIDE_OF_COLUMN, np.float32(0))
-            dy = max(y * _SIDE_OF_COLUMN - qy, qy - (y + 1) * _SIDE_OF_COLUMN, np.float32(0))
-            if dx * dx + dy * dy >= worst or x < 0 or y < 0 or x >= columns[0] or y >= columns[1]:
+            dx, dy = _gap(rx, steps[s, 0]), _gap(ry, steps[s, 1])
+            x, y = cx + steps[s, 0], cy + steps[s, 1]
+            if dx * dx + dy * dy >= d2 or x < 0 or y < 0 or x >= columns[0] or y >= columns[1]:
                 continue
             begin, end = starts[x * columns[1] + y], starts[x * columns[1] + y + 1]
             left, right = begin, end
-            while left < right:
+            while right - left > _LINEAR:
                 middle = (left + right) // 2
                 if points[middle, 2] < qz:
                     left = middle + 1
                 else:
                     right = middle
-            # Outwards from the point's own height, up and then down, until no nearer neighbour can come: heights are
+            # Outwards from the point's own height, up and then down, until no nearer neighbour can come. Heights are
             # sorted up to the side of a cube.
-            for p in range(left, end):
-                dz = points[p, 2] - qz
-                if dz > _SIDE_OF_CUBE and (dz - _SIDE_OF_CUBE) ** 2 > worst:
-                    break
-                count, worst = _insert(p, points, qx, qy, qz, found, squared, count, worst)
-            for p in range(left - 1, begin - 1, -1):
-                dz = qz - points[p, 2]
-                if dz > _SIDE_OF_CUBE and (dz - _SIDE_OF_CUBE) ** 2 > worst:
-                    break
-                count, worst = _insert(p, points, qx, qy, qz, found, squared, count, worst)
-        if count:
-            _count_votes(found[:count], squared[:count], values, confidence, i, value, share, distance)
+            p, way = left, 1
+            while True:
+                ez = points[p, 2] - qz if begin <= p < end else _FAR * np.float32(way)
+                beyond = ez * np.float32(way) - _SIDE_OF_CUBE
+                if beyond > 0 and beyond * beyond > d2:
+                    if way < 0:
+                        break
+                    p, way = left - 1, -1
+                    continue
+                ex, ey = points[p, 0] - qx, points[p, 1] - qy
+                d = ex * ex + ey * ey + ez * ez
+                if d < d0:
+                    d2, i2, d1, i1, d0, i0 = d1, i1, d0, i0, d, p
+                elif d < d1:
+                    d2, i2, d1, i1 = d1, i1, d, p
+                elif d < d2:
+                    d2, i2 = d, p
+                p += way
+        found[i, 0], found[i, 1], found[i, 2] = i0, i1, i2
+        squared[i, 0], squared[i, 1], squared[i, 2] = d0, d1, d2
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[misc]
-def _count_votes(found, squared, values, confidence, i, value, share, distance):  # type: ignore[no-untyped-def]
-    total = best = np.float32(0)
-    weights = 1 / (np.sqrt(squared) + _NEAR)
-    for a in range(len(found)):
-        total += weights[a]
-        own, trust = values[found[a]], np.float32(0)
-        for b in range(len(found)):
-            if values[found[b]] == own:
-                trust += weights[b] * confidence[found[b]]
-        if trust > best:
-            best = trust
-            value[i], distance[i] = own, np.sqrt(squared[a])
-    share[i] = best / total
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")  # type: ignore[misc]
+def _gap(inside, step):  # type: ignore[no-untyped-def]
+    """Distance along one axis from a place ``inside`` a column to the column that is ``step`` columns away."""
+    if step > 0:
+        return np.float32(step) * _SIDE_OF_COLUMN - inside
+    if step < 0:
+        return inside - np.float32(step + 1) * _SIDE_OF_COLUMN
+    return np.float32(0)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _count_votes(found, squared, values, confidence, value, share, distance):  # type: ignore[no-untyped-def]
+    for i in range(len(found)):
+        total = best = np.float32(0)
+        for a in range(found.shape[1]):
+            if found[i, a] < 0:
+                break
+            own, weight = values[found[i, a]], np.float32(0)
+            total += 1 / (np.sqrt(squared[i, a]) + _NEAR)
+            for b in range(found.shape[1]):
+                if found[i, b] >= 0 and values[found[i, b]] == own:
+                    weight += confidence[found[i, b]] / (np.sqrt(squared[i, b]) + _NEAR)
+            if a == 0 or weight > best:
+                best, value[i], distance[i] = weight, own, np.sqrt(squared[i, a])
+        if total > 0:
+            share[i] = best / total
