@@ -11,12 +11,12 @@ Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
     calibration/perspective.txt                                 P_rect_00, R_rect_00
     calibration/calib_cam_to_velo.txt, calib_cam_to_pose.txt    camera 0 to velodyne; each camera to the IMU
 
-The dataset publishes labels of accumulated clouds only. ``lidar-synth label kitti360`` recovers labels per scan from them
-(kitti360_labels.py), and so does github.com/JulesSanchez/recoverKITTI360label, which writes DRIVE/labels/FFFFFFFFFF.bin:
-int16 per point, KITTI-360's semantic id, -1 = none found. Under data_3d_semantics_scan, the reader accepts both and
-distinguishes the two encodings by their size: two bytes per point are the encoding of that tool, four are
-SemanticKITTI's packing (KITTI-360's semantic id in the lower 16 bits, instance above), which the writer uses. Only
-frames of annotated windows can have labels; all others are read without labels.
+The dataset publishes labels of accumulated clouds only. ``lidar-synth label kitti360`` recovers labels per scan from
+them (kitti360_labels.py), and so does github.com/JulesSanchez/recoverKITTI360label, which writes
+DRIVE/labels/FFFFFFFFFF.bin: int16 per point, KITTI-360's semantic id, -1 = none found. Under data_3d_semantics_scan,
+the reader accepts both and distinguishes the two encodings by their size: two bytes per point are the encoding of that
+tool, four are SemanticKITTI's packing (KITTI-360's semantic id in the lower 16 bits, instance above), which the writer
+uses. Only frames of annotated windows can have labels; all others are read without labels.
 
 The pose of a ``Scan`` is velodyne to world: pose calib_cam_to_pose[image_00] calib_cam_to_velo^-1.
 """

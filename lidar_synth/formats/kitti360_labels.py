@@ -2,14 +2,14 @@
 
 Output, which ``KITTI360(root, labels=out)`` reads::
 
-    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label       uint32 per point: KITTI-360's id, instance above it; 0 = none
-    data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin     uint8 per point: 255 times the confidence of the label
-    data_3d_semantics_scan/DRIVE/windows/FFFFFFFFFF_LLLLLLLLLL.json    counts of a complete window, and what it was made of
-    data_3d_semantics_scan/report.json                         counts of all windows
+    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label     uint32 per point: KITTI-360's id, instance above; 0 = none
+    data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin   uint8 per point: 255 times the confidence of the label
+    data_3d_semantics_scan/DRIVE/windows/WINDOW.json         counts of a complete window, and what it was made of
+    data_3d_semantics_scan/report.json                       counts of all windows
 
 The unit of work is a window. A rerun repeats windows without a record, and those whose clouds, poses or boxes changed.
-A frame gets labels if a window covers it, it has a pose (or the car hardly moved between two poses), and its scan lies on
-the clouds; frames without labels have no file.
+A frame gets labels if a window covers it, it has a pose (or the car hardly moved between two poses), and its scan lies
+on the clouds; frames without labels have no file.
 """
 
 import json
@@ -166,6 +166,8 @@ def label_scans(
     root, out = Path(root), Path(out)
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
+    for cached in (_poses, _boxes, _hash):
+        cached.cache_clear()  # files may have changed since an earlier call
     plan = plan_labels(root, split)
     for drive in {job.drive for job in plan.jobs}:
         if labels_folder(out, drive).is_dir() and not (labels_folder(out, drive).parent / "windows").is_dir():
@@ -208,7 +210,7 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
         write_file(confidence_path(out, job.drive, name), np.rint(found.confidence * 255).astype(np.uint8).tobytes())
         write_labels(folder / f"{name}.label", found.values)
         train = CLASSES.decode((found.values & 0xFFFF).astype(np.uint16))
-        counts.count(train, found.confidence, found.far, found.disputed, found.moving)
+        counts.count(train, found.confidence, found.fit, found.far, found.disputed, found.moving)
         if against is not None:
             truth = read_scan_labels(against, job.drive, name, folder, len(scan)).get("label")
             if truth is not None:

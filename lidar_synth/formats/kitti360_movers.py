@@ -1,7 +1,7 @@
 """Moving objects of KITTI-360 at any frame: their accumulated points, moved with their boxes.
 
-The points of an object that were measured in different frames are gathered in the frame of its box. At each frame with a
-box, also at one whose points were not accumulated, they are put back where the box is then.
+The points of an object that were measured in different frames are gathered in the frame of its box. At each frame with
+a box, also at one whose points were not accumulated, they are put back where the box is then.
 """
 
 from collections.abc import Iterable
@@ -106,7 +106,7 @@ def inside(
     kept = (np.abs(local) <= size / 2 + margin).all(axis=1)
     if floor:
         kept &= local[:, 2] > floor - size[2] / 2
-    return near[kept]
+    return np.asarray(near[kept])
 
 
 def _points(cloud: NDArray[np.void]) -> NDArray[np.float64]:

@@ -10,8 +10,8 @@ from lidar_synth.datasets.classes import IGNORE, NAMES, TRAIN_ID
 from lidar_synth.errors import DataError
 
 CLASS_COUNTS = ("points", "confidence", "known", "covered", "right")
-"""Counts of each class: labelled points, the sum of their confidence, and, compared with known labels of this class: all
-points, those that got a label, and those that got the right one."""
+"""Counts of each class: labelled points, the sum of their confidence, and, compared with known labels of this class:
+all points, those that got a label, and those that got the right one."""
 
 
 @dataclass
@@ -19,6 +19,8 @@ class Counts:
     """The points of some scans.
 
     Args:
+        scans: number of scans.
+        fit: sum over the scans of the share of their upright points that lie on the clouds.
         points: all points.
         far: those without a neighbour in the clouds.
         disputed: those whose neighbours disagree.
@@ -28,6 +30,8 @@ class Counts:
         compared: {frame: known, covered and right points, and the same of moving cars}.
     """
 
+    scans: int = 0
+    fit: float = 0.0
     points: int = 0
     far: int = 0
     disputed: int = 0
@@ -39,10 +43,18 @@ class Counts:
     compared: dict[int, list[int]] = field(default_factory=dict)
 
     def count(
-        self, train: NDArray[np.uint8], confidence: NDArray[np.float32], far: int, disputed: int, moving: int
+        self,
+        train: NDArray[np.uint8],
+        confidence: NDArray[np.float32],
+        fit: float,
+        far: int,
+        disputed: int,
+        moving: int,
     ) -> None:
-        """Add a scan: (N,) train ids and confidence, and the numbers of the points without a label."""
+        """Add a scan: (N,) train ids and confidence; its fit, and numbers of points as in the class."""
         labelled = train != IGNORE
+        self.scans += 1
+        self.fit += fit
         self.points += len(train)
         self.far += far
         self.disputed += disputed
@@ -63,7 +75,7 @@ class Counts:
         self.compared[frame] = [int(mask.sum()) for mask in masks]
 
     def __iadd__(self, other: "Counts") -> "Counts":
-        for name in ("points", "far", "disputed", "void", "moving"):
+        for name in ("scans", "fit", "points", "far", "disputed", "void", "moving"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name, values in other.classes.items():
             self.classes[name] = self.classes[name] + values
@@ -85,7 +97,8 @@ class Counts:
             compared = {int(frame): [int(n) for n in counts] for frame, counts in values["compared"].items()}
             return cls(**values | {"classes": classes, "compared": compared})
         except (TypeError, KeyError, ValueError, AttributeError) as error:
-            raise DataError(f"counts of labels {str(values)[:200]} ({error!r})", "those that this package wrote") from error
+            given = f"counts of labels {str(values)[:200]} ({error!r})"
+            raise DataError(given, "those that this package wrote") from error
 
 
 @dataclass
@@ -139,7 +152,8 @@ class LabelReport:
         """Shares of all points, and, if known labels were compared, of the points that have one."""
         counts = self.counts
         shares = {name: getattr(counts, name) / max(counts.points, 1) for name in ("far", "disputed", "void", "moving")}
-        shares = {"labelled": float(counts.classes["points"].sum()) / max(counts.points, 1)} | shares
+        labelled = float(counts.classes["points"].sum()) / max(counts.points, 1)
+        shares = {"on_clouds": counts.fit / max(counts.scans, 1), "labelled": labelled} | shares
         if self.compared:
             known, covered, right, *cars = np.sum(list(self.compared.values()), axis=0).tolist()
             shares |= {"covered": covered / max(known, 1), "right": right / max(covered, 1)}

@@ -89,16 +89,14 @@ Chunk = tuple[NDArray[np.floating], NDArray[np.uint32], NDArray[np.float32]]
 """Points (N, 3), label values (N,) and confidence (N,)."""
 
 
-def index_cloud(
-    chunks: Iterable[Chunk], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> NearestLabels:
+def index_cloud(chunks: Iterable[Chunk], low: NDArray[np.float64], high: NDArray[np.float64]) -> NearestLabels:
     """Index the part of a cloud that lies in a volume.
 
     Args:
         chunks: the cloud in parts, so that it need not fit into memory.
         low, high: (3,) corners of the volume, metres; it is at most 800 m high. Points outside are left out.
     """
-    columns = tuple(int(n) for n in np.maximum(np.ceil((high - low)[:2] / _COLUMN), 1))
+    wide, deep = np.maximum(np.ceil((high - low)[:2] / _COLUMN), 1).astype(int).tolist()
     empty = np.zeros(0, np.int64), np.zeros((0, 3), np.float32), np.zeros(0, np.uint32), np.zeros(0, np.float32)
     kept = [empty]
     for points, values, confidence in chunks:
@@ -106,17 +104,17 @@ def index_cloud(
         inside = ((local >= 0) & (local < (high - low).astype(np.float32))).all(axis=1)
         local, values, confidence = local[inside], values[inside], confidence[inside]
         keys = np.empty(len(local), np.int64)
-        _keys(local, values, columns[1], keys)
+        _keys(local, values, deep, keys)
         keys, first = np.unique(keys, return_index=True)
         kept.append((keys, local[first], values[first], confidence[first]))
     keys, points, values, confidence = (np.concatenate(parts) for parts in zip(*kept, strict=True))
     keys, first = np.unique(keys, return_index=True)
     column = keys // (_FLOORS * _SIDE * _SIDE * _CLASSES)
-    starts = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=columns[0] * columns[1]))])
-    return NearestLabels(low, columns, starts, points[first], values[first], confidence[first])
+    starts = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=wide * deep))])
+    return NearestLabels(low, (wide, deep), starts, points[first], values[first], confidence[first])
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)
 def _keys(points, values, across, keys):  # type: ignore[no-untyped-def]
     """The key by which points are sorted: column, height, cube in the column, class."""
     for i in range(len(points)):
@@ -126,7 +124,7 @@ def _keys(points, values, across, keys):  # type: ignore[no-untyped-def]
         keys[i] = (column * (_FLOORS * _SIDE * _SIDE) + cube) * _CLASSES + (values[i] & (_CLASSES - 1))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True, fastmath=True)
 def _three_nearest(queries, points, starts, columns, steps, bounds, radius, found, squared):  # type: ignore[no-untyped-def]
     """Fill ``found`` and ``squared`` (N, 3) with the nearest points and their squared distances; -1 = none.
 
@@ -177,7 +175,7 @@ def _three_nearest(queries, points, starts, columns, steps, bounds, radius, foun
         squared[i, 0], squared[i, 1], squared[i, 2] = d0, d1, d2
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _gap(inside, step):  # type: ignore[no-untyped-def]
     """Distance along one axis from a place ``inside`` a column to the column that is ``step`` columns away."""
     if step > 0:
@@ -187,7 +185,7 @@ def _gap(inside, step):  # type: ignore[no-untyped-def]
     return np.float32(0)
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)
 def _count_votes(found, squared, values, confidence, value, share, distance):  # type: ignore[no-untyped-def]
     for i in range(len(found)):
         total = best = np.float32(0)

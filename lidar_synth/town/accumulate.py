@@ -1,9 +1,9 @@
 """The town's scans as accumulated, labelled clouds in KITTI-360's layout (formats/kitti360_accumulated.py).
 
-Made as the dataset's own tool makes them (kitti360Scripts, devkits/accumuLaser): points measured from 3 to 30 m, thinned
-to 2 cm, the nearest measurement first; what moves is separate and carries its frame. They are no copy of the scans'
-labels: only every second frame is accumulated, and with errors of the poses, so that labels recovered from the clouds
-can be compared with those of frames which the clouds hold and of frames which they do not hold.
+Made as the dataset's own tool makes them (kitti360Scripts, devkits/accumuLaser): points measured from 3 to 30 m,
+thinned to 2 cm, the nearest measurement first; what moves is separate and carries its frame. They are no copy of the
+scans' labels: only every second frame is accumulated, and with errors of the poses, so that labels recovered from the
+clouds can be compared with those of frames which the clouds hold and of frames which they do not hold.
 """
 
 from pathlib import Path
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.kitti360 import label_values
-from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES
 from lidar_synth.formats.kitti360_accumulated import REACH, SPACING, write_cloud
+from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.noise import keyed_rng
 from lidar_synth.town.town import Town

@@ -6,9 +6,9 @@ Right: a town is exported with accumulated clouds, which hold every second frame
 (lidar_synth/town/accumulate.py); labels are recovered and compared with the known ones, for frames that the clouds hold
 and for frames that they do not hold. The target is 97 % of the labelled points and 90 % of moving cars.
 
-Speed: processor time of the whole run, with reading and writing. The target is 20 scans per second on 2 cores. Windows of
-KITTI-360 have about 10 million points, those of the town 300,000; so a window is filled up to ``--points`` by copies of
-its points, moved by a few centimetres, and its scans are labelled again.
+Speed: processor time of the whole run, with reading and writing. The target is 20 scans per second on 2 cores. Windows
+of KITTI-360 have about 10 million points, those of the town 300,000; so a window is filled up to ``--points`` by copies
+of its points, moved by a few centimetres, and its scans are labelled again.
 """
 
 import argparse
@@ -24,7 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from timing import machine
 
-from lidar_synth.formats.kitti360_accumulated import PROPERTIES, SPACING, find_windows, read_cloud, write_cloud
+from lidar_synth.formats.kitti360_accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
 from lidar_synth.formats.kitti360_labels import label_scans
 from lidar_synth.formats.label_report import LabelReport
 from lidar_synth.town import Town, export_town
@@ -78,18 +78,18 @@ def main() -> None:
         print_right(report)
         each = used / arguments.scans
         print(
-            f"\n{report.counts.points / arguments.scans:,.0f} points per scan, {1e3 * each:.0f} ms of processor time per "
-            f"scan: {2 / each:.1f} scans/s on 2 dedicated cores; {arguments.scans / clock:.1f} scans/s by one process here"
+            f"\n{report.counts.points / arguments.scans:,.0f} points and {1e3 * each:.0f} ms of processor time per scan"
         )
+        print(f"{2 / each:.1f} scans/s on 2 dedicated cores; {arguments.scans / clock:.1f} scans/s by one process here")
         fill(town, arguments.points)
         used = time.process_time()
         report = label_scans(town, again, against=town)
         used, scans = time.process_time() - used, sum(report.labelled.values())
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         print(
-            f"\nA window of {arguments.points:,} points, {SPACING * 100:.0f} cm and denser, {scans} scans: {used:.1f} s of "
-            f"processor time with reading, at most {peak:.1f} GiB of memory"
+            f"\nA window of {arguments.points:,} points: {used:.1f} s of processor time for {scans} scans, with reading"
         )
+        print(f"at most {peak:.1f} GiB of memory\n")
         print_right(report)
 
 
