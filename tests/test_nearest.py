@@ -33,7 +33,9 @@ def test_the_vote_is_that_of_a_search_through_all_points(radius: float) -> None:
         trust = {v: (weights * index.confidence[near])[index.values[near] == v].sum() for v in index.values[near]}
         best = max(trust, key=lambda v: trust[v])
         assert vote.value[i] == best
-        assert vote.share[i] == pytest.approx(trust[best] / weights.sum(), rel=1e-3)
+        own = index.values[near] == best
+        assert vote.share[i] == pytest.approx(trust[best] / sum(trust.values()), rel=1e-3)
+        assert vote.trust[i] == pytest.approx(trust[best] / weights[own].sum(), rel=1e-3)
         assert vote.distance[i] == pytest.approx(distance[near][index.values[near] == best].min(), rel=1e-3)
 
 

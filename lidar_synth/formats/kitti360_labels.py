@@ -210,7 +210,8 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
         write_file(confidence_path(out, job.drive, name), np.rint(found.confidence * 255).astype(np.uint8).tobytes())
         write_labels(folder / f"{name}.label", found.values)
         train = CLASSES.decode((found.values & 0xFFFF).astype(np.uint16))
-        counts.count(train, found.confidence, found.fit, found.far, found.disputed, found.moving)
+        reasons = {"far": found.far, "disputed": found.disputed, "moving": found.moving}
+        counts.count(train, found.confidence, fit=found.fit, **reasons)
         if against is not None:
             truth = read_scan_labels(against, job.drive, name, folder, len(scan)).get("label")
             if truth is not None:

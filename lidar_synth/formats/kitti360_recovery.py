@@ -22,15 +22,18 @@ from lidar_synth.labels.nearest import Chunk, index_cloud
 RADIUS = 0.3
 """Maximum distance of a neighbour, metres."""
 
-AGREEMENT = 0.5
+AGREEMENT = 0.6
 """Minimum share of the neighbours' weight for a label."""
 
 VIEW = 100.0
 """Distance from the car, metres, within which clouds are indexed."""
 
 FIT = 0.6
-"""Minimum share of a scan's upright points that lie on the clouds; below it, pose and clouds do not fit. In the town it is
-0.97 to 0.99, with the poses 0.5 m off 0.3 to 0.43, turned by 1 degree 0.77 to 0.91, and by 3 degrees 0.4 to 0.59."""
+"""Minimum share of a scan's upright points that lie on the clouds; below it, pose and clouds do not fit.
+
+In the town it is 0.97 to 0.99; with poses 0.5 m off 0.3 to 0.43, turned by 1 degree 0.77 to 0.91, by 3 degrees 0.4 to
+0.59.
+"""
 
 ON_SURFACE = 0.1
 """Distance, metres, up to which a point lies on a static surface, also inside a box of a moving object."""
@@ -129,10 +132,10 @@ class Recovery:
         """The labels of a scan: (N, 3) points in the sensor's frame, as measured."""
         placed = self.place(points, frame)
         vote = self._static.vote(placed, RADIUS)
-        values, share, distance = vote
+        values, share, trust, distance = vote
         moving = self._vote_of_movers(placed, frame, *vote)
         far, disputed = ~np.isfinite(distance), share < AGREEMENT
-        confidence = (share * (1 - np.minimum(distance, RADIUS) / (2 * RADIUS))).astype(np.float32)
+        confidence = (share * trust * (1 - np.minimum(distance, RADIUS) / (2 * RADIUS))).astype(np.float32)
         values[far | disputed] = 0
         confidence[values == 0] = 0
         boxed = self._label_boxed(placed, frame, values, confidence, distance)
@@ -149,6 +152,7 @@ class Recovery:
         frame: int,
         values: NDArray[np.uint32],
         share: NDArray[np.float32],
+        trust: NDArray[np.float32],
         distance: NDArray[np.float32],
     ) -> NDArray[np.bool_]:
         """Replace the vote for points that are nearer to a moving object, and mark them."""
@@ -161,7 +165,7 @@ class Recovery:
             vote = index.vote(placed[near], RADIUS)
             closer = vote.distance < distance[near]
             chosen = near[closer]
-            values[chosen], share[chosen], distance[chosen] = (v[closer] for v in vote)
+            values[chosen], share[chosen], trust[chosen], distance[chosen] = (v[closer] for v in vote)
             nearer[chosen] = True
         return nearer
 

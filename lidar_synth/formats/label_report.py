@@ -46,6 +46,7 @@ class Counts:
         self,
         train: NDArray[np.uint8],
         confidence: NDArray[np.float32],
+        *,
         fit: float,
         far: int,
         disputed: int,

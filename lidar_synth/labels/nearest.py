@@ -30,12 +30,14 @@ class Vote(NamedTuple):
 
     Args:
         value: (N,) uint32 value with most weight among the neighbours; 0 where there is no neighbour.
-        share: (N,) float32 in [0, 1], its share in the weight of all neighbours, times its mean confidence.
+        share: (N,) float32 in [0, 1], its share in the weight of all neighbours.
+        trust: (N,) float32 in [0, 1], the mean confidence of the neighbours with this value.
         distance: (N,) float32 metres, distance of its nearest neighbour; infinite where there is none.
     """
 
     value: NDArray[np.uint32]
     share: NDArray[np.float32]
+    trust: NDArray[np.float32]
     distance: NDArray[np.float32]
 
 
@@ -77,7 +79,8 @@ class NearestLabels:
         order = np.lexsort([np.abs(steps).sum(axis=1), bounds])  # nearest columns first
         local = (points - self.low).astype(np.float32)
         count = len(local)
-        vote = Vote(np.zeros(count, np.uint32), np.zeros(count, np.float32), np.full(count, np.inf, np.float32))
+        zeros = np.zeros((2, count), np.float32)
+        vote = Vote(np.zeros(count, np.uint32), *zeros, np.full(count, np.inf, np.float32))
         found, squared = np.empty((count, 3), np.int64), np.empty((count, 3), np.float32)
         cloud = (self.points, self.starts, self.columns)
         _three_nearest(local, *cloud, steps[order], bounds[order], np.float32(radius), found, squared)
@@ -186,18 +189,20 @@ def _gap(inside, step):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _count_votes(found, squared, values, confidence, value, share, distance):  # type: ignore[no-untyped-def]
+def _count_votes(found, squared, values, confidence, value, share, trust, distance):  # type: ignore[no-untyped-def]
     for i in range(len(found)):
         total = best = np.float32(0)
         for a in range(found.shape[1]):
             if found[i, a] < 0:
                 break
-            own, weight = values[found[i, a]], np.float32(0)
-            total += 1 / (np.sqrt(squared[i, a]) + _NEAR)
+            own, weight, plain = values[found[i, a]], np.float32(0), np.float32(0)
+            total += confidence[found[i, a]] / (np.sqrt(squared[i, a]) + _NEAR)
             for b in range(found.shape[1]):
                 if found[i, b] >= 0 and values[found[i, b]] == own:
-                    weight += confidence[found[i, b]] / (np.sqrt(squared[i, b]) + _NEAR)
+                    near = 1 / (np.sqrt(squared[i, b]) + _NEAR)
+                    plain += near
+                    weight += confidence[found[i, b]] * near
             if a == 0 or weight > best:
-                best, value[i], distance[i] = weight, own, np.sqrt(squared[i, a])
+                best, value[i], trust[i], distance[i] = weight, own, weight / plain, np.sqrt(squared[i, a])
         if total > 0:
             share[i] = best / total
