@@ -25,6 +25,7 @@ LIMITS = {
     "docs/how-to/trainers/other.md": 100,
     "docs/how-to/your-sensor.md": 250,
     "docs/how-to/your-dataset.md": 300,
+    "docs/how-to/label-kitti360.md": 200,
     "docs/how-to/train-a-generator.md": 450,
     "docs/how-to/bake.md": 400,
     "docs/how-to/look.md": 150,
