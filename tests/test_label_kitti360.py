@@ -111,6 +111,10 @@ def test_a_rerun_repeats_only_what_is_missing_or_changed(copy: Path, tmp_path: P
     poses = copy / "data_poses" / DRIVE / "poses.txt"
     poses.write_text(poses.read_text() + "\n")
     assert label_scans(copy, out, progress=False).kept == 0
+    _beside(copy)
+    with pytest.raises(DataError, match="do not lie on"):
+        label_scans(copy, out, progress=False)
+    assert len(list(out.rglob("*.label"))) <= SCANS // 4  # no labels of the run before
 
 
 def _turned(copy: Path) -> None:

@@ -198,6 +198,8 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
     recovery = Recovery(job.windows, _boxes(root, job.drive), poses, job.frames)
     points = partial(_points, root, job.drive)
     recovery.choose_motion({f: points(f)[:, :3] for f in job.frames[:: -(-len(job.frames) // _SAMPLES)]})
+    for frame in job.frames:  # labels of an earlier run with other clouds or poses
+        (folder / f"{frame:010d}.label").unlink(missing_ok=True)
     counts, fitting, misfits = Counts(), [], []
     for frame in job.frames:
         scan = points(frame)[:, :3]

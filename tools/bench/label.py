@@ -24,6 +24,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from timing import machine
 
+from lidar_synth import KITTI360
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.formats.kitti360_accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
 from lidar_synth.formats.kitti360_labels import label_scans
 from lidar_synth.formats.label_report import LabelReport
@@ -43,6 +45,21 @@ def print_right(report: LabelReport) -> None:
         known, covered, right, cars, seen, good = np.sum(rows, axis=0)
         shares = (covered / known, right / covered, seen / max(cars, 1), good / max(seen, 1))
         print(f"| {name} ({len(rows)}) | " + " | ".join(f"{100 * s:.1f} %" for s in shares) + " |")
+
+
+def print_confidence(town: Path, out: Path) -> None:
+    """Print how many labels are right by their confidence."""
+    edges = np.array([0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.01])
+    counts = np.zeros((2, len(edges) - 1))
+    for known, scan in zip(KITTI360(town), KITTI360(town, labels=out), strict=True):
+        assert known.label is not None and scan.label is not None and scan.confidence is not None
+        both = (known.label != IGNORE) & (scan.label != IGNORE)
+        for row, mask in zip(counts, (both, both & (known.label == scan.label)), strict=True):
+            row += np.histogram(scan.confidence[mask], edges)[0]
+    print("\n| confidence | share of the labels | right |\n|---|---:|---:|")
+    for low, high, number, right in zip(edges, edges[1:], *counts, strict=False):
+        shares = f"{100 * number / counts[0].sum():.1f} % | {100 * right / max(number, 1):.1f} %"
+        print(f"| {low:.1f} to {min(high, 1):.1f} | {shares} |")
 
 
 def fill(root: Path, points: int) -> None:
@@ -76,6 +93,7 @@ def main() -> None:
         report = label_scans(town, out, against=town)
         used, clock = time.process_time() - used, time.perf_counter() - clock
         print_right(report)
+        print_confidence(town, out)
         each = used / arguments.scans
         print(
             f"\n{report.counts.points / arguments.scans:,.0f} points and {1e3 * each:.0f} ms of processor time per scan"
