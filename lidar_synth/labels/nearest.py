@@ -79,8 +79,8 @@ class NearestLabels:
         order = np.lexsort([np.abs(steps).sum(axis=1), bounds])  # nearest columns first
         local = (points - self.low).astype(np.float32)
         count = len(local)
-        zeros = np.zeros((2, count), np.float32)
-        vote = Vote(np.zeros(count, np.uint32), *zeros, np.full(count, np.inf, np.float32))
+        share, trust = np.zeros((2, count), np.float32)
+        vote = Vote(np.zeros(count, np.uint32), share, trust, np.full(count, np.inf, np.float32))
         found, squared = np.empty((count, 3), np.int64), np.empty((count, 3), np.float32)
         cloud = (self.points, self.starts, self.columns)
         _three_nearest(local, *cloud, steps[order], bounds[order], np.float32(radius), found, squared)
