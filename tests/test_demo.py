@@ -61,6 +61,34 @@ def test_one_sequence_alone_is_refused(demo: ModuleType, tmp_path: Path) -> None
         demo.semantic_kitti(str(tmp_path), 3)
 
 
+def write_drives(root: Path, drives: list[int], scans: int, labelled: bool) -> None:
+    """A dataset in KITTI-360's layout."""
+    writer, sensor = WRITERS["kitti360"](root), load_sensor("hdl64e_kitti360")
+    for drive in drives:
+        for frame in range(scans):
+            scan = random_scan(sensor, 50, frame)
+            kept = scan if labelled else replace(scan, label=None, raw_label=None, instance=None)
+            writer.write(kept, frame, name=f"{drive:02d}/{frame}")
+    writer.finish()
+
+
+@pytest.mark.parametrize(("drives", "held_out"), [([4, 5, 0], {5}), ([4], {4})], ids=["several drives", "one drive"])
+def test_labelled_scans_of_kitti360_are_split_by_place(
+    demo: ModuleType, tmp_path: Path, drives: list[int], held_out: set[int]
+) -> None:
+    write_drives(tmp_path, drives, 8, labelled=True)
+    data = demo.kitti360(str(tmp_path), 3)
+    assert data.labelled and len(data.real) == 3 and len(data.held_out) in (2, 3)
+    assert {int(scan.id[19:21]) for scan in data.held_out} == held_out
+    assert max(scan.id for scan in data.real) < min(scan.id for scan in data.held_out)
+
+
+def test_kitti360_without_labels_is_not_trained_on(demo: ModuleType, tmp_path: Path) -> None:
+    write_drives(tmp_path, [4], 4, labelled=False)
+    data = demo.kitti360(str(tmp_path), 3)
+    assert not data.labelled and not data.held_out and f"lidar-synth label kitti360 {tmp_path}" in data.notes
+
+
 def test_the_town_that_is_held_out_is_another_one(
     demo: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

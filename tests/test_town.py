@@ -28,7 +28,7 @@ from lidar_synth.town.shading import camera_hits
 from lidar_synth.town.solid import Solid
 from lidar_synth.town.vehicles import vehicles
 
-INDICES = (4, 5, 47, 444)
+INDICES = (4, 5, 26, 164)
 """Scans of three stretches; the first two are neighbours."""
 
 
@@ -59,7 +59,7 @@ def test_a_scan_is_the_same_in_any_order_and_process(scans: dict[int, Scan]) -> 
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         elsewhere = pool.submit(fingerprint, 444)
         backwards = Town(seed=0, scans=500)
-        for index in (47, 5, 4):
+        for index in (26, 5, 4):
             assert as_bytes(backwards[index]) == as_bytes(scans[index])
         assert elsewhere.result() == as_bytes(scans[444])
 
@@ -197,11 +197,12 @@ def test_image_boxes_and_truncation_match_the_boxes(scans: dict[int, Scan]) -> N
 
 
 @pytest.mark.slow
-def test_no_ray_passes_through_walls_or_cars(town: Town, scans: dict[int, Scan]) -> None:
-    """A ray returns from the first surface that it hits, except for glass, wire and leaves."""
+def test_no_ray_passes_through_walls_or_cars(town: Town) -> None:
+    """A ray returns from the first surface that it hits, except for glass, wire, leaves and the relief of soil."""
     mover_points = 0
+    still = Town(scans=500, motion=False)
     for index in INDICES:
-        world, scan = town.world(index), scans[index]
+        world, scan = town.world(index), still[index]
         snapshot, pose, _ = town.moment(index)
         assert scan.ring is not None and scan.instance is not None
         start = np.zeros((len(scan), 3)) + np.array((0, 0, 1)) * optics(scan.sensor)[1][scan.ring][:, None]
@@ -209,7 +210,8 @@ def test_no_ray_passes_through_walls_or_cars(town: Town, scans: dict[int, Scan])
         measured = np.linalg.norm(offset, axis=1)
         origins = (start @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
         rays = ((offset / measured[:, None]) @ pose[:3, :3].T).astype(np.float32)
-        solid = ~np.isin(np.array(list(MATERIALS))[world.surfaces.material], ["glass", "carglass", "leaf", "wire"])
+        open_or_soft = [name for name, m in MATERIALS.items() if m.transmission or m.relief]
+        solid = ~np.isin(np.array(list(MATERIALS))[world.surfaces.material], open_or_soft)
         first, face, _ = Solid(world.triangles).first(origins, rays)
         behind = (first < measured - 0.25) & solid[world.faces[face]]
         # At edges, the ray computed from a rounded point can miss what the original ray hit.
@@ -275,7 +277,7 @@ def test_neighbouring_scans_overlap_when_accumulated_by_pose(scans: dict[int, Sc
 def test_stretches_are_far_apart_in_the_world(scans: dict[int, Scan]) -> None:
     places = {i // STRETCH_FRAMES: s.pose[:3, 3] for i, s in scans.items() if s.pose is not None}
     assert len(places) == 3
-    assert abs(places[2][0] - places[0][0]) > 1500
+    assert abs(places[8][0] - places[0][0]) > 1500
 
 
 def test_points_are_in_ring_order(scans: dict[int, Scan]) -> None:
@@ -287,12 +289,25 @@ def test_points_are_in_ring_order(scans: dict[int, Scan]) -> None:
 def test_points_lie_on_their_lasers_rays(scans: dict[int, Scan]) -> None:
     sensor = load_sensor("town")
     elevation, height = optics(sensor)
-    scan = scans[4]
+    scan = Town(scans=5, motion=False)[4]
     x, y, z = scan.points.T
     assert np.allclose(np.arctan2(z - height[scan.ring], np.hypot(x, y)), elevation[scan.ring], atol=1e-5)
-    column = (np.arctan2(-y, x) / np.pi + 1) / 2 * sensor.columns
-    assert np.abs(column - np.floor(column) - 0.5).max() < 0.01
-    assert free_rays(sensor)[scan.ring, column.astype(int)].all()
+    firing = (np.arctan2(-y, x) / np.pi + 1) / 2 * sensor.firings
+    assert np.abs(firing - np.floor(firing) - 0.5).max() < 0.01
+    assert free_rays(sensor)[scan.ring, firing.astype(int)].all()
+
+
+def test_the_vehicle_moves_while_the_sensor_turns() -> None:
+    """What is measured later is measured from farther along the street."""
+    still, moving = Town(scans=5, motion=False)[4], Town(scans=5)[4]
+    elevation, height = optics(still.sensor)
+    for scan, largest in ((still, 1e-4), (moving, 2.0)):
+        x, y, z = scan.points.T
+        start = np.hypot(x, y) + (z - height[scan.ring]) / np.tan(-elevation[scan.ring])  # of the ray, towards behind
+        assert abs(start[scan.ring > 20]).max() < largest
+    behind = (np.arctan2(abs(y), x) > 2.9) & (scan.ring > 20)
+    left, right = np.median(start[behind & (y > 0)]), np.median(start[behind & (y < 0)])
+    assert -0.6 < left < -0.1 < 0.1 < right < 0.6
 
 
 def test_returns_from_a_level_road_have_the_elevations_of_the_beams() -> None:
@@ -312,7 +327,7 @@ def test_range_images_are_about_as_full_as_those_of_real_scans(scans: dict[int, 
 @pytest.mark.parametrize("name", ["hdl32e_nuscenes", "os1_128"])
 def test_the_town_can_be_scanned_with_another_preset(name: str) -> None:
     sensor = presets()[name]
-    scan = Town(seed=0, sensor=sensor, scans=500)[4]
+    scan = Town(seed=0, sensor=sensor, scans=500, motion=False)[4]
     assert scan.sensor == sensor and scan.ring is not None
     x, y, z = scan.points.T
     assert np.allclose(np.arctan2(z, np.hypot(x, y)), sensor.laser_elevations[scan.ring], atol=1e-5)

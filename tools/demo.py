@@ -4,8 +4,9 @@
 
 1. Writes scans of a procedural town in SemanticKITTI's layout, in place of your own labelled dataset, and scans of
    another town, on which segmenters are measured. With SEMANTICKITTI_ROOT set, that dataset is used instead: sequence
-   08 is held out, or the last sequence if there is no 08. KITTI360_ROOT works too, but has no labels per scan: its
-   scans are mixed and shown, and nothing is trained.
+   08 is held out, or the last sequence if there is no 08. KITTI360_ROOT works too: its last labelled drive is held
+   out, or the end of its only one. Without labels per scan (``lidar-synth label kitti360`` makes them) its scans are
+   mixed and shown, and nothing is trained.
 2. Bakes a bank of scans that the shipped model generates, and verifies it.
 3. Trains a small segmenter on the labelled scans, without and with synthetic ones, with two or three seeds each.
 4. Writes a page: real and synthetic scans side by side, the mixture, and the mIoU of both trainings.
@@ -27,8 +28,9 @@ import numpy as np
 from comparison import AUGMENTATION, Protocol, Result, compare
 from numpy.typing import NDArray
 
-from lidar_synth import Bank, Scan, Source, open_scans
+from lidar_synth import KITTI360, Bank, Scan, Source, open_scans
 from lidar_synth.datasets.classes import NAMES
+from lidar_synth.errors import DataError
 from lidar_synth.files.disk import write_file
 from lidar_synth.geometry.scan import REAL
 from lidar_synth.viz import classes_panel, html_page, mixture_panel, scores_panel
@@ -40,6 +42,9 @@ _TOWN_MODEL = (
     "The synthetic scans come from a model of a procedural town, which has not seen this dataset: they look like the "
     "town. For scans like yours, train a model on yours."
 )
+
+
+_LABEL = "lidar-synth label kitti360 {root} {root}"
 
 
 @dataclass(frozen=True)
@@ -112,11 +117,21 @@ def semantic_kitti(root: str, scans: int) -> Data:
 
 
 def kitti360(root: str, scans: int) -> Data:
-    """KITTI-360, which has no labels per scan."""
-    real = spread(open_scans(root, layout="kitti360", split="r2flow/train"), scans)
-    return Data(
-        real, [], "real scan (KITTI-360)", "Real scans: KITTI-360. They have no labels, so nothing was trained."
-    )
+    """KITTI-360, with labels per scan if they were made; the last drive, or the end of the only one, is held out."""
+    name = "Real scan (KITTI-360)"
+    try:
+        source = KITTI360(root, "r2flow/train", labels=root)
+    except DataError:
+        real = spread(KITTI360(root, "r2flow/train"), scans)
+        notes = f"Real scans: KITTI-360, without labels, so nothing was trained. Make them: {_LABEL.format(root=root)}"
+        return Data(real, [], name, "real", notes)
+    drives = {key: list(found) for key, found in groupby(range(len(source)), lambda i: source.ids[i].split("/")[0])}
+    *others, last = drives.values()
+    chosen = [i for indices in others for i in indices] or last[: max(1, 3 * len(last) // 4)]
+    held_out = [i for i in last if i not in set(chosen)]
+    notes = f"Real scans: KITTI-360, {len(drives)} drives, with labels from its accumulated clouds. {_TOWN_MODEL}"
+    place = f"{'the last' if others else 'the end of the only'} labelled drive, on which nothing was trained"
+    return Data(spread(source, scans, chosen), spread(source, scans, held_out), name, "real", notes, place)
 
 
 def dataset(out: Path, scans: int, seed: int) -> Data:

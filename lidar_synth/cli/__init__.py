@@ -17,6 +17,7 @@ from lidar_synth.cli.curate import curate
 from lidar_synth.cli.doctor import doctor
 from lidar_synth.cli.evaluate import evaluate
 from lidar_synth.cli.import_ import import_
+from lidar_synth.cli.label import label
 from lidar_synth.cli.recipes import recipes
 from lidar_synth.cli.sample import sample
 from lidar_synth.cli.town import town
@@ -27,6 +28,7 @@ from lidar_synth.errors import ConfigError, LidarSynthError
 COMMANDS: dict[str, Callable[..., None]] = {
     "town": town,
     "convert": convert,
+    "label": label,
     "view": view,
     "sample": sample,
     "bake": bake,

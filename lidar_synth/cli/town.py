@@ -17,6 +17,9 @@ def town(
     sequence: Annotated[
         int | None, typer.Option(help="number of the drive or sequence to write [4 for kitti360, 0 for semantic_kitti]")
     ] = None,
+    accumulate: Annotated[
+        bool, typer.Option("--accumulate", help="also write KITTI-360's accumulated clouds, for lidar-synth label")
+    ] = False,
     jobs: Annotated[int, typer.Option(help="number of worker processes")] = 1,
 ) -> None:
     """Writes street scans of a procedural town with labels, boxes, poses and images, in the layout of a public dataset.
@@ -28,9 +31,10 @@ def town(
       lidar-synth town my_town --scans 1000 --seed 1 --layout semantic_kitti --no-camera --jobs 4
       lidar-synth town my_town --scans 100 --layout kitti
       lidar-synth town my_town --scans 500 --sensor os1_128 --no-camera
+      lidar-synth town my_town --scans 100 --accumulate --no-camera
     """
     from lidar_synth.town import Town, export_town
 
     source = Town(seed, sensor, scans, interval)
-    written, kept = export_town(source, out, layout, sequence=sequence, camera=camera, jobs=jobs)
+    written, kept = export_town(source, out, layout, sequence=sequence, camera=camera, accumulate=accumulate, jobs=jobs)
     print(f"{out}: {written} scans written, {kept} were there already")

@@ -7,15 +7,16 @@ Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
     data_poses/DRIVE/poses.txt                                  F and 12 numbers: the car's IMU at frame F to world
     data_3d_bboxes/train/DRIVE.xml                              boxes, see kitti360_boxes.py
     data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label        labels per scan, see below
+    data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin      uint8 per point, 255 = certain
     calibration/perspective.txt                                 P_rect_00, R_rect_00
     calibration/calib_cam_to_velo.txt, calib_cam_to_pose.txt    camera 0 to velodyne; each camera to the IMU
 
-The dataset publishes labels of accumulated clouds only. Labels per scan are recovered from them by nearest neighbours
-(github.com/JulesSanchez/recoverKITTI360label writes DRIVE/labels/FFFFFFFFFF.bin: int16 per point, KITTI-360's
-semantic id, -1 = none found). Under data_3d_semantics_scan, the reader accepts files named ``.label`` or ``.bin`` and
-distinguishes the two encodings by their size: two bytes per point are the encoding of that tool, four are
-SemanticKITTI's packing (KITTI-360's semantic id in the lower 16 bits, instance above), which the writer uses. Only
-frames of annotated windows can have labels; all others are read without labels.
+The dataset publishes labels of accumulated clouds only. ``lidar-synth label kitti360`` recovers labels per scan from
+them (kitti360_labels.py), and so does github.com/JulesSanchez/recoverKITTI360label, which writes
+DRIVE/labels/FFFFFFFFFF.bin: int16 per point, KITTI-360's semantic id, -1 = none found. Under data_3d_semantics_scan,
+the reader accepts both and distinguishes the two encodings by their size: two bytes per point are the encoding of that
+tool, four are SemanticKITTI's packing (KITTI-360's semantic id in the lower 16 bits, instance above), which the writer
+uses. Only frames of annotated windows can have labels; all others are read without labels.
 
 The pose of a ``Scan`` is velodyne to world: pose calib_cam_to_pose[image_00] calib_cam_to_velo^-1.
 """
@@ -30,10 +31,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import KITTI360 as CLASSES
 from lidar_synth.datasets.recordings import KITTI360_SPLITS
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files.disk import (
-    list_files,
-    read_file,
-)
+from lidar_synth.files.disk import list_files, read_file, read_values
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES, WorldBoxes, read_boxes, write_boxes
 from lidar_synth.formats.kitti360_poses import CAMERA, read_calibration, read_poses, write_calibration, write_poses
@@ -57,6 +55,8 @@ class KITTI360(ScanFiles):
     Args:
         root: the folder that holds ``data_3d_raw``.
         split: the full name of a split, such as ``r2flow/train``, or ``all``.
+        labels: the folder with ``data_3d_semantics_scan``; then only scans that have labels there are read. By default
+            all scans are read, with labels where ``root`` has them.
         sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
             else ``hdl64e_kitti360``.
         on_bad: see ``ScanFiles``.
@@ -64,7 +64,7 @@ class KITTI360(ScanFiles):
     Raises:
         ConfigError: on an unknown split; ``train`` alone is unknown, because published works split the drives
             differently.
-        DataError: if the folder has none of the split's drives.
+        DataError: if the folder has none of the split's drives, or ``labels`` has none of its scans.
 
     Example:
         >>> from lidar_synth import KITTI360
@@ -83,24 +83,22 @@ class KITTI360(ScanFiles):
         root: str | Path,
         split: str = "all",
         *,
+        labels: str | Path | None = None,
         sensor: str | Path | Sensor | None = None,
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
-        wanted = choose(
-            "KITTI-360 split",
-            split,
-            SPLITS,
-            "Published works split the drives differently: give the full name of a split.",
-        )
-        existing = sorted(p.parent.parent.name for p in (root / "data_3d_raw").glob("*/velodyne_points/data"))
-        drives = [d for d in existing if wanted is None or d in wanted]
-        if not drives:
-            raise DataError(
-                f"{root} has no drive of split {split!r} (it has {', '.join(existing) or 'none at all'})",
-                "data_3d_raw/2013_05_28_drive_NNNN_sync/velodyne_points/data/*.bin",
-            )
+        drives = drives_of(root, split)
         ids = [f"{d}/{path.stem}" for d in drives for path in list_files(scans_folder(root, d), ".bin")]
+        self._labels = root if labels is None else Path(labels)
+        if labels is not None:
+            ids = [name for name in ids if label_file(self._labels, *name.split("/"))]
+            if not ids:
+                raise DataError(
+                    f"{labels} has no labels of scans of {root}",
+                    "data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label",
+                    f"lidar-synth label kitti360 {root} {labels} makes them from the accumulated clouds.",
+                )
         super().__init__(root, ids, sensor, on_bad)
         self._camera = read_calibration(root)
         self._poses = {d: read_poses(root, d, self._camera) for d in drives}
@@ -116,7 +114,7 @@ class KITTI360(ScanFiles):
             points[:, :3],
             points[:, 3],
             self.sensor,
-            **read_scan_labels(self.root, drive, frame, path, len(points)),
+            **read_scan_labels(self._labels, drive, frame, path, len(points)),
             boxes=self._scan_boxes(drive, int(frame), pose) if pose is not None else None,
             pose=pose,
             image_path=image if image.is_file() else None,
@@ -128,8 +126,8 @@ class KITTI360(ScanFiles):
 
     def _scan_boxes(self, drive: str, frame: int, pose: NDArray[np.float64]) -> Boxes | None:
         if drive not in self._boxes:
-            paths = sorted((self.root / "data_3d_bboxes").glob(f"*/{drive}.xml"))
-            self._boxes[drive] = read_boxes(paths[0]) if paths else None
+            path = boxes_path(self.root, drive)
+            self._boxes[drive] = None if path is None else read_boxes(path)
         boxes = self._boxes[drive]
         return None if boxes is None else boxes.at(frame, pose, self.sensor.range_max)
 
@@ -173,8 +171,7 @@ class KITTI360Writer(Writer):
         if picture is not None:
             write_image(image_path(self.root, drive, frame), picture)
         if scan.label is not None:
-            labels = self.root / "data_3d_semantics_scan" / drive / "labels" / f"{frame}.label"
-            write_labels(labels, _with_global_instances(encode_labels(scan, CLASSES), scan))
+            write_labels(labels_folder(self.root, drive) / f"{frame}.label", label_values(scan))
         self._write_points(path, scan)
 
     def finish(self) -> None:
@@ -193,8 +190,13 @@ class KITTI360Writer(Writer):
             clear_notes(folder)
 
 
-def _with_global_instances(labels: NDArray[np.uint32], scan: Scan) -> NDArray[np.uint32]:
-    """Convert instance numbers below 1000 to KITTI-360's id * 1000 + n, which labels and boxes use."""
+def label_values(scan: Scan) -> NDArray[np.uint32]:
+    """(N,) values of a scan's label file: KITTI-360's id, and above it id * 1000 + n, which labels and boxes use.
+
+    Raises:
+        DataError: on a train id or an instance that the file cannot hold.
+    """
+    labels = encode_labels(scan, CLASSES)
     if labels is scan.raw_label:
         return labels
     ids, instances = labels & 0xFFFF, labels >> 16
@@ -224,15 +226,54 @@ def image_path(root: Path, drive: str, frame: str) -> Path:
     return root / "data_2d_raw" / drive / "image_00" / "data_rect" / f"{frame}.png"
 
 
+def drives_of(root: Path, split: str) -> list[str]:
+    """The drives of a split that a folder has.
+
+    Raises:
+        ConfigError: on an unknown split.
+        DataError: if it has none of them.
+    """
+    hint = "Published works split the drives differently: give the full name of a split."
+    wanted = choose("KITTI-360 split", split, SPLITS, hint)
+    existing = sorted(p.parent.parent.name for p in (root / "data_3d_raw").glob("*/velodyne_points/data"))
+    drives = [d for d in existing if wanted is None or d in wanted]
+    if not drives:
+        raise DataError(
+            f"{root} has no drive of split {split!r} (it has {', '.join(existing) or 'none at all'})",
+            "data_3d_raw/2013_05_28_drive_NNNN_sync/velodyne_points/data/*.bin",
+        )
+    return drives
+
+
+def boxes_path(root: Path, drive: str) -> Path | None:
+    """The file with the boxes of a drive; None if there is none."""
+    return next(iter(sorted((root / "data_3d_bboxes").glob(f"*/{drive}.xml"))), None)
+
+
+def labels_folder(root: Path, drive: str) -> Path:
+    """The folder of a drive's labels per scan."""
+    return root / "data_3d_semantics_scan" / drive / "labels"
+
+
+def confidence_path(root: Path, drive: str, frame: str) -> Path:
+    """The file with the confidence of a scan's labels."""
+    return root / "data_3d_semantics_scan" / drive / "confidence" / f"{frame}.bin"
+
+
+def label_file(root: Path, drive: str, frame: str) -> Path | None:
+    """The label file of a scan; None if it has none."""
+    paths = (labels_folder(root, drive) / f"{frame}{suffix}" for suffix in (".label", ".bin"))
+    return next((path for path in paths if path.is_file()), None)
+
+
 def read_scan_labels(root: Path, drive: str, frame: str, points: Path, count: int) -> dict[str, Any]:
-    """``label``, ``raw_label`` and ``instance`` of a scan; empty if it has no label file.
+    """``label``, ``raw_label``, ``instance`` and, if known, ``confidence`` of a scan; empty if it has no label file.
 
     Raises:
         FileError: if its label file cannot be read.
         DataError: if the numbers of labels and points differ; on an id that KITTI-360 does not define.
     """
-    folder = root / "data_3d_semantics_scan" / drive / "labels"
-    path = next((p for p in (folder / f"{frame}.label", folder / f"{frame}.bin") if p.is_file()), None)
+    path = label_file(root, drive, frame)
     if path is None:
         return {}
     content = read_file(path)
@@ -243,4 +284,11 @@ def read_scan_labels(root: Path, drive: str, frame: str, points: Path, count: in
         raw = np.frombuffer(content, "<u4")
     else:
         raise mismatch(path, len(content) // 4, points, count)
-    return decode_labels(raw, CLASSES, f"{path} (labels of {points})")
+    found = decode_labels(raw, CLASSES, f"{path} (labels of {points})")
+    trust = confidence_path(root, drive, frame)
+    if trust.is_file():
+        values = read_values(trust, "u1")
+        if len(values) != count:
+            raise mismatch(trust, len(values), points, count)
+        found["confidence"] = values.astype(np.float32) / 255
+    return found

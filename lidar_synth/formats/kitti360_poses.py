@@ -9,6 +9,7 @@ Files (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
     data_poses/DRIVE/cam0_to_world.txt   a frame and 16 numbers per line: rectified camera 0 to world
 """
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ CAMERA = ideal_camera(552.554261, (1408, 376))
 IMU_FROM_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
 """The IMU has x forward, y right, z down; without calibration it is assumed to be at the sensor."""
 
+STILL = 0.5
+"""Maximum distance, metres, that the car moved between two poses for the frames between them to get poses, too."""
 
 SIZES = {"P_rect_00": 12, "R_rect_00": 9, "S_rect_00": 2, "image_00": 12, "cam_to_velo": 12}
 """Number of values of each matrix of the calibration."""
@@ -116,3 +119,65 @@ def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -
     folder = root / "data_poses" / drive
     write_file(folder / "poses.txt", "".join(imu).encode())
     write_file(folder / "cam0_to_world.txt", "".join(cam0).encode())
+
+
+def fill_poses(poses: dict[int, NDArray[np.float64]], frames: Iterable[int]) -> dict[int, NDArray[np.float64]]:
+    """Poses of further frames, between two known poses that are at most ``STILL`` apart.
+
+    The dataset leaves out frames in which the car hardly moved.
+
+    Args:
+        poses: {frame: (4, 4)} sensor to world.
+        frames: the frames that need a pose.
+
+    Returns:
+        The poses of those of ``frames`` that have one or can be filled.
+    """
+    known = np.array(sorted(poses), np.int64)
+    filled = {}
+    for frame in frames:
+        if frame in poses:
+            filled[frame] = poses[frame]
+            continue
+        after = int(np.searchsorted(known, frame))
+        if not 0 < after < len(known):
+            continue
+        first, last = int(known[after - 1]), int(known[after])
+        if np.linalg.norm(poses[last][:3, 3] - poses[first][:3, 3]) <= STILL:
+            share = (frame - first) / (last - first)
+            filled[frame] = poses[first if share < 0.5 else last].copy()
+            filled[frame][:3, 3] = (1 - share) * poses[first][:3, 3] + share * poses[last][:3, 3]
+    return filled
+
+
+def ego_motion(poses: Mapping[int, NDArray[np.float64]], frame: int) -> NDArray[np.float64]:
+    """(4, 4) the sensor of the frame before, in the frame of the sensor at ``frame``.
+
+    Without a pose of the frame before, the motion to the next frame is taken; without both, the car stood still.
+    """
+    if frame - 1 in poses:
+        return np.asarray(np.linalg.inv(poses[frame]) @ poses[frame - 1])
+    if frame + 1 in poses:
+        return np.asarray(np.linalg.inv(poses[frame + 1]) @ poses[frame])
+    return np.eye(4)
+
+
+def undo_ego_motion(points: NDArray[np.floating], motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points of one revolution as seen from the sensor's place at the moment of the pose.
+
+    The sensor turns clockwise once per frame and looks ahead at the moment of the pose, so a point at azimuth a
+    (counter-clockwise from ahead) was measured a / 2 pi of a frame earlier. This is the rule by which the dataset's own
+    tool (kitti360Scripts, accumuLaser) accumulated its clouds.
+
+    Args:
+        points: (N, 3) metres, as measured.
+        motion: (4, 4) from ``ego_motion``.
+    """
+    share = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi))[:, None].astype(np.float64)
+    skew = (motion[:3, :3] - motion[:3, :3].T) / 2
+    sine = np.sqrt((skew**2).sum() / 2)
+    moved: NDArray[np.float64] = points + share * motion[:3, 3]
+    if sine > 0:  # Rodrigues' formula
+        angle, turned = share * np.arcsin(min(sine, 1.0)), points @ (skew.T / sine)
+        moved += np.sin(angle) * turned + (1 - np.cos(angle)) * (turned @ (skew.T / sine))
+    return moved

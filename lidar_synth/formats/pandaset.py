@@ -55,8 +55,8 @@ class PandaSet(ScanFiles):
 
     Args:
         root: the folder of the sequences, or one sequence.
-        sensor: ``pandar64`` or ``pandar_gt``, the forward sensor; a YAML file or a ``Sensor`` describes a Pandar64
-            unless it is named ``pandar_gt``.
+        sensor: ``pandar64`` (the default) or ``pandar_gt``, the forward sensor; a YAML file or a ``Sensor`` describes a
+            Pandar64 unless it is named ``pandar_gt``.
         motion_compensated: whether all points are in the frame of the sensor at the scan's timestamp, as in KITTI's
             odometry; by default each is in the frame of the sensor at its own time, as it was measured.
         sequences: names of the sequences to read, such as ``("002",)``; all by default. PandaSet has no splits.
@@ -76,11 +76,13 @@ class PandaSet(ScanFiles):
         ['reflectance', 'label', 'raw_label', 'ring', 'time']
     """
 
+    default_sensor = "pandar64"
+
     def __init__(
         self,
         root: str | Path,
         *,
-        sensor: str | Path | Sensor = "pandar64",
+        sensor: str | Path | Sensor | None = None,
         motion_compensated: bool = False,
         sequences: Sequence[str] | None = None,
         camera: str = CAMERAS[0],

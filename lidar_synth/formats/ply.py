@@ -4,15 +4,18 @@ The package reads ``ascii`` and both binary byte orders and writes ``binary_litt
 compared with the file before any value is read.
 """
 
+import os
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import SKIP_HINT, read_file, read_start, write_file
+from lidar_synth.files.disk import SKIP_HINT, read_file, read_start, unreadable, write_file
 from lidar_synth.formats.cloud import (
     Field,
     check_fields,
@@ -60,11 +63,47 @@ def write_ply(path: Path, scan: Scan) -> None:
         FileError: if it cannot be written.
     """
     records = to_records(scan)
+    write_file(path, vertex_header(records, to_comments(scan)) + records.tobytes())
+
+
+def vertex_header(records: NDArray[np.void], comments: Iterable[str] = ()) -> bytes:
+    """The header of a binary file that holds only these records."""
     names = {kind: name for name, kind in reversed(TYPES.items())}
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in to_comments(scan))]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     lines += [f"element vertex {len(records)}"]
     lines += [f"property {names[records.dtype[n].str[1:]]} {n}" for n in records.dtype.names or ()]
-    write_file(path, "\n".join([*lines, "end_header\n"]).encode() + records.tobytes())
+    return "\n".join([*lines, "end_header\n"]).encode()
+
+
+def map_vertices(path: Path) -> NDArray[np.void]:
+    """All properties of the vertices of a large binary ``.ply`` file, mapped into memory instead of read.
+
+    Returns:
+        (N,) records, read-only; N may be 0.
+
+    Raises:
+        FileError: if it cannot be read.
+        DataError: if its header is invalid or does not match the file.
+    """
+    where = str(path)
+    try:
+        with path.open("rb") as file:
+            start = file.read(LONGEST_HEADER)
+            size = os.fstat(file.fileno()).st_size
+    except OSError as error:
+        raise unreadable(path, error, "a PLY file") from error
+    encoding, elements, offset = _parse(start, where)
+    if encoding == "ascii" or len(elements) != 1 or elements[0].lists:
+        raise DataError(f"{where} is not a list of binary points", "a binary PLY file with only the element vertex")
+    fields, count = elements[0].fields, elements[0].count
+    if size - offset != elements[0].size:
+        raise cut(where, size - offset, elements[0].size)
+    if len({f.name for f in fields}) < len(fields):
+        raise DataError(f"{where} has a property twice", "each property once", SKIP_HINT)
+    kind = np.dtype([(f.name, f.type) for f in fields])
+    if count == 0:
+        return np.zeros(0, kind)
+    return np.memmap(path, kind, "r", offset, count)
 
 
 def read_ply(path: Path) -> dict[str, NDArray[Any]]:
@@ -75,15 +114,12 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
         DataError: if its header is invalid or does not match the file, or it holds no points.
     """
     content, where = read_file(path), str(path)
-    end = re.search(rb"^end_header\r?\n", content[:LONGEST_HEADER], re.M)
-    if not content.startswith(b"ply") or end is None:
-        raise DataError(f"{where} has no header of a .ply file", "a PLY file", SKIP_HINT)
-    encoding, elements = _header(content[: end.start()].decode("latin-1"), where)
+    encoding, elements, offset = _parse(content[:LONGEST_HEADER], where)
     [(position, vertex)] = [(i, e) for i, e in enumerate(elements) if e.name == "vertex"]
     if vertex.lists or (encoding != "ascii" and any(e.lists for e in elements[:position])):
         raise DataError(f"{where} has lists in its points or before them", "the element vertex first, without lists")
     check_fields(vertex.fields, vertex.count, where)
-    body = content[end.end() :]
+    body = content[offset:]
     if encoding == "ascii":
         lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
         if len(lines) != (wanted := sum(e.count for e in elements)):
@@ -105,6 +141,14 @@ def read_ply_description(path: Path) -> Description | None:
     """
     lines = read_start(path, LONGEST_HEADER).split("\nend_header", 1)[0].splitlines()
     return from_comments((line.removeprefix("comment") for line in lines if line.startswith("comment")), str(path))
+
+
+def _parse(start: bytes, where: str) -> tuple[str, list[Element], int]:
+    """Encoding, elements, and length of the header in the first bytes of a file."""
+    end = re.search(rb"^end_header\r?\n", start, re.M)
+    if not start.startswith(b"ply") or end is None:
+        raise DataError(f"{where} has no header of a .ply file", "a PLY file", SKIP_HINT)
+    return *_header(start[: end.start()].decode("latin-1"), where), end.end()
 
 
 def _header(text: str, where: str) -> tuple[str, list[Element]]:

@@ -214,6 +214,7 @@ def made_up(sensor: Sensor, fields: frozenset[str]) -> Scan:
         "instance": np.zeros(sensor.shape, np.int32),
         "ring": np.broadcast_to(np.arange(rows, dtype=np.int16)[:, None], sensor.shape),
         "confidence": (label != IGNORE).astype(np.float32),
+        "time": np.zeros(sensor.shape, np.float32),
     }
     image = RangeImage(
         np.ascontiguousarray(np.broadcast_to(distance, (rows, columns))),

@@ -9,7 +9,7 @@ from lidar_synth.town.furniture import StaticObject
 from lidar_synth.town.materials import Finish
 from lidar_synth.town.scene import Scene
 
-KINDS = ("hedge", "hedge", "thicket", "thicket", "wall", "bars", "boards", "wire", "wallhedge", "none", "none")
+KINDS = ("hedge", "hedge", "thicket", "thicket", "wall", "bars", "boards", "wire", "wallhedge", "none", "none", "none")
 """Kinds of boundary; a kind that is listed twice is twice as frequent."""
 
 

@@ -16,6 +16,7 @@ from lidar_synth.formats.kitti360 import KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.formats.writer import Writer, claim
+from lidar_synth.town.accumulate import check_accumulation, window_paths, windows_of, write_window
 from lidar_synth.town.town import Town
 from lidar_synth.town.world import STRETCH_FRAMES
 
@@ -50,6 +51,7 @@ def export_town(
     *,
     sequence: int | None = None,
     camera: bool = True,
+    accumulate: bool = False,
     jobs: int = 1,
     progress: bool = True,
 ) -> tuple[int, int]:
@@ -61,6 +63,7 @@ def export_town(
         layout: one of ``LAYOUTS``.
         sequence: number of the drive or sequence to write, 0 to 99; ``SEQUENCES`` by default.
         camera: whether to render and write the camera image of each scan.
+        accumulate: whether to write accumulated clouds beside the scans of layout ``kitti360``, see accumulate.py.
         jobs: number of worker processes, at least 1.
         progress: whether to show a progress bar.
 
@@ -68,8 +71,8 @@ def export_town(
         The number of scans written by this call, and the number of scans that already existed.
 
     Raises:
-        ConfigError: on an unknown layout, a sequence or number of jobs out of range, or a folder that holds another
-            town.
+        ConfigError: on an unknown layout, a sequence or number of jobs out of range, clouds of another layout or of
+            too many scans, or a folder that holds another town.
         FileError: if the output cannot be written.
     """
     if layout not in LAYOUTS or jobs < 1:
@@ -77,6 +80,8 @@ def export_town(
     number = SEQUENCES.get(layout, 0) if sequence is None else sequence
     if not 0 <= number < 100:
         raise ConfigError(f"sequence {number}", "0 to 99")
+    if accumulate:
+        check_accumulation(town, layout)
     _claim_folder(Path(out), town, layout, number, camera)
     writer = LAYOUTS[layout](out, calibration=town.calibration)
     names = [f"{number:02d}/{i:06d}" if layout in SEQUENCES else None for i in range(len(town))]
@@ -92,6 +97,8 @@ def export_town(
     if layout == "semantic_kitti" and len(town):
         times = "".join(f"{town.interval * i:e}\n" for i in range(len(town)))
         write_file(Path(out) / "sequences" / f"{number:02d}" / "times.txt", times.encode())
+    if accumulate:
+        _write_windows(town, Path(out), f"2013_05_28_drive_{number:04d}_sync", jobs, progress)
     return len(missing), len(town) - len(missing)
 
 
@@ -125,3 +132,11 @@ def _write_group(town: Town, writer: Writer, names: list[str | None], camera: bo
     for i in indices:
         writer.write(town[i], i, name=names[i], image=town.image(i) if camera else None)
     return len(indices)
+
+
+def _write_windows(town: Town, out: Path, drive: str, jobs: int, progress: bool) -> None:
+    missing = [w for w in windows_of(town) if not window_paths(out, drive, w)[0].is_file()]
+    work = partial(write_window, town, out, drive)
+    with in_processes(work, missing, jobs) as done:
+        for _ in tqdm(done, total=len(missing), unit="window", disable=not progress):
+            pass

@@ -66,14 +66,14 @@ MATERIALS: dict[str, Material] = {
         0.31, 0.05, gloss=0.15, dropout=0.01, colour=(0.25, 0.25, 0.26), grain=0.03, colour_dependent=True
     ),
     "metal": Material(
-        0.34, 0.08, gloss=0.45, dropout=0.04, colour=(0.52, 0.54, 0.55), grain=0.05, colour_dependent=True
+        0.42, 0.08, gloss=0.45, dropout=0.04, colour=(0.52, 0.54, 0.55), grain=0.05, colour_dependent=True
     ),
     "wire": Material(0.3, 0.08, transmission=0.8, roughness=0.003, colour=(0.35, 0.42, 0.36)),
     "paint": Material(0.52, 0.05, gloss=0.75, dropout=0.015, colour=(0.6, 0.6, 0.62), grain=0.0, colour_dependent=True),
     "glass": Material(0.22, 0.05, gloss=0.6, transmission=0.45, dropout=0.5, colour=(0.1, 0.12, 0.14), grain=0.0),
     "carglass": Material(0.15, 0.03, gloss=0.9, transmission=0.1, dropout=0.9, colour=(0.06, 0.07, 0.08), grain=0.0),
-    "tyre": Material(0.21, 0.03, gloss=0.1, dropout=0.08, roughness=0.002, colour=(0.06, 0.06, 0.065)),
-    "interior": Material(0.25, 0.04, gloss=0.1, dropout=0.2, roughness=0.003, colour=(0.11, 0.1, 0.1)),
+    "tyre": Material(0.21, 0.03, gloss=0.1, dropout=0.08, colour=(0.06, 0.06, 0.065)),
+    "interior": Material(0.25, 0.04, gloss=0.1, dropout=0.2, colour=(0.11, 0.1, 0.1)),
     "curtain": Material(0.4, 0.05, roughness=0.002, colour=(0.78, 0.76, 0.72)),
     "plate": Material(0.9, 0.1, colour=(0.85, 0.85, 0.82), grain=0.0),
     "sign": Material(0.8, 0.15, colour=(0.8, 0.8, 0.8), grain=0.0),
@@ -91,9 +91,7 @@ MATERIALS: dict[str, Material] = {
     ),
     "foliage": Material(0.355, 0.085, roughness=0.08, relief=0.4, grazing=1.0, colour=(0.12, 0.21, 0.07), grain=0.6),
     "bark": Material(0.39, 0.08, roughness=0.003, colour=(0.33, 0.27, 0.21), grain=0.45),
-    "cloth": Material(
-        0.4, 0.06, dropout=0.01, roughness=0.004, colour=(0.3, 0.3, 0.4), grain=0.12, colour_dependent=True
-    ),
+    "cloth": Material(0.4, 0.06, dropout=0.01, colour=(0.3, 0.3, 0.4), grain=0.12, colour_dependent=True),
     "skin": Material(0.4, 0.05, colour=(0.78, 0.58, 0.47), grain=0.05),
 }
 """The materials by name."""

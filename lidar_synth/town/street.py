@@ -135,7 +135,7 @@ def _crossings(kind: str, length: float, ends: tuple[float, float], rng: np.rand
 def _residential(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
     """Sampled bands, kerbs, parking and lanes of a residential street."""
     parking = [str(rng.choice(["none", "street", "bay", "kerb"], p=[0.34, 0.30, 0.18, 0.18])) for _ in range(2)]
-    lane = rng.uniform(2.5, 3.0)
+    lane = rng.uniform(2.7, 3.5)
     edge = [lane + (2.0 if p == "street" else 0.0) for p in parking]
     bands = []
     for p in parking:
@@ -149,7 +149,7 @@ def _residential(rng: np.random.Generator) -> tuple[list[list[Band]], list[float
 def _main(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane], float]:
     """Sampled bands, kerbs, parking, lanes and median of a main road."""
     each = int(rng.choice([1, 2], p=[0.6, 0.4]))
-    width = rng.uniform(3.1, 3.6)
+    width = rng.uniform(3.2, 3.9)
     median = float(rng.choice([0.0, rng.uniform(1.0, 3.6)], p=[0.6, 0.4]))
     lanes = [Lane(-(median + width * (i + 0.5)), 1) for i in range(each)]
     lanes += [Lane(median + width * (i + 0.5), -1) for i in range(each)]
@@ -170,7 +170,7 @@ def _main(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list
 
 def _edge(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
     """Sampled bands, kerbs, parking and lanes of a road at the edge of town."""
-    width = rng.uniform(2.9, 3.6)
+    width = rng.uniform(3.1, 4.4)
     bands = []
     for _ in range(2):
         side = [Band("soil", rng.uniform(0.5, 1.2)), Band("grass", rng.uniform(1.5, 5))]

@@ -41,6 +41,8 @@ class Town:
         scans: number of scans.
         interval: seconds between neighbouring scans of a stretch, 0 < interval < 60.
         noise: the measurement noise of the sensor; by default ``Noise()``.
+        motion: whether the vehicle moves while the sensor turns. The points are motion compensated, as SemanticKITTI's:
+            in the frame of the scan's pose, each cast from where the sensor was. Other objects stand still.
 
     Raises:
         ConfigError: on a negative seed or number of scans, an interval out of range, or an unknown sensor.
@@ -63,6 +65,7 @@ class Town:
         scans: int = 1000,
         interval: float = 0.4,
         noise: Noise | None = None,
+        motion: bool = True,
     ) -> None:
         if seed < 0 or scans < 0 or not 0 < interval < 60:
             raise ConfigError(
@@ -70,7 +73,7 @@ class Town:
                 "seed >= 0, scans >= 0 and 0 < interval < 60 s",
             )
         self.seed, self.sensor, self.interval = seed, load_sensor(sensor), interval
-        self._scans, self._noise = scans, noise or Noise()
+        self._scans, self._noise, self._motion = scans, noise or Noise(), motion
         self._worlds: OrderedDict[int, World] = OrderedDict()
         elevation, height = optics(self.sensor)
         # The order in which the sensor writes points: ring by ring from the top, counter-clockwise from straight ahead.
@@ -88,7 +91,7 @@ class Town:
         self._gains = laser_gains(self.sensor, self._noise)
 
     def __reduce__(self) -> tuple[type["Town"], tuple[object, ...]]:
-        return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise)
+        return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise, self._motion)
 
     @property
     def calibration(self) -> Calibration:
@@ -164,6 +167,8 @@ class Town:
 
     def _travelled(self, index: int) -> NDArray[np.float32]:
         """(3,) metres that the ego vehicle drives during the revolution of a scan, in the world frame."""
+        if not self._motion:
+            return np.zeros(3, np.float32)
         world, time = self.world(index), index % STRETCH_FRAMES * self.interval
         still = np.zeros(2)
         ends = [ego_pose(world.street, world.scene, time + t, HEIGHT, still) for t in (-REVOLUTION / 2, REVOLUTION / 2)]

@@ -1,0 +1,379 @@
+"""Labels of KITTI-360's scans, recovered from accumulated clouds of the town, whose labels are known."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lidar_synth import KITTI360, MixedScans
+from lidar_synth.cli import app
+from lidar_synth.errors import ConfigError, DataError, LidarSynthError
+from lidar_synth.formats.kitti360 import boxes_path, confidence_path, label_file, labels_folder, scans_folder
+from lidar_synth.formats.kitti360_accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
+from lidar_synth.formats.kitti360_boxes import WorldBoxes, read_boxes
+from lidar_synth.formats.kitti360_labels import label_scans, plan_labels
+from lidar_synth.formats.kitti360_movers import Movers
+from lidar_synth.formats.kitti360_poses import (
+    ego_motion,
+    fill_poses,
+    read_calibration,
+    read_poses,
+    undo_ego_motion,
+)
+from lidar_synth.formats.label_report import LabelReport
+from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.town import Town, export_town
+from lidar_synth.town.accumulate import MOST, STEP, windows_of
+
+DRIVE = "2013_05_28_drive_0004_sync"
+SCANS = 20
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("embreex")
+    out = tmp_path_factory.mktemp("k360") / "town"
+    sensor = replace(load_sensor("hdl64e_kitti360"), name="coarse", columns=512)
+    export_town(Town(3, sensor, SCANS), out, "kitti360", camera=False, accumulate=True, progress=False)
+    return out
+
+
+@pytest.fixture(scope="module")
+def labelled(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LabelReport]:
+    out = tmp_path_factory.mktemp("labels")
+    return out, label_scans(root, out, against=root, progress=False)
+
+
+@pytest.fixture
+def copy(root: Path, tmp_path: Path) -> Path:
+    """A copy of the dataset, without labels per scan, that a test may change; its scans are links."""
+    out = tmp_path / "town"
+    shutil.copytree(root / "data_3d_raw", out / "data_3d_raw", copy_function=os.link)
+    for name in ("data_poses", "calibration", "data_3d_bboxes", "data_3d_semantics"):
+        shutil.copytree(root / name, out / name)
+    return out
+
+
+def shares(report: LabelReport, part: int) -> NDArray[np.float64]:
+    """Share covered, share right of these, and the same of moving cars, in frames of one remainder by ``STEP``."""
+    rows = [c for name, c in report.compared.items() if int(name[-10:]) % STEP == part]
+    known, covered, right, cars, seen, good = np.sum(rows, axis=0)
+    assert len(rows) == SCANS / STEP and cars > 100
+    return np.array([covered / known, right / covered, seen / cars, good / seen])
+
+
+@pytest.mark.parametrize("part", range(STEP), ids=["accumulated", "not accumulated"])
+def test_labels_of_the_town_are_recovered(labelled: tuple[Path, LabelReport], part: int) -> None:
+    covered, right, cars_covered, cars_right = shares(labelled[1], part)
+    assert covered > 0.9 and right > 0.97
+    assert cars_covered > 0.9 and cars_right > 0.9 and cars_covered * cars_right > 0.9
+
+
+def test_confidence_tells_wrong_labels_from_right_ones(root: Path, labelled: tuple[Path, LabelReport]) -> None:
+    confidence, right = [], []
+    for truth, scan in zip(KITTI360(root), KITTI360(root, labels=labelled[0]), strict=True):
+        assert scan.confidence is not None and scan.label is not None and truth.label is not None
+        known = (scan.label != 255) & (truth.label != 255)
+        confidence.append(scan.confidence[known])
+        right.append((scan.label == truth.label)[known])
+        assert not scan.confidence[scan.raw_label == 0].any()
+    sure = np.concatenate(confidence) > 0.8
+    assert np.concatenate(right)[sure].mean() > max(0.99, np.concatenate(right)[~sure].mean() + 0.03)
+
+
+def test_a_segmenter_gets_only_scans_with_labels(root: Path, labelled: tuple[Path, LabelReport]) -> None:
+    label_file(labelled[0], DRIVE, f"{5:010d}").rename(labelled[0] / "kept")  # type: ignore[union-attr]
+    scans = KITTI360(root, labels=labelled[0])
+    (labelled[0] / "kept").rename(labels_folder(labelled[0], DRIVE) / f"{5:010d}.label")
+    assert len(scans) == SCANS - 1 and f"{DRIVE}/{5:010d}" not in scans.ids
+    assert all(scan.label is not None for scan in scans)
+    assert MixedScans(scans, ratio=0)[0]["label"].max() < 256
+    with pytest.raises(DataError, match="lidar-synth label kitti360"):
+        KITTI360(root, labels=root / "calibration")
+
+
+@pytest.mark.slow
+def test_a_rerun_repeats_only_what_is_missing_or_changed(copy: Path, tmp_path: Path) -> None:
+    out = tmp_path / "labels"
+    first = label_scans(copy, out, progress=False)
+    assert first.kept == 0 and first.labelled == {DRIVE: SCANS}
+    content = {p: p.read_bytes() for p in sorted(out.rglob("*.label"))}
+    label_file(out, DRIVE, f"{0:010d}").unlink()  # type: ignore[union-attr]
+    again = label_scans(copy, out, jobs=2, progress=False)
+    assert again.kept == 1 and again.to_dict() == first.to_dict()
+    assert {p: p.read_bytes() for p in sorted(out.rglob("*.label"))} == content
+    poses = copy / "data_poses" / DRIVE / "poses.txt"
+    poses.write_text(poses.read_text() + "\n")
+    assert label_scans(copy, out, progress=False).kept == 0
+    _beside(copy)
+    with pytest.raises(DataError, match="do not lie on"):
+        label_scans(copy, out, progress=False)
+    assert len(list(out.rglob("*.label"))) <= SCANS // 4  # no labels of the run before
+
+
+def _turned(copy: Path) -> None:
+    _change_poses(
+        copy, lambda frame, pose: pose @ np.array([(0.9, -0.43589, 0, 0), (0.43589, 0.9, 0, 0), *np.eye(4)[2:]])
+    )
+
+
+def _beside(copy: Path) -> None:
+    _change_poses(copy, lambda frame, pose: pose + np.array([[0, 0, 0, 1.5]] * 2 + [[0] * 4] * 2))
+
+
+def _elsewhere(copy: Path) -> None:
+    _change_poses(copy, lambda frame, pose: pose + np.array([[0, 0, 0, 700.0]] * 2 + [[0] * 4] * 2))
+
+
+def _torn(copy: Path) -> None:
+    _change_poses(copy, lambda frame, pose: pose + np.array([[0, 0, 0, 1e5 * (frame % 2)], *[[0] * 4] * 3]))
+
+
+def _change_poses(copy: Path, change: Callable[[int, NDArray[np.float64]], NDArray[np.float64]]) -> None:
+    path = copy / "data_poses" / DRIVE / "poses.txt"
+    lines = np.loadtxt(path)
+    for line in lines:
+        pose = np.vstack([line[1:].reshape(3, 4), (0, 0, 0, 1)])
+        line[1:] = change(int(line[0]), pose)[:3].ravel()
+    np.savetxt(path, lines)
+
+
+@pytest.mark.parametrize("change", [_turned, _beside, _elsewhere, _torn], ids=lambda f: f.__name__.strip("_"))
+def test_wrong_poses_are_an_error_and_write_no_labels(
+    copy: Path, tmp_path: Path, change: Callable[[Path], None]
+) -> None:
+    change(copy)
+    with pytest.raises(DataError, match="do not lie on its accumulated clouds|spread over"):
+        label_scans(copy, tmp_path / "labels", progress=False)
+    assert len(list((tmp_path / "labels").rglob("*.label"))) <= SCANS // 4
+
+
+def test_frames_without_window_or_pose_are_counted(copy: Path, tmp_path: Path) -> None:
+    first, _ = find_windows(copy, DRIVE)
+    first.static.unlink()  # frames 0 to 7 are in no other window
+    poses = copy / "data_poses" / DRIVE / "poses.txt"
+    poses.write_text("".join(line for line in poses.open() if int(line.split()[0]) not in (12, 13)))
+    plan = plan_labels(copy)
+    assert plan.outside == {DRIVE: 8} and plan.without_pose == {DRIVE: 2} and plan.frames == SCANS - 10
+    report = label_scans(copy, tmp_path, progress=False)
+    assert report.labelled == {DRIVE: SCANS - 10}
+    assert {int(p.stem) for p in tmp_path.rglob("*.label")} == {*range(8, SCANS)} - {12, 13}
+
+
+def test_moving_cars_without_accumulated_points_get_the_class_of_their_boxes(
+    root: Path, copy: Path, tmp_path: Path
+) -> None:
+    for window in find_windows(copy, DRIVE):
+        assert window.dynamic is not None
+        window.dynamic.unlink()
+    report = label_scans(copy, tmp_path, against=root, progress=False)
+    for part in range(STEP):
+        *_, cars_covered, cars_right = shares(report, part)
+        assert cars_covered > 0.6 and cars_right > 0.9
+
+
+def test_empty_dynamic_clouds_are_read_as_in_the_dataset(copy: Path) -> None:
+    window = find_windows(copy, DRIVE)[0]
+    assert window.dynamic is not None
+    write_cloud(window.dynamic, {name: np.zeros(0) for name in PROPERTIES})
+    assert len(read_cloud(window.dynamic)) == 0 and window.dynamic.stat().st_size < 400
+
+
+def _skewed(points: NDArray[np.float32], motion: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Points as a sensor measures them that moves while it turns: the inverse of ``undo_ego_motion``."""
+    raw = points.astype(np.float64)
+    for _ in range(20):
+        raw -= undo_ego_motion(raw, motion) - points
+    return raw.astype(np.float32)
+
+
+def test_scans_measured_while_driving_are_recognised_and_labelled(root: Path, copy: Path, tmp_path: Path) -> None:
+    poses = read_poses(root, DRIVE, read_calibration(root))
+    for frame in range(SCANS):
+        path = scans_folder(copy, DRIVE) / f"{frame:010d}.bin"
+        scan = np.fromfile(path, np.float32).reshape(-1, 4)
+        scan[:, :3] = _skewed(scan[:, :3], ego_motion(poses, frame))
+        path.unlink()  # a link to the original
+        scan.tofile(path)
+    report = label_scans(copy, tmp_path, against=root, progress=False)
+    records = [json.loads(p.read_text()) for p in (tmp_path / "data_3d_semantics_scan" / DRIVE / "windows").iterdir()]
+    assert all(record["turns"] for record in records)
+    for part in range(STEP):
+        covered, right, *_ = shares(report, part)
+        assert covered > 0.9 and right > 0.97
+
+
+def test_undoing_the_motion_of_the_sensor_is_exact_at_the_pose_and_half_a_turn_away() -> None:
+    angle = np.radians(4)
+    motion = np.eye(4)
+    motion[:2, :2] = [(np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))]
+    motion[:3, 3] = -1, 0.1, 0
+    ahead, behind = np.array([(10.0, 0, 1)]), np.array([(-10.0, 1e-9, 1)])
+    assert np.allclose(undo_ego_motion(ahead, motion), ahead)
+    half = np.array([(np.cos(angle / 2), -np.sin(angle / 2), 0), (np.sin(angle / 2), np.cos(angle / 2), 0), (0, 0, 1)])
+    assert np.allclose(undo_ego_motion(behind, motion), behind @ half.T + motion[:3, 3] / 2)
+    assert np.array_equal(undo_ego_motion(behind, np.eye(4)), behind)
+
+
+def test_poses_are_filled_only_where_the_car_stood() -> None:
+    poses = {f: np.eye(4) for f in (0, 10, 20)}
+    poses[10][0, 3], poses[20][0, 3] = 0.4, 12.0
+    filled = fill_poses(poses, range(-1, 22))
+    assert set(filled) == {*range(11), 20}
+    assert filled[5][0, 3] == pytest.approx(0.2)
+
+
+def _moving_box(frames: range, speed: float, instance: int = 26001, start: float = 0.0) -> WorldBoxes:
+    transforms = np.tile(np.diag([4.0, 2.0, 1.5, 1.0]), (len(frames), 1, 1))
+    transforms[:, 0, 3] = start + speed * np.array(frames)
+    windows = np.repeat(np.array(frames)[:, None], 2, axis=1)
+    return WorldBoxes(transforms, np.array(["Car"] * len(frames)), np.full(len(frames), instance, np.int32), windows)
+
+
+def _dynamic(points: list[tuple[float, float, float, int]], path: Path) -> NDArray[np.void]:
+    x, y, z, frame = np.array(points).T
+    values = {"x": x, "y": y, "z": z, "timestamp": frame, "semantic": np.full(len(x), 26)}
+    write_cloud(path, values | {"instance": np.full(len(x), 26001), "confidence": np.ones(len(x))})
+    return read_cloud(path)
+
+
+def test_points_of_a_moving_object_follow_its_box(tmp_path: Path) -> None:
+    cloud = _dynamic([(0.5, 0, 0, 0), (4.5, 0.9, 0, 2), (50, 0, 0, 3)], tmp_path / "dynamic" / "a.ply")
+    movers = Movers([cloud], _moving_box(range(5), 2.0), range(5))
+    points, values = movers.at(1)  # no point was measured in this frame
+    assert np.allclose(sorted(points.tolist()), [(2.5, 0, 0), (2.5, 0.9, 0)], atol=1e-5)
+    assert set(values.tolist()) == {26 | 26001 << 16}
+    assert len(movers.at(3)[0]) == 3 and len(movers.at(9)[0]) == 0  # the point in no box, only in its own frame
+
+
+def test_a_box_that_stands_still_is_no_moving_object_unless_it_has_moving_points(tmp_path: Path) -> None:
+    still = _moving_box(range(5), 0.0)
+    assert not Movers([], still, range(5)).tracks
+    cloud = _dynamic([(0.5, 0, 0, 0)], tmp_path / "dynamic" / "a.ply")
+    assert len(Movers([cloud], still, range(5)).tracks) == 1
+
+
+def test_an_instance_number_that_is_used_again_is_another_object() -> None:
+    one, other = _moving_box(range(5), 2.0), _moving_box(range(5, 9), 2.0, start=1000.0)
+    both = WorldBoxes(*(np.concatenate([getattr(one, n), getattr(other, n)]) for n in vars(one)))
+    assert len(Movers([], both, range(9)).tracks) == 2
+
+
+def _truncated(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def _without_confidence(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"float confidence", b"float visibility"))
+
+
+def _unknown_class(path: Path) -> None:
+    values = {n: np.array(read_cloud(path)[n]) for n in read_cloud(path).dtype.names or ()}
+    values["semantic"][5] = 99
+    write_cloud(path, values)
+
+
+def _huge_instance(path: Path) -> None:
+    values = {n: np.array(read_cloud(path)[n]) for n in read_cloud(path).dtype.names or ()}
+    values["instance"][5] = 1 << 20
+    write_cloud(path, values)
+
+
+def _text(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"binary_little_endian", b"ascii"))
+
+
+def _twice(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"uchar red", b"uchar blue"))
+
+
+def _many(path: Path) -> None:
+    head, mark, rest = path.read_bytes().partition(b"element vertex ")
+    path.write_bytes(head + mark + b"9" + rest)
+
+
+def _misnamed(path: Path) -> None:
+    path.rename(path.with_name("9_2.ply"))
+
+
+DAMAGES = [_truncated, _without_confidence, _unknown_class, _huge_instance, _text, _twice, _many, _misnamed]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda f: f.__name__.strip("_"))
+def test_a_damaged_cloud_is_named(copy: Path, tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    damage(find_windows(copy, DRIVE)[0].static)
+    with pytest.raises(DataError, match=r"static/.*\.ply"):
+        label_scans(copy, tmp_path / "labels", progress=False)
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [("data_3d_semantics", "Accumulated Point Clouds"), ("data_poses", "poses.txt"), ("calibration", "calibration/")],
+)
+def test_a_missing_part_of_the_dataset_is_named(copy: Path, tmp_path: Path, missing: str, message: str) -> None:
+    shutil.rmtree(copy / missing)
+    with pytest.raises(DataError, match=message):
+        label_scans(copy, tmp_path / "labels", progress=False)
+
+
+def test_labels_from_elsewhere_are_not_overwritten(root: Path) -> None:
+    with pytest.raises(ConfigError, match="from elsewhere"):
+        label_scans(root, root, progress=False)
+
+
+def test_confidence_of_another_scan_is_refused(root: Path, labelled: tuple[Path, LabelReport], tmp_path: Path) -> None:
+    shutil.copytree(labelled[0], tmp_path / "labels")
+    path = confidence_path(tmp_path / "labels", DRIVE, f"{3:010d}")
+    path.write_bytes(path.read_bytes()[1:])
+    scans = KITTI360(root, labels=tmp_path / "labels")
+    assert scans[2].confidence is not None
+    with pytest.raises(DataError, match="confidence"):
+        scans[3]
+
+
+def test_windows_overlap_and_stay_in_their_stretch() -> None:
+    assert windows_of(Town(0, scans=45)) == [(0, 11), (8, 19), (20, 31), (28, 39), (40, 44)]
+
+
+def test_clouds_hold_every_second_frame_within_reach(root: Path) -> None:
+    boxes = boxes_path(root, DRIVE)
+    assert boxes is not None and len(read_boxes(boxes).instances)
+    for window in find_windows(root, DRIVE):
+        assert window.dynamic is not None
+        moving = read_cloud(window.dynamic)
+        assert set(moving["timestamp"].tolist()) <= set(range(window.first, window.last + 1, STEP))
+        static = read_cloud(window.static)
+        points = np.column_stack([static[axis] for axis in "xyz"])
+        assert len(np.unique(np.floor(points / 0.02), axis=0)) > 0.98 * len(points) > 10_000
+        assert set(np.unique(static["instance"] // 1000)) <= set(np.unique(static["semantic"])) | {0}
+
+
+@pytest.mark.parametrize(("layout", "scans"), [("semantic_kitti", 5), ("kitti360", MOST + 1)])
+def test_what_cannot_be_accumulated_is_refused(layout: str, scans: int, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="accumulated"):
+        export_town(Town(0, scans=scans), tmp_path, layout, accumulate=True)
+
+
+def test_the_command_prints_a_report(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(["label", "kitti360", str(root), str(tmp_path), "--dry-run"])
+    assert f"{SCANS} scans in 2 windows" in capsys.readouterr().out and not list(tmp_path.iterdir())
+    run(["label", "kitti360", str(root), str(tmp_path), "--against", str(root)])
+    text = capsys.readouterr().out
+    assert f"{SCANS} scans labelled" in text and "right" in text and "building" in text
+    run(["label", "kitti360", str(root), str(tmp_path), "--against", str(root), "--json"])
+    report = json.loads(capsys.readouterr().out)
+    stored = json.loads((tmp_path / "data_3d_semantics_scan" / "report.json").read_text())
+    assert report == stored and report["shares"]["right"] > 0.97 and report["frames"]["labelled"] == {DRIVE: SCANS}
+    with pytest.raises(LidarSynthError):
+        run(["label", "kitti", str(root), str(tmp_path)])
+
+
+def run(words: list[str]) -> None:
+    """Run a command of ``lidar-synth`` in this process."""
+    app(words, standalone_mode=False)
