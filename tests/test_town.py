@@ -57,11 +57,11 @@ def as_bytes(scan: Scan) -> list[bytes]:
 @pytest.mark.slow
 def test_a_scan_is_the_same_in_any_order_and_process(scans: dict[int, Scan]) -> None:
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        elsewhere = pool.submit(fingerprint, 444)
+        elsewhere = pool.submit(fingerprint, 164)
         backwards = Town(seed=0, scans=500)
         for index in (26, 5, 4):
             assert as_bytes(backwards[index]) == as_bytes(scans[index])
-        assert elsewhere.result() == as_bytes(scans[444])
+        assert elsewhere.result() == as_bytes(scans[164])
 
 
 @pytest.mark.slow
@@ -145,7 +145,7 @@ def test_reflectance_is_quantised_and_differs_between_materials(scans: dict[int,
     raw = np.concatenate([s.raw_label & 0xFFFF for s in scans.values()])
     near = np.concatenate([np.linalg.norm(s.points, axis=1) for s in scans.values()]) < 25
     mean = {c: reflectance[(raw == c) & near].mean() for c in (40, 60, 81, 50)}
-    assert mean[40] < mean[60] and mean[40] < mean[81]
+    assert mean[40] < min(mean[60], mean[81])
     assert MATERIALS["asphalt"].reflectance < MATERIALS["render"].reflectance < MATERIALS["plate"].reflectance
 
 
@@ -268,10 +268,8 @@ def test_neighbouring_scans_overlap_when_accumulated_by_pose(scans: dict[int, Sc
     # With the pose of the other scan the same clouds do not match, so the test depends on the poses.
     without_motion = tree.query(cloud(5, first.pose), distance_upper_bound=3)[0]
     heights = [np.abs(q[:, 2]).mean() for q in (cloud(4), cloud(5))]
-    assert (
-        np.mean(np.minimum(without_motion, 3)) > np.mean(np.minimum(distance_to_first, 3))
-        and abs(heights[0] - heights[1]) < 1
-    )
+    assert np.mean(np.minimum(without_motion, 3)) > np.mean(np.minimum(distance_to_first, 3))
+    assert abs(heights[0] - heights[1]) < 1
 
 
 def test_stretches_are_far_apart_in_the_world(scans: dict[int, Scan]) -> None:
