@@ -83,18 +83,27 @@ def gather(scans: Sequence[Scan]) -> Cloud:
 def turn_fraction(points: NDArray[np.float32]) -> Floats:
     """(N,) fraction of the turn at which each point was measured, about -0.5 to 0.5.
 
-    If the azimuth follows the order of the points around one turn, the turn starts where the file does; otherwise
-    behind the sensor.
+    The turn starts where the file does, if its points are in the order of time; otherwise behind the sensor.
     """
-    azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / (2 * np.pi)
-    if not len(azimuth):
-        return azimuth
-    step = np.diff(azimuth, prepend=azimuth[0])
-    unwrapped = np.cumsum(step - np.round(step))
-    extent = abs(unwrapped[-1])
-    if ONE_TURN[0] < extent < ONE_TURN[1] and np.ptp(unwrapped) < ONE_TURN[1]:
+    if in_order_of_time(points):
+        unwrapped = _unwrapped(points)
         return np.asarray(unwrapped - unwrapped.mean())
-    return azimuth
+    return np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / (2 * np.pi)
+
+
+def in_order_of_time(points: NDArray[np.float32]) -> bool:
+    """Whether the azimuth follows the order of the points around one turn."""
+    if not len(points):
+        return False
+    unwrapped = _unwrapped(points)
+    return bool(ONE_TURN[0] < abs(unwrapped[-1]) and np.ptp(unwrapped) < ONE_TURN[1])
+
+
+def _unwrapped(points: NDArray[np.float32]) -> Floats:
+    """(N,) turns from the first point, following the order of the points."""
+    azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / (2 * np.pi)
+    step = np.diff(azimuth, prepend=azimuth[0])
+    return np.asarray(np.cumsum(step - np.round(step)))
 
 
 def rings_of_file(scans: Sequence[Scan]) -> tuple[str, NDArray[np.int64] | None]:
