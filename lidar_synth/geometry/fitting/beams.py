@@ -16,8 +16,8 @@ from lidar_synth.geometry.sensor import Sensor
 
 Floats = NDArray[np.float64]
 
-POINTS = 250_000
-"""Number of points that a fit uses; a choice between models uses a quarter of them."""
+POINTS = 120_000
+"""Number of points that a fit uses; a choice between models uses a third of them."""
 
 NEAREST = 0.5
 """Points nearer than this to the vertical axis are left out of the fit, metres."""
@@ -179,7 +179,7 @@ def _attempt(
     model = _from_rings(cloud, still) if cloud.kept else with_peaks(cloud, still)
     if model is None:
         return None, 0.0
-    few = _some_points(cloud, POINTS // 4, seed)
+    few = _some_points(cloud, POINTS // 3, seed)
     for _ in range(1 if cloud.kept else ROUNDS):
         model, parts = _choose_parts(few, model, parts)
         again = None if cloud.kept else with_peaks(cloud, model)

@@ -28,6 +28,11 @@ LEAST_POINTS = 500
 LEAST_QUALITY = 0.85
 """Share of points in the middle half between the borders of their beams; less is no fit, and 0.5 are any points."""
 
+FRAME_HINT = (
+    "Give the points in the frame of the sensor, or of a vehicle within 2 m and 6 degrees of it, with the time of each "
+    "point where motion is compensated, and only those of one rotating sensor."
+)
+
 CLOSE = 0.05
 """Degrees; the share of points that lie as close to their beam is reported."""
 
@@ -103,7 +108,8 @@ def fit_sensor(scans: Source | Sequence[Scan], *, name: str = "fitted", columns:
         raise DataError(f"{len(given)} scans with {count} points", f"at least {LEAST_POINTS} points to fit a sensor to")
     beams, cloud = fit_beams(given)
     if beams is None:
-        raise DataError("points of one beam only", "two beams or more", "A sensor has at least two rows.")
+        given_points = f"{count} points whose elevations show fewer than two beams"
+        raise DataError(given_points, "two beams or more", FRAME_HINT)
     return _described(beams, cloud, given, name, columns)
 
 
@@ -175,8 +181,7 @@ def _check(model: Model, ring: NDArray[np.int64], off: Floats) -> None:
             f"no beams found: {quality:.0%} of the points lie near the middle of {len(room)} bands of elevation "
             f"(anywhere: 50%)",
             f"at least {LEAST_QUALITY:.0%}",
-            "Give the points in the frame of the sensor, or of a vehicle within 2 m and 6 degrees of it, with the time "
-            "of each point where motion is compensated, and only those of one rotating sensor.",
+            FRAME_HINT,
         )
 
 

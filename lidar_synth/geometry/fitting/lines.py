@@ -81,6 +81,11 @@ def residuals(points: Floats, ring: Integers, tangents: Floats, heights: Floats)
 
 def nearest_beams(points: Floats, tangents: Floats, heights: Floats) -> Integers:
     """(N,) the beam that passes nearest to each point, by angle."""
+    if not np.ptp(heights):
+        order = np.argsort(tangents)
+        angles = np.arctan(tangents[order])
+        elevation = np.arctan2(points[:, 2] - heights[0], np.hypot(points[:, 0], points[:, 1]))
+        return np.asarray(order[np.searchsorted((angles[1:] + angles[:-1]) / 2, elevation)])
     ring = np.empty(len(points), np.int64)
     cosines = 1 / np.hypot(1, tangents)
     for start in range(0, len(points), CHUNK):
