@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.fitting.lines import CAP, Cloud, Model, nearest_beams, refine, residuals
 from lidar_synth.geometry.fitting.peaks import beam_peaks
-from lidar_synth.geometry.fitting.search import find_motion, find_mount
+from lidar_synth.geometry.fitting.search import REACH, find_motion, find_mount
 from lidar_synth.geometry.projection.rings import fault_of, ring_numbers
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -30,6 +30,12 @@ GAIN = {"motion": 0.9, "mount": 0.9, "heights": 0.75}
 
 GOOD = 0.9
 """Quality above which no other mounting is looked for."""
+
+DOUBLE = np.radians(0.02)
+"""Two beams nearer than this are one."""
+
+POOR = 0.6
+"""Quality below which the mounting is not known well enough to look for the start of the turn."""
 
 SETTLING = 8
 """Largest number of times that the steps of the last fit are repeated while they raise the quality."""
@@ -159,8 +165,23 @@ def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud
         offset, turn = find_mount([part.points[part.scan == scan] for scan in range(len(scans))], seed)
         moved, better = _attempt(part, replace(still, offset=offset, turn=turn), seed, frozenset({"mount"}))
         if better > quality:
-            best = moved
+            best, quality = moved, better
+    if POOR < quality < GOOD and best and not cloud.kept and not any(scan.time is not None for scan in scans):
+        best = _with_another_seam(part, best, quality, seed)
     return (Beams(best[0], source, best[1]) if best else None), cloud
+
+
+def _with_another_seam(
+    cloud: Cloud, best: tuple[Model, frozenset[str]], quality: float, seed: int
+) -> tuple[Model, frozenset[str]]:
+    """The best fit with turns that start behind the sensor, as before, or on another side of it."""
+    still = replace(best[0], motion=np.zeros_like(best[0].motion), tangents=np.zeros(1), heights=np.zeros(1))
+    for seam in (0.25, 0.5, 0.75):
+        turned = replace(cloud, time=(cloud.time + seam + 0.5) % 1.0 - 0.5)
+        other, better = _attempt(turned, still, seed, frozenset({"motion", "mount"}))
+        if other and better > quality:
+            best, quality = other, better
+    return best
 
 
 def _some_points(cloud: Cloud, count: int, seed: int) -> Cloud:
@@ -194,7 +215,24 @@ def _attempt(
         before, quality = quality, quality_of(model, fitted)
         if quality > GOOD_ENOUGH or quality - before < 0.001:
             break
-    return (model, parts), quality
+    model = _without_doubles(model, fitted)
+    inside = bool((np.abs(model.offset) < np.array(REACH) + 0.5).all())
+    return (model, parts), quality if inside else 0.0
+
+
+def _without_doubles(model: Model, cloud: Cloud) -> Model:
+    """The model without beams that have met a stronger one on the same line."""
+    if cloud.kept:
+        return model
+    points = np.bincount(cloud.ring, minlength=len(model.tangents))
+    order = np.argsort(-model.tangents)
+    kept: list[int] = []
+    for beam in order.tolist():
+        if kept and np.arctan(model.tangents[kept[-1]]) - np.arctan(model.tangents[beam]) < DOUBLE:
+            kept[-1] = max(kept[-1], beam, key=lambda one: int(points[one]))
+        else:
+            kept.append(beam)
+    return replace(model, tangents=model.tangents[kept], heights=model.heights[kept])
 
 
 def quality_of(model: Model, cloud: Cloud) -> float:

@@ -25,7 +25,7 @@ TURNS = 5
 LEAST_POINTS = 500
 """A fit needs as many points, and a beam a tenth of them to be certain."""
 
-LEAST_QUALITY = 0.85
+LEAST_QUALITY = 0.92
 """Share of points in the middle half between the borders of their beams; less is no fit, and 0.5 are any points."""
 
 FRAME_HINT = (
@@ -191,8 +191,12 @@ def _azimuths(
     turns = []
     for number in range(min(TURNS, len(scans))):
         use = np.flatnonzero((cloud.scan == number) & (np.hypot(points[:, 0], points[:, 1]) > 0.5))
-        time = scans[number].time is not None or in_order_of_time(scans[number].points)
-        turns.append(turn_of(points[use], ring[use], cloud.time[use] if time else None))
+        time: Floats | None = None
+        if scans[number].time is not None:
+            time = cloud.time[use]
+        elif in_order_of_time(scans[number].points):
+            time = np.arange(len(use), dtype=np.float64)
+        turns.append(turn_of(points[use], ring[use], time))
     return fit_azimuths(turns, rows)
 
 

@@ -23,8 +23,8 @@ CAP = np.radians(0.1)
 
 PRIOR_HEIGHT, PRIOR_SPEED, PRIOR_TURN = 0.03, 20.0, 2.0
 """Standard deviations of heights about their median (metres), speeds (m/s) and turn rates (rad/s)."""
-_MOUNT, _MOTION = 2, 8
-"""Columns of a block of the normal equations: tangent, height, 6 of the mounting, 6 of the motion."""
+PRIOR_HEIGHT_STEP = 0.0002
+"""Scale of the differences between the heights of neighbouring beams, metres."""
 
 
 @dataclass
@@ -173,6 +173,16 @@ def _add_priors(normal: Floats, right: Floats, model: Model, scale: float) -> No
     strength = (scale / sigma) ** 2
     normal[np.diag_indices_from(normal)] += strength
     right -= strength * now
+    # Lasers of one block stand at nearly the same height; robust, because there can be several blocks.
+    step = np.diff(model.heights)
+    alike = (scale / PRIOR_HEIGHT_STEP) ** 2 / (1 + (step / PRIOR_HEIGHT_STEP) ** 2)
+    upper, lower = 2 * np.arange(beams - 1) + 1, 2 * np.arange(beams - 1) + 3
+    normal[upper, upper] += alike
+    normal[lower, lower] += alike
+    normal[upper, lower] -= alike
+    normal[lower, upper] -= alike
+    right[upper] += alike * step
+    right[lower] -= alike * step
 
 
 def _active(beams: int, scans: int, free: frozenset[str]) -> NDArray[np.bool_]:

@@ -11,6 +11,10 @@ from lidar_synth.geometry.scan import Scan
 Floats = NDArray[np.float64]
 
 
+EXTENSION = 1.5
+"""Segments beyond the first and the last pose for which a trajectory holds: the turn before the first pose is one."""
+
+
 class Trajectory:
     """The poses of a sensor over time: positions are interpolated linearly, rotations at constant speed (slerp).
 
@@ -70,10 +74,10 @@ class Trajectory:
         return np.asarray(start + fraction[:, None] * (end - start))
 
     def _segments(self, times: Floats) -> tuple[NDArray[np.intp], Floats]:
-        """The segment of each time and the fraction of it; the first and the last one extend by their own length."""
+        """The segment of each time and the fraction of it; the first and the last one extend by 1.5 lengths."""
         segment = np.clip(np.searchsorted(self.times, times, "right") - 1, 0, len(self.times) - 2)
         fraction = (times - self.times[segment]) / (self.times[segment + 1] - self.times[segment])
-        if len(times) and not (fraction.min() >= -1 and fraction.max() <= 2):
+        if len(times) and not (fraction.min() >= -EXTENSION and fraction.max() <= 1 + EXTENSION):
             given = f"points from {times.min():.3f} to {times.max():.3f} s"
             span = f"{self.times[0]:.3f} to {self.times[-1]:.3f} s"
             raise DataError(given, f"times within those of the poses, {span}", "Check `moment`.")

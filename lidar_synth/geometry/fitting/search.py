@@ -115,8 +115,9 @@ def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
     sector = np.minimum((azimuth * sectors).astype(np.int64), sectors - 1)
     fine = np.bincount(sector * rows + row, minlength=rows * sectors).astype(np.float64)
     total = np.concatenate([[0.0], np.cumsum(fine)])
-    coarse = (total[5:] - total[:-5]) / 5
-    return float((fine**2).sum() / (coarse**2).sum())
+    coarse = total[5:] - total[:-5]
+    # Pairs of points in a bin; counting a point with itself would reward emptiness where points are few.
+    return float(25 * (fine * (fine - 1)).sum() / max((coarse * (coarse - 1)).sum(), 1.0))
 
 
 def _sharpness_within(points: Floats, sectors: int, place: Floats) -> float:
