@@ -98,7 +98,9 @@ def fit_azimuths(turns: list[Turn], beams: int) -> Azimuths:
     if not on_lattice:
         return Azimuths(count)
     # Motion compensation blurs the lattice, so only scans that show it count.
-    clear = [turn for turn, (value, found) in zip(turns, lattices, strict=True) if value > COHERENT and found == lattice]
+    clear = [
+        turn for turn, (value, found) in zip(turns, lattices, strict=True) if value > COHERENT and found == lattice
+    ]
     sides = np.median([_sides(turn, beams, lattice) for turn in clear], axis=0)
     phases = [_phases(turn, beams, lattice, sides) for turn in clear]
     if locked:

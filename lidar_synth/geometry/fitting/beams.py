@@ -76,14 +76,15 @@ def gather(scans: Sequence[Scan]) -> Cloud:
     points = np.concatenate([scan.points for scan in scans]).astype(np.float64)
     if not np.isfinite(points).all():
         bad = next(scan.id for scan in scans if not np.isfinite(scan.points).all())
-        raise DataError(f"scan {bad!r} with NaN or infinite points", "finite metres", "Read it with on_bad='drop-points'.")
+        raise DataError(
+            f"scan {bad!r} with NaN or infinite points", "finite metres", "Read it with on_bad='drop-points'."
+        )
     number = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
     if all(scan.time is not None for scan in scans):
         time = np.concatenate([np.asarray(scan.time, np.float64) for scan in scans])
     else:
         time = np.concatenate([turn_fraction(scan.points) for scan in scans])
-    cloud = Cloud(points, number, time, np.full(len(points), -1))
-    return cloud
+    return Cloud(points, number, time, np.full(len(points), -1))
 
 
 def turn_fraction(points: NDArray[np.float32]) -> Floats:

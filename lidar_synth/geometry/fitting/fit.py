@@ -185,9 +185,7 @@ def _check(model: Model, ring: NDArray[np.int64], off: Floats) -> None:
         )
 
 
-def _azimuths(
-    scans: Sequence[Scan], cloud: Cloud, points: Floats, ring: NDArray[np.int64], rows: int
-) -> Azimuths:
+def _azimuths(scans: Sequence[Scan], cloud: Cloud, points: Floats, ring: NDArray[np.int64], rows: int) -> Azimuths:
     turns = []
     for number in range(min(TURNS, len(scans))):
         use = np.flatnonzero((cloud.scan == number) & (np.hypot(points[:, 0], points[:, 1]) > 0.5))

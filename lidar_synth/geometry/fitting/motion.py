@@ -61,13 +61,14 @@ class Trajectory:
         segment, fraction = self._segments(times)
         offset = points - self._positions(segment, fraction)
         local = np.einsum("nji,nj->ni", self.poses[segment, :3, :3], offset)
-        return rotate(local, -fraction[:, None] * self._steps[segment])
+        return rotate(np.asarray(local), -fraction[:, None] * self._steps[segment])
 
     def to_world(self, points: Floats, times: Floats) -> Floats:
         """(N, 3) points in the world, from the frame that the sensor had at the time of each."""
         segment, fraction = self._segments(times)
         turned = rotate(points, fraction[:, None] * self._steps[segment])
-        return np.einsum("nij,nj->ni", self.poses[segment, :3, :3], turned) + self._positions(segment, fraction)
+        turned = np.einsum("nij,nj->ni", self.poses[segment, :3, :3], turned)
+        return np.asarray(turned + self._positions(segment, fraction))
 
     def _positions(self, segment: NDArray[np.intp], fraction: Floats) -> Floats:
         start, end = self.poses[segment, :3, 3], self.poses[segment + 1, :3, 3]

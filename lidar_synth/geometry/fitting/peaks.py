@@ -1,5 +1,7 @@
 """Beams as peaks of the distribution of elevations, for points without rings and in any order."""
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,7 +64,7 @@ def _extrema(values: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     sign = np.sign(rising)
     known = np.flatnonzero(sign)
     turns = known[:-1][(sign[known[:-1]] > 0) & (sign[known[1:]] < 0)]
-    bounds = list(zip(turns[:-1], turns[1:], strict=True))
+    bounds = list(itertools.pairwise(turns))
     return turns, np.array([a + np.argmin(values[a:b]) for a, b in bounds], np.intp)
 
 
