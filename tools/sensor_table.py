@@ -79,7 +79,7 @@ def main() -> None:
     parser.add_argument("labelled", type=Path)
     given = parser.parse_args()
     real, labelled = given.real, given.labelled
-    hesai = np.loadtxt(labelled / "pandaset/pandar64_elevations.csv", delimiter=",", skiprows=1)[:, 1]
+    hesai = np.loadtxt(labelled / "pandaset/pandar64_elevations.csv", delimiter=",", skiprows=1)[:, 1].tolist()
     print("| scans | frames | beams | error (degrees) | within 0.05 | firings | offsets by | range step | seconds |")
     print("|---|---:|---:|---:|---:|---:|---|---:|---:|")
     row("Pandar64 (PandaSet), sensor frame", lambda: pandar(labelled), hesai)

@@ -56,6 +56,14 @@ class SensorFit:
         rings: for each scan (N,) int16, the beam of each point.
         off: for each scan (N,) float32 degrees, how far each point lies above its beam.
         uncertain: one sentence for each part that the fit is not sure of.
+
+    Example:
+        >>> from lidar_synth import Town, fit_sensor
+        >>> fit = fit_sensor(Town(seed=0, sensor="os1_128", scans=1))
+        >>> fit.source, fit.points.shape, fit.mount[:3, 3].round(2).tolist()
+        ('ring field', (128,), [0.0, 0.0, 0.0])
+        >>> fit.uncertain
+        ()
     """
 
     sensor: Sensor
