@@ -38,12 +38,18 @@ _HOME = {
     "Sensor": "geometry.sensor",
     "Source": "geometry.scan",
     "Sources": "mixing",
+    "SensorFit": "geometry.fitting",
     "Town": "town",
+    "Trajectory": "geometry.fitting",
+    "assign_beams": "geometry.fitting",
+    "deskew": "geometry.fitting",
+    "fit_sensor": "geometry.fitting",
     "load_generator": "generate.generator",
     "load_sensor": "geometry.sensor",
     "make_policy": "labels",
     "open_scans": "formats",
     "project": "geometry.projection",
+    "reskew": "geometry.fitting",
     "unfold": "geometry.projection",
     "unproject": "geometry.projection",
 }
@@ -62,6 +68,12 @@ if TYPE_CHECKING:
     from lidar_synth.formats import open_scans as open_scans
     from lidar_synth.generate.generator import Generator as Generator
     from lidar_synth.generate.generator import load_generator as load_generator
+    from lidar_synth.geometry.fitting import SensorFit as SensorFit
+    from lidar_synth.geometry.fitting import Trajectory as Trajectory
+    from lidar_synth.geometry.fitting import assign_beams as assign_beams
+    from lidar_synth.geometry.fitting import deskew as deskew
+    from lidar_synth.geometry.fitting import fit_sensor as fit_sensor
+    from lidar_synth.geometry.fitting import reskew as reskew
     from lidar_synth.geometry.projection import project as project
     from lidar_synth.geometry.projection import unfold as unfold
     from lidar_synth.geometry.projection import unproject as unproject

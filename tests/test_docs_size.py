@@ -27,6 +27,7 @@ LIMITS = {
     "docs/how-to/your-dataset.md": 370,
     "docs/how-to/pandaset.md": 260,
     "docs/how-to/label-kitti360.md": 200,
+    "docs/how-to/any-sensor.md": 500,
     "docs/how-to/train-a-generator.md": 450,
     "docs/how-to/bake.md": 400,
     "docs/how-to/look.md": 150,

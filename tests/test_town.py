@@ -290,7 +290,8 @@ def test_points_lie_on_their_lasers_rays(scans: dict[int, Scan]) -> None:
     scan = Town(scans=5, motion=False)[4]
     x, y, z = scan.points.T
     assert np.allclose(np.arctan2(z - height[scan.ring], np.hypot(x, y)), elevation[scan.ring], atol=1e-5)
-    firing = (np.arctan2(-y, x) / np.pi + 1) / 2 * sensor.firings
+    turned = np.arctan2(-y, x) - np.radians(sensor.azimuths)[scan.ring]
+    firing = (turned / np.pi + 1) / 2 * sensor.firings % sensor.firings
     assert np.abs(firing - np.floor(firing) - 0.5).max() < 0.01
     assert free_rays(sensor)[scan.ring, firing.astype(int)].all()
 

@@ -134,6 +134,10 @@ class ScanFiles(ABC):
             with suppress(DataError, FileError), bad_points_kept():
                 self._compare(self.read(index))
 
+    def skip_sensor_check(self) -> None:
+        """Do not compare any scan with the sensor, because its sensor is not known yet."""
+        self._unchecked = False
+
     def _compare(self, scan: Scan) -> None:
         shares = agreement(scan.points, self.sensor)
         if faults := shares.faults(self.sensor):

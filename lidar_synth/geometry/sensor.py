@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, shorten
@@ -274,6 +275,12 @@ def presets() -> dict[str, Sensor]:
     text = files("lidar_synth.geometry").joinpath("sensors.yaml").read_text(encoding="utf-8")
     entries = _entries(parse_yaml(text, "sensors.yaml"), "sensors.yaml")
     return {name: Sensor.from_dict({"name": name, **values}) for name, values in entries.items()}
+
+
+def sensor_yaml(sensor: Sensor) -> str:
+    """The YAML text of a sensor, which ``load_sensor`` reads."""
+    values = sensor.to_dict()
+    return yaml.safe_dump({values.pop("name"): values}, default_flow_style=None, sort_keys=False, width=120)
 
 
 def load_sensor(sensor: "str | Path | Sensor") -> Sensor:

@@ -15,6 +15,7 @@ from lidar_synth.viz.images import picture
 from lidar_synth.viz.page import html_page
 from lidar_synth.viz.panels import classes_panel, mixture_panel, scores_panel, verdict
 from lidar_synth.viz.render import Camera, Orbit, bird, render
+from lidar_synth.viz.sensor_fit import fit_figure
 from lidar_synth.viz.sheet import contact_sheet, histograms, sheet
 from lidar_synth.viz.window import show
 
@@ -25,6 +26,7 @@ __all__ = [
     "bird",
     "classes_panel",
     "contact_sheet",
+    "fit_figure",
     "histograms",
     "html_page",
     "mixture_panel",

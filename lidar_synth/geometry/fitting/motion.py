@@ -1,0 +1,157 @@
+"""Motion compensation and its inverse, by poses interpolated at the moment of each point."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.scan import Scan
+
+Floats = NDArray[np.float64]
+
+
+EXTENSION = 1.5
+"""Segments beyond the first and the last pose for which a trajectory holds: the turn before the first pose is one."""
+
+
+class Trajectory:
+    """The poses of a sensor over time: positions are interpolated linearly, rotations at constant speed (slerp).
+
+    Args:
+        times: (K,) seconds, increasing, K >= 2.
+        poses: (K, 4, 4) of the frame in which the points are given, to the world, metres.
+
+    Raises:
+        DataError: on shapes that do not match, times that do not increase, or poses that are not rigid.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Trajectory
+        >>> poses = np.stack([np.eye(4), np.eye(4)])
+        >>> poses[1, 0, 3] = 2.0  # 2 m forward in 0.1 s
+        >>> Trajectory([0.0, 0.1], poses).at(0.05)[:3, 3]
+        array([1., 0., 0.])
+    """
+
+    def __init__(self, times: ArrayLike, poses: ArrayLike) -> None:
+        self.times, self.poses = np.asarray(times, np.float64), np.asarray(poses, np.float64)
+        count = len(self.times) if self.times.ndim == 1 else 0
+        if count < 2 or self.poses.shape != (count, 4, 4):
+            given = f"times of shape {self.times.shape} and poses of shape {self.poses.shape}"
+            raise DataError(given, "(K,) and (K, 4, 4), K >= 2")
+        if not np.isfinite(self.times).all() or not (np.diff(self.times) > 0).all():
+            raise DataError("times of poses that do not increase", "finite seconds, one after the other")
+        turn = self.poses[:, :3, :3]
+        if not np.isfinite(self.poses).all() or not np.allclose(turn @ turn.swapaxes(1, 2), np.eye(3), atol=1e-4):
+            raise DataError("poses whose upper left 3 x 3 part is not a rotation", "rigid poses, sensor to world")
+        self._steps = rotation_vectors(turn[:-1].swapaxes(1, 2) @ turn[1:])
+
+    def at(self, time: float) -> Floats:
+        """(4, 4) the pose at one moment."""
+        pose = np.eye(4)
+        segment, fraction = self._segments(np.array([time]))
+        pose[:3, 3] = self._positions(segment, fraction)[0]
+        turned = rotate(np.eye(3), np.broadcast_to(self._steps[segment] * fraction[:, None], (3, 3)))
+        pose[:3, :3] = self.poses[segment[0], :3, :3] @ turned.T
+        return pose
+
+    def from_world(self, points: Floats, times: Floats) -> Floats:
+        """(N, 3) points of the world in the frame that the sensor had at the time of each."""
+        segment, fraction = self._segments(times)
+        offset = points - self._positions(segment, fraction)
+        local = np.einsum("nji,nj->ni", self.poses[segment, :3, :3], offset)
+        return rotate(np.asarray(local), -fraction[:, None] * self._steps[segment])
+
+    def to_world(self, points: Floats, times: Floats) -> Floats:
+        """(N, 3) points in the world, from the frame that the sensor had at the time of each."""
+        segment, fraction = self._segments(times)
+        turned = rotate(points, fraction[:, None] * self._steps[segment])
+        turned = np.einsum("nij,nj->ni", self.poses[segment, :3, :3], turned)
+        return np.asarray(turned + self._positions(segment, fraction))
+
+    def _positions(self, segment: NDArray[np.intp], fraction: Floats) -> Floats:
+        start, end = self.poses[segment, :3, 3], self.poses[segment + 1, :3, 3]
+        return np.asarray(start + fraction[:, None] * (end - start))
+
+    def _segments(self, times: Floats) -> tuple[NDArray[np.intp], Floats]:
+        """The segment of each time and the fraction of it; the first and the last one extend by 1.5 lengths."""
+        segment = np.clip(np.searchsorted(self.times, times, "right") - 1, 0, len(self.times) - 2)
+        fraction = (times - self.times[segment]) / (self.times[segment + 1] - self.times[segment])
+        if len(times) and not (fraction.min() >= -EXTENSION and fraction.max() <= 1 + EXTENSION):
+            given = f"points from {times.min():.3f} to {times.max():.3f} s"
+            span = f"{self.times[0]:.3f} to {self.times[-1]:.3f} s"
+            raise DataError(given, f"times within those of the poses, {span}", "Check `moment`.")
+        return segment, fraction
+
+
+def reskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
+    """Undo motion compensation: each point as the sensor measured it, in the frame of its own moment.
+
+    Args:
+        scan: N points with ``time``, all of them in the frame of the moment of ``scan.pose``.
+        trajectory: the poses of that frame around this moment.
+        moment: seconds of the trajectory at which ``scan.time`` is 0.
+
+    Raises:
+        DataError: on a scan without ``time``, or times for which there are no poses.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Town, Trajectory, reskew
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> scan.time = np.linspace(0, 0.1, len(scan), dtype=np.float32)
+        >>> poses = np.stack([np.eye(4), np.eye(4)])
+        >>> poses[1, 0, 3] = 2.0
+        >>> measured = reskew(scan, Trajectory([0.0, 0.1], poses))
+        >>> (measured.points[-1] - scan.points[-1]).round(2)
+        array([-2.,  0.,  0.], dtype=float32)
+    """
+    times = _times(scan, moment)
+    pose = trajectory.at(moment)
+    world = scan.points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    return replace(scan, points=trajectory.from_world(world, times).astype(np.float32))
+
+
+def deskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
+    """Motion compensation: all points in the frame of one moment, as if the sensor had measured them at once.
+
+    The arguments and errors are those of ``reskew``, its inverse.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Town, Trajectory, deskew
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> scan.time = np.zeros(len(scan), np.float32)
+        >>> still = Trajectory([0.0, 0.1], np.stack([np.eye(4), np.eye(4)]))
+        >>> bool(np.allclose(deskew(scan, still).points, scan.points))
+        True
+    """
+    times = _times(scan, moment)
+    pose = trajectory.at(moment)
+    world = trajectory.to_world(scan.points.astype(np.float64), times)
+    return replace(scan, points=((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32))
+
+
+def _times(scan: Scan, moment: float) -> Floats:
+    if scan.time is None:
+        raise DataError(f"scan {scan.id!r} has no time", "seconds for each point in scan.time")
+    return moment + scan.time.astype(np.float64)
+
+
+def rotation_vectors(turns: Floats) -> Floats:
+    """(K, 3) axis times angle, radians, of rotations (K, 3, 3) by less than half a turn."""
+    skew = np.stack([turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]],
+                    1)  # fmt: skip
+    sine = np.linalg.norm(skew, axis=1) / 2
+    angle = np.arctan2(sine, (np.trace(turns, axis1=1, axis2=2) - 1) / 2)
+    return np.asarray(skew * np.where(sine > 1e-9, angle / np.maximum(2 * sine, 1e-12), 0.5)[:, None])
+
+
+def rotate(points: Floats, vectors: Floats) -> Floats:
+    """(N, 3) points turned by rotation vectors (N, 3) or (3,), radians (Rodrigues' formula)."""
+    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    axis = vectors / np.maximum(angle, 1e-12)
+    along = np.sum(axis * points, -1, keepdims=True)
+    cosine = np.cos(angle)
+    return np.asarray(points * cosine + np.cross(axis, points) * np.sin(angle) + axis * along * (1 - cosine))
