@@ -44,13 +44,16 @@ class Hits:
 _UNKNOWN = {"label": IGNORE}
 
 
-def cast(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays) -> Hits:
+def cast(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upright: NDArray[np.float64]) -> Hits:
     """Cast rays at the surfaces of a scan.
+
+    Returns at the rim of a surface stand for a patch of their own: level where the surface is level, else vertical.
 
     Args:
         surfaces: of N returns.
         points: (N, 3) the returns in the frame of the rays, metres; NaN for returns that are left out.
         rays: H lasers with F firings.
+        upright: (3,) the upward direction in the frame of the rays.
     """
     scan, shape = surfaces.scan, (len(rays.slope), rays.count)
     there = np.isfinite(points[:, 0])
@@ -68,7 +71,10 @@ def cast(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays) -> Hits:
     recorded = np.linalg.norm(scan.points[rim], axis=1)
     half = np.minimum(surfaces.step / 2 * recorded / rho[rim], 0.2)
     up, down = np.tan(surfaces.up[rim]) * recorded, np.tan(surfaces.down[rim]) * recorded
-    hit_footprints(points[rim], azimuth[rim], rho[rim], surfaces.level[rim], half, up, down, *lasers, patch, of)
+    normal = points[rim] - np.outer(points[rim] @ upright, upright)  # vertical patches face the sensor
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal[surfaces.level[rim]] = upright
+    hit_footprints(points[rim], azimuth[rim], rho[rim], normal, half, up, down, *lasers, patch, of)
     front = patch * (1 + FRONT[1]) + FRONT[0] < solid
     front |= np.isinf(solid) & np.isfinite(patch)
     vertex[front] = np.flatnonzero(rim)[of[front]]

@@ -20,6 +20,9 @@ NOISE = 0.06
 WIDEST = 1.6
 """The widest gap between neighbours of one ring, in firings; a wider one is a ray without a return."""
 
+NEAREST, FARTHEST = 0.6, 1.6
+"""How far a footprint extends along grazing rays, as a factor of the distance of its return."""
+
 
 @numba.njit(cache=True, nogil=True)
 def neighbours_below(starts, azimuth, step, bridge, below):  # type: ignore[no-untyped-def]
@@ -234,12 +237,14 @@ def _normal(points, i, j, k):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def hit_footprints(points, azimuth, rho, level, half, up, down, slope, height, first, step, out, vertex):  # type: ignore[no-untyped-def]
+def hit_footprints(
+    points, azimuth, rho, normal, half, up, down, slope, height, first, step, out, vertex
+):  # type: ignore[no-untyped-def]
     """Find the first footprint that each ray hits: the patch of a surface that one return of the source stands for.
 
     Args:
-        points, azimuth, rho, level: (N, ...) returns in the target's frame. A footprint is vertical and faces the
-            sensor, or is level where ``level`` says so.
+        points, azimuth, rho: (N, ...) returns in the target's frame.
+        normal: (N, 3) of each footprint, unit length.
         half: (N,) radians to either side.
         up, down: (N,) metres above and below the return.
         slope, height, first, step: of ``Rays``.
@@ -248,14 +253,17 @@ def hit_footprints(points, azimuth, rho, level, half, up, down, slope, height, f
     """
     firings = out.shape[1]
     for i in range(len(points)):
-        z, distance = points[i, 2], rho[i]
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        x, y, z, distance = points[i, 0], points[i, 1], points[i, 2], rho[i]
         top, bottom = _above(distance, z + up[i], slope, height), _above(distance, z - down[i], slope, height)
         for r in range(top, bottom):
-            along = distance
-            if level[i] and slope[r] * (z - height[r]) > 0:
-                along = min(max((z - height[r]) / slope[r], 0.6 * distance), 1.6 * distance)
             f = int(np.ceil((azimuth[i] - half[i] - first[r]) / step))
             while first[r] + f * step < azimuth[i] + half[i]:
+                dx, dy = np.cos(first[r] + f * step), -np.sin(first[r] + f * step)
+                over = nx * x + ny * y + nz * (z - height[r])
+                towards = nx * dx + ny * dy + nz * slope[r]
+                along = over / towards if over * towards > 0 else distance
+                along = min(max(along, NEAREST * distance), FARTHEST * distance)
                 column = f % firings
                 if along < out[r, column]:
                     out[r, column] = along

@@ -85,12 +85,15 @@ class Transfer:
         rays, rng = rays_of(self.target), rng or keyed_rng(0)
         surfaces = estimate(scan)
         seen = float(_seen(surfaces, rays, self.mount).mean())
-        hits = cast(surfaces, self.mount.points(surfaces.scan.points), rays)
+        upright = self.mount.matrix[2, :3]
+        hits = cast(surfaces, self.mount.points(surfaces.scan.points), rays, upright)
         others = [estimate(sweep) for sweep in sweeps]
         if others:
-            hits.fill(_nearest([cast(o, self.mount.points(moved(o.scan, scan)), rays) for o in others], hits))
-        found = self._returns(hits, rays, rng)
-        if not len(found):
+            placed = [self.mount.points(moved(other.scan, scan)) for other in others]
+            found = [cast(other, points, rays, upright) for other, points in zip(others, placed, strict=True)]
+            hits.fill(_nearest(found, hits))
+        returns = self._returns(hits, rays, rng)
+        if not len(returns):
             raise DataError(
                 f"scan {scan.id!r} of {scan.sensor.name!r}: none of its surfaces lies within the field of view and the "
                 f"range of {self.target.name!r} ({self.target.down:.1f} to {self.target.up:.1f} degrees; "
@@ -101,7 +104,7 @@ class Transfer:
         boxes = None if scan.boxes is None else self.mount.boxes(scan.boxes)
         pose = None if scan.pose is None else scan.pose @ self.mount.matrix
         return Transferred(
-            replace(found, boxes=boxes, pose=pose, image_path=scan.image_path, id=scan.id, domain=scan.domain), seen
+            replace(returns, boxes=boxes, pose=pose, image_path=scan.image_path, id=scan.id, domain=scan.domain), seen
         )
 
     def _returns(self, hits: Hits, rays: Rays, rng: np.random.Generator) -> Scan:
