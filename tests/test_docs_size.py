@@ -24,6 +24,7 @@ LIMITS = {
     "docs/how-to/trainers/reader.md": 180,
     "docs/how-to/trainers/other.md": 100,
     "docs/how-to/your-sensor.md": 250,
+    "docs/how-to/another-sensor.md": 300,
     "docs/how-to/your-dataset.md": 300,
     "docs/how-to/train-a-generator.md": 450,
     "docs/how-to/bake.md": 400,

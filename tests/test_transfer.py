@@ -206,6 +206,20 @@ def test_sweeps_fill_gaps_and_moving_objects_follow_their_boxes() -> None:
         Transfer(HDL64E).cast(scan, sweeps=[replace(later, pose=None)])
 
 
+def test_the_own_vehicle_does_not_stand_in_the_way_of_another_mount(scan: Scan) -> None:
+    """A bonnet 0.5 m below the sensor would hide the street from a sensor 0.4 m further down."""
+    rays = rays_of(HDL64E)
+    own = np.flatnonzero((scan.ring > 50) & (np.abs(scan.points[:, 1]) < 0.5 * np.abs(scan.points[:, 0])))
+    points = scan.points.copy()
+    points[own] *= (-0.5 / rays.slope[scan.ring[own]] / np.hypot(*points[own, :2].T))[:, None]
+    given = replace(scan, points=points)
+    lower = Transfer(HDL64E, Mount(-0.4))
+    assert len(lower(given)) > 0.95 * len(lower(scan[np.setdiff1d(np.arange(len(scan)), own)]))
+    assert len(replace(lower, vehicle=(0.0, 0.0))(given)) < 0.98 * len(lower(given))
+    near = np.linalg.norm(Transfer(replace(HDL64E, range_min=0.1))(given).points, axis=1) < 1.8
+    assert near.sum() > 0.9 * len(own)  # in the same place it stays
+
+
 def test_a_source_seen_as_another_sensor(scan: Scan) -> None:
     scans = SeenAs([scan, scan], Transfer(UNEVEN, measurement=Measurement(loss=0.5)), seed=3)
     assert len(scans) == 2 and scans.sensor == UNEVEN

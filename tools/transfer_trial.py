@@ -1,6 +1,6 @@
 """Does the transfer from sensor to sensor help a segmenter? Trained on one real sensor, tested on another.
 
-    python tools/transfer_trial.py SEMANTIC_KITTI PANDASET [--seeds 3] [--steps 500] [--jobs 1] [--out TABLE.md]
+    python tools/transfer_trial.py SEMANTIC_KITTI PANDASET [--seeds 3] [--steps 400] [--jobs 1] [--out TABLE.md]
 
 SEMANTIC_KITTI is a root with labels (64 beams, HDL-64E). PANDASET is a folder of Pandar64 frames as arrays
 (``sensor_frame/NN.npz`` with points, reflectance, ring and PandaSet's classes, beside ``pandar64_elevations.csv``).
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from lidar_synth import Scan, Sensor, load_sensor, open_scans, unfold
@@ -103,9 +103,9 @@ class Images:
     height: Tensor
 
     @classmethod
-    def of(cls, scans: Sequence[Scan]) -> "Images":
-        """One row per laser, ``COLUMNS`` columns, the nearest return of each cell."""
-        views = [unfold(scan, replace(scan.sensor.by_beams(), columns=COLUMNS, firings=None)) for scan in scans]
+    def of(cls, scans: Sequence[Scan], columns: int = COLUMNS) -> "Images":
+        """One row per laser, the nearest return of each cell."""
+        views = [unfold(scan, replace(scan.sensor.by_beams(), columns=columns, firings=None)) for scan in scans]
         stacks = [np.stack(v) for v in zip(*((v.range, v.reflectance, v.label) for v in views), strict=True)]
         return cls(*map(torch.from_numpy, stacks), torch.from_numpy(np.sin(views[0].sensor.ray_angles()[0])))
 
@@ -115,7 +115,7 @@ class Images:
         while True:
             parts = []
             for i in rng.choice(len(self.range), BATCH, replace=False):
-                turn, mirror = int(rng.integers(COLUMNS)), bool(rng.integers(2))
+                turn, mirror = int(rng.integers(self.range.shape[-1])), bool(rng.integers(2))
                 images = [t[i].roll(turn, -1) for t in (self.range, self.reflectance, self.label)]
                 parts.append([t.flip(-1) if mirror else t for t in images])
             names = ("range", "reflectance", "label")
@@ -127,13 +127,33 @@ class Images:
             yield {n: getattr(self, n)[i : i + 1] for n in ("range", "reflectance", "label")}
 
 
-def run(train: Images, tests: dict[str, Images], steps: int, seed: int) -> dict[str, NDArray[np.int64]]:
-    """Train one segmenter; its confusion matrix on every test set."""
+class Bfloat16(nn.Module):
+    """A network in mixed precision, which halves the time on a CPU that has bfloat16."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.autocast("cpu", torch.bfloat16):
+            logits: Tensor = self.network(x)
+        return logits.float()
+
+
+def run(
+    train: Images, tests: dict[str, Images], steps: int, seed: int, kept: Path | None
+) -> dict[str, NDArray[np.int64]]:
+    """Train one segmenter, or read its result; its confusion matrix on every test set."""
+    if kept is not None and kept.is_file():
+        return dict(np.load(kept))
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    network = RangeSegmenter(widths=WIDTHS)
+    network = Bfloat16(RangeSegmenter(widths=WIDTHS))
     train_segmenter(network, train.batches(seed), train.height, steps, progress=False)
-    return {name: confusion(network, test.singly(), test.height) for name, test in tests.items()}
+    found = {name: confusion(network, test.singly(), test.height) for name, test in tests.items()}
+    if kept is not None:
+        np.savez(kept, **found)
+    return found
 
 
 def respond(scans: Sequence[Scan], response: Response) -> list[Scan]:
@@ -188,17 +208,23 @@ def main() -> None:
     parser.add_argument("kitti", type=Path)
     parser.add_argument("pandaset", type=Path)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=500)
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--columns", type=int, default=COLUMNS, help="of the range images")
     parser.add_argument("--jobs", type=int, default=1, help="processes, of one thread each")
     parser.add_argument("--out", type=Path, help="file for the table")
+    parser.add_argument("--work", type=Path, help="folder for the result of each training, to resume")
     given = parser.parse_args()
+    if given.work:
+        given.work.mkdir(parents=True, exist_ok=True)
     sets = arms(read_semantic_kitti(given.kitti), read_pandaset(given.pandaset))
-    jobs = [(arm, seed) for seed in range(given.seeds) for arm in sets]
+    order = list(sets)
+    jobs = [(arm, seed) for part in (order[:3], order[3:]) for seed in range(given.seeds) for arm in part]
     results: dict[tuple[str, str], list[NDArray[np.int64]]] = {
         (arm, test): [] for arm, (_, tests) in sets.items() for test in tests
     }
     with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
-        futures = [pool.submit(run, *sets[arm], given.steps, seed) for arm, seed in jobs]
+        kept = [given.work and given.work / f"{order.index(arm)}-{given.steps}-{seed}.npz" for arm, seed in jobs]
+        futures = [pool.submit(run, *sets[a], given.steps, s, k) for (a, s), k in zip(jobs, kept, strict=True)]
         for (arm, seed), future in zip(tqdm(jobs, "trainings"), futures, strict=True):
             for test, found in future.result().items():
                 results[arm, test].append(found)

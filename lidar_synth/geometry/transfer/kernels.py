@@ -237,9 +237,7 @@ def _normal(points, i, j, k):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def hit_footprints(
-    points, azimuth, rho, normal, half, up, down, slope, height, first, step, out, vertex
-):  # type: ignore[no-untyped-def]
+def hit_footprints(points, azimuth, rho, normal, half, up, down, slope, height, first, step, out, vertex):  # type: ignore[no-untyped-def]
     """Find the first footprint that each ray hits: the patch of a surface that one return of the source stands for.
 
     Args:

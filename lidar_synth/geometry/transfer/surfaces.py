@@ -17,8 +17,8 @@ GROUND = np.isin(np.arange(256), [TRAIN_ID[n] for n in ("road", "parking", "side
 """(256,) whether a train id is a class of the ground."""
 
 SCATTERED = 0.1
-"""Neighbours along a ring differ in elevation by less than this share of the gap between rings, in the median: by 0.01 in
-scans of KITTI and nuScenes, by 0.35 or more if they are opened as scans of a sensor with fewer beams."""
+"""Neighbours along a ring differ in elevation by less than this share of the gap between rings, in the median: by 0.01
+in scans of KITTI and nuScenes, by 0.35 or more if they are opened as scans of a sensor with fewer beams."""
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,9 @@ class Transfer:
         target: the sensor to imitate: its lasers, firings, limits and quantisation.
         mount: the target's place relative to the recording sensor.
         measurement: how the target measures other than the recording sensor.
+        vehicle: (length, width) in metres of the footprint around the recording sensor, below it, whose returns are of
+            the vehicle that carries it. If the target has another mount they are left out; otherwise they would stand
+            in its way.
 
     Example:
         >>> from lidar_synth import Town, load_sensor
@@ -64,6 +67,7 @@ class Transfer:
     target: Sensor
     mount: Mount = field(default_factory=Mount)
     measurement: Measurement = field(default_factory=Measurement)
+    vehicle: tuple[float, float] = (4.0, 2.0)
 
     def __call__(self, scan: Scan, rng: np.random.Generator | None = None) -> Scan:
         """The scan as the target sensor would have recorded it; see ``cast``."""
@@ -83,11 +87,11 @@ class Transfer:
                 if nothing of it is in the target's field of view; on sweeps without poses.
         """
         rays, rng = rays_of(self.target), rng or keyed_rng(0)
-        surfaces = estimate(scan)
+        surfaces = estimate(self._without_vehicle(scan))
         seen = float(_seen(surfaces, rays, self.mount).mean())
         upright = self.mount.matrix[2, :3]
         hits = cast(surfaces, self.mount.points(surfaces.scan.points), rays, upright)
-        others = [estimate(sweep) for sweep in sweeps]
+        others = [estimate(self._without_vehicle(sweep)) for sweep in sweeps]
         if others:
             placed = [self.mount.points(moved(other.scan, scan)) for other in others]
             found = [cast(other, points, rays, upright) for other, points in zip(others, placed, strict=True)]
@@ -106,6 +110,15 @@ class Transfer:
         return Transferred(
             replace(returns, boxes=boxes, pose=pose, image_path=scan.image_path, id=scan.id, domain=scan.domain), seen
         )
+
+    def _without_vehicle(self, scan: Scan) -> Scan:
+        """The scan without returns of the vehicle that carries its sensor, where the target has another mount."""
+        if self.mount == Mount():
+            return scan
+        along, across, above = np.abs(scan.points[:, 0]), np.abs(scan.points[:, 1]), scan.points[:, 2]
+        # Not the road beside a low sensor: a vehicle is at most 1.5 m below the sensor on it.
+        own = (along < self.vehicle[0] / 2) & (across < self.vehicle[1] / 2) & (above < 0) & (above > -1.5)
+        return scan if not own.any() else scan[~own]
 
     def _returns(self, hits: Hits, rays: Rays, rng: np.random.Generator) -> Scan:
         """The returns of the rays that hit something, row by row."""
@@ -129,7 +142,7 @@ class Transfer:
     @property
     def identity(self) -> str:
         """A text of everything that determines the scans."""
-        return f"{self.target.to_dict()} {asdict(self.mount)} {asdict(self.measurement)}"
+        return f"{self.target.to_dict()} {asdict(self.mount)} {asdict(self.measurement)} {self.vehicle}"
 
 
 class SeenAs:
