@@ -153,6 +153,14 @@ def test_what_was_not_seen_returns_nothing(scan: Scan) -> None:
     assert elevation.max() < 3.1 and abs(seen - 25.5 / 45) < 0.02
 
 
+def test_surfaces_end_where_rings_are_missing(scan: Scan) -> None:
+    found = Transfer(HDL64E)(scan[(scan.ring < 25) | (scan.ring > 40)])
+    assert not ((found.ring > 25) & (found.ring < 40)).any() and ((found.ring < 25).sum(), (found.ring > 40).sum()) > (
+        0,
+        0,
+    )
+
+
 def test_limits_and_quantisation_are_those_of_the_target(scan: Scan) -> None:
     target = replace(UNEVEN, range_min=6.0, range_max=20.0, range_step=0.05, reflectance_levels=8)
     found = Transfer(target)(scan)

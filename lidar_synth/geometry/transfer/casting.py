@@ -44,7 +44,7 @@ class Hits:
 _UNKNOWN = {"label": IGNORE}
 
 
-def cast(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upright: NDArray[np.float64]) -> Hits:
+def first_hits(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upright: NDArray[np.float64]) -> Hits:
     """Cast rays at the surfaces of a scan.
 
     Returns at the rim of a surface stand for a patch of their own: level where the surface is level, else vertical.

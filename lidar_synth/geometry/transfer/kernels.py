@@ -78,10 +78,11 @@ def _joined(points, key, ground, level, i, j, across):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True)
-def triangulate(starts, azimuth, points, key, ground, level, below, step, bridge):  # type: ignore[no-untyped-def]
+def triangulate(rings, starts, azimuth, points, key, ground, level, below, step, bridge):  # type: ignore[no-untyped-def]
     """Join neighbouring rings by triangles.
 
     Args:
+        rings: (K,) number of each ring, increasing.
         starts: (K + 1,) the first return of each ring, and N.
         azimuth: (N,) radians, increasing within a ring.
         points: (N, 3) metres.
@@ -96,17 +97,17 @@ def triangulate(starts, azimuth, points, key, ground, level, below, step, bridge
     """
     count, limit = len(azimuth), WIDEST * step
     triangles = np.empty((4 * count if bridge else 2 * count, 3), np.int32)
-    found, rings = 0, len(starts) - 1
+    found, farthest = 0, 2 if bridge else 1
     rim = np.zeros(count, np.bool_)
     rim[: starts[1]] = True
-    rim[starts[rings - 1] :] = True
-    for k in range(rings - 1):
-        for further in range(1, 3 if bridge else 2):
-            if k + further >= rings:
+    rim[starts[len(rings) - 1] :] = True
+    for k in range(len(rings) - 1):
+        for further in range(1, farthest + 1):
+            if k + further >= len(rings):
                 break
             a0, b0 = starts[k], starts[k + further]
             n, m = starts[k + 1] - a0, starts[k + further + 1] - b0
-            if n == 0 or m == 0:
+            if rings[k + further] - rings[k] > farthest:
                 rim[a0 : a0 + n] = True
                 rim[b0 : b0 + m] = True
                 continue

@@ -23,9 +23,10 @@ class Mount:
         ConfigError: on more than 5 m or 45 degrees.
 
     Example:
+        >>> import numpy as np
         >>> from lidar_synth.geometry.transfer import Mount
-        >>> Mount(z=0.1, pitch=2).matrix[:3, 3]
-        array([0. , 0. , 0.1])
+        >>> Mount(z=0.1).points(np.array([(10.0, 0.0, -1.7)]))  # the road is further below
+        array([[10. ,  0. , -1.8]])
     """
 
     z: float = 0.0

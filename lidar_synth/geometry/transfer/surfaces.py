@@ -73,8 +73,8 @@ def estimate(scan: Scan) -> Surfaces:
     neighbours_below(starts, azimuth, step, on_grid, below)
     find_level(points, below, level)
     ground = np.ones(len(scan), bool) if scan.label is None else GROUND[scan.label] | (scan.label == IGNORE)
-    triangles, rim = triangulate(starts, azimuth, points, _objects(scan), ground, level, below, step, on_grid)
-    half = np.maximum(-np.diff(middle), 0) / 2
+    triangles, rim = triangulate(present, starts, azimuth, points, _objects(scan), ground, level, below, step, on_grid)
+    half = np.maximum(-np.diff(middle), 0) / np.diff(present) / 2
     up, down = np.concatenate([half[:1], half]), np.concatenate([half, half[-1:]])
     counts = np.diff(starts)
     bounds = float(middle.min() - down[-1]), float(middle.max() + up[0])
