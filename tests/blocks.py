@@ -27,7 +27,7 @@ def record(sensor: Sensor, mount: Mount | None = None, car: tuple[float, ...] = 
     """
     rays, matrix = rays_of(sensor), (mount or Mount()).matrix.copy()
     matrix[0, 3] += at
-    azimuth = rays.first[:, None] + np.arange(rays.count) * rays.step
+    azimuth = rays.first[:, None] + np.arange(rays.firings) * rays.step
     slope, height = (np.broadcast_to(v[:, None], azimuth.shape) for v in (rays.slope, rays.height))
     ways = np.stack([np.cos(azimuth), -np.sin(azimuth), slope], -1).reshape(-1, 3) @ matrix[:3, :3].T
     starts = np.stack([0 * slope, 0 * slope, height], -1).reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -46,8 +46,8 @@ def record(sensor: Sensor, mount: Mount | None = None, car: tuple[float, ...] = 
         sensor,
         label=label,
         instance=(label == CAR).astype(np.int32),
-        ring=np.repeat(np.arange(len(rays.slope)), rays.count)[kept].astype(np.int16),
-        time=(np.tile(np.arange(rays.count), len(rays.slope))[kept] * 1e-4).astype(np.float32),
+        ring=np.repeat(np.arange(len(rays.slope)), rays.firings)[kept].astype(np.int16),
+        time=(np.tile(np.arange(rays.firings), len(rays.slope))[kept] * 1e-4).astype(np.float32),
         boxes=(mount or Mount()).boxes(Boxes(ahead, ("Car",), instance=np.array([1], np.int32))),
         pose=matrix,
         id="blocks",
@@ -59,8 +59,8 @@ def image(scan: Scan) -> NDArray[np.int64]:
     rays = rays_of(scan.sensor)
     assert scan.ring is not None
     azimuth = -np.arctan2(scan.points[:, 1], scan.points[:, 0]) - rays.first[scan.ring]
-    firing = np.rint(azimuth / rays.step).astype(int) % rays.count
-    index = np.full((len(rays.slope), rays.count), -1)
+    firing = np.rint(azimuth / rays.step).astype(int) % rays.firings
+    index = np.full((len(rays.slope), rays.firings), -1)
     index[scan.ring, firing] = np.arange(len(scan))
     return index
 

@@ -41,7 +41,7 @@ def described(name: str, scans: Sequence[Scan], low: float, high: float) -> str:
         elevation = np.arctan2(scan.points[:, 2] - rays.height[ring], np.hypot(*scan.points[:, :2].T))
         near.append(np.mean(np.abs(np.degrees(elevation) - beams[ring]) < 0.01))
         kept = counted[ring]
-        fill.append(kept.sum() / (counted.sum() * rays.count))
+        fill.append(kept.sum() / (counted.sum() * rays.firings))
         ranges.append(np.linalg.norm(scan.points[kept], axis=1))
     quantiles = np.quantile(np.concatenate(ranges), [0.05, 0.25, 0.5, 0.75, 0.95])
     return (
@@ -61,10 +61,10 @@ def to_itself(scan: Scan) -> float:
 
 def _image(scan: Scan) -> NDArray[np.float64]:
     rays = rays_of(scan.sensor)
-    image = np.zeros((len(rays.slope), rays.count))
+    image = np.zeros((len(rays.slope), rays.firings))
     assert scan.ring is not None
     firing = (-np.arctan2(scan.points[:, 1], scan.points[:, 0]) - rays.first[scan.ring]) / rays.step
-    image[scan.ring, np.rint(firing).astype(int) % rays.count] = np.linalg.norm(scan.points, axis=1)
+    image[scan.ring, np.rint(firing).astype(int) % rays.firings] = np.linalg.norm(scan.points, axis=1)
     return image
 
 

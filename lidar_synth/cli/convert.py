@@ -80,8 +80,7 @@ def convert(
     writer = choose("format", to, WRITERS)(out)
     given = {"layout": layout, "split": split, "fields": fields, "reflectance_max": reflectance_max}
     scans = open_scans(source, sensor=sensor, on_bad=on_bad, **given)  # type: ignore[arg-type]
-    options = {"mount": mount, "sweeps": sweeps, "like": like, "range_noise": range_noise, "reach": reach}
-    change = _change(scans, as_sensor, **options)
+    change = _change(scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach)
     report = run(scans, writer, jobs=jobs, on_bad=on_bad, as_sensor=change, unfold=unfold)  # type: ignore[arg-type]
     print(f"{out}: {report.written} scans written, {report.kept} were there already, {len(report.skipped)} skipped")
     if report.seen:

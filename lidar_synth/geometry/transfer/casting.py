@@ -55,7 +55,7 @@ def first_hits(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upri
         rays: H lasers with F firings.
         upright: (3,) the upward direction in the frame of the rays.
     """
-    scan, shape = surfaces.scan, (len(rays.slope), rays.count)
+    scan, shape = surfaces.scan, (len(rays.slope), rays.firings)
     there = np.isfinite(points[:, 0])
     azimuth, rho = -np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
     rows = np.empty(len(points), np.int32)

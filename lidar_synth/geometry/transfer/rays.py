@@ -20,14 +20,14 @@ class Rays(NamedTuple):
         height: (H,) metres above the sensor's origin at which the laser starts.
         first: (H,) radians, clockwise.
         step: radians.
-        count: F.
+        firings: F.
     """
 
     slope: NDArray[np.float64]
     height: NDArray[np.float64]
     first: NDArray[np.float64]
     step: float
-    count: int
+    firings: int
 
 
 @lru_cache(maxsize=16)

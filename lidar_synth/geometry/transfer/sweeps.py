@@ -1,11 +1,13 @@
 """Other sweeps of the same drive as seen from one scan: by the poses, and moving objects by their boxes."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import Boxes, Scan
 
 MOVABLE = np.isin(np.arange(256), range(TRAIN_ID["motorcyclist"] + 1))
 """(256,) whether a train id is a class of vehicles or people."""
@@ -43,7 +45,7 @@ def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
         out[MOVABLE[sweep.label]] = np.nan
     if sweep.boxes is None:
         return out
-    inside = _widened(sweep).contain(sweep.points)
+    inside = _widened(sweep.boxes).contain(sweep.points)
     there = {} if scan.boxes is None else {int(n): box for n, box in _numbered(scan)}
     for held, instance, box in zip(inside, sweep.boxes.instance, sweep.boxes.values, strict=True):
         out[held] = np.nan if int(instance) not in there else _carried(points[held], box, there[int(instance)])
@@ -55,11 +57,10 @@ def _numbered(scan: Scan) -> list[tuple[int, NDArray[np.float32]]]:
     return [(int(n), box) for n, box in zip(scan.boxes.instance, scan.boxes.values, strict=True) if n >= 0]
 
 
-def _widened(scan: Scan):  # type: ignore[no-untyped-def]
-    from dataclasses import replace
-
-    assert scan.boxes is not None
-    return replace(scan.boxes, values=scan.boxes.values + np.float32([0, 0, 0, 2 * MARGIN, 2 * MARGIN, 0, 0]))
+def _widened(boxes: Boxes) -> Boxes:
+    values = boxes.values.copy()
+    values[:, 3:5] += 2 * MARGIN
+    return replace(boxes, values=values)
 
 
 def _carried(points: NDArray[np.float64], box: NDArray[np.float32], to: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -67,4 +68,4 @@ def _carried(points: NDArray[np.float64], box: NDArray[np.float32], to: NDArray[
     turn = float(to[6]) - float(box[6])
     c, s = np.cos(turn), np.sin(turn)
     offset = points - box[:3].astype(np.float64)
-    return offset @ np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)]) + to[:3]
+    return np.asarray(offset @ np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)]) + to[:3], np.float64)

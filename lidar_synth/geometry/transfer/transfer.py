@@ -175,7 +175,7 @@ class SeenAs:
 
 def _seen(surfaces: Surfaces, rays: Rays, mount: Mount) -> NDArray[np.bool_]:
     """(H, F) which rays lie within the field of view of the sensor that recorded the surfaces."""
-    azimuth = rays.first[:, None] + np.arange(rays.count) * rays.step
+    azimuth = rays.first[:, None] + np.arange(rays.firings) * rays.step
     slope = np.broadcast_to(rays.slope[:, None], azimuth.shape)
     directions = np.stack([np.cos(azimuth), -np.sin(azimuth), slope], -1) @ mount.matrix[:3, :3].T
     elevation = np.arctan2(directions[..., 2], np.hypot(directions[..., 0], directions[..., 1]))
