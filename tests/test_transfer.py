@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import BUILDING, CAR, CAR_BOX, GROUND, REFLECTANCE, ROAD, image, record
+from blocks import BUILDING, CAR, CAR_BOX, GROUND, REFLECTANCE, ROAD, WALL, image, record
 from conftest import random_scan
 
 from lidar_synth import Town
@@ -57,6 +57,28 @@ def _near(scan: Scan, most: float) -> np.ndarray:
     return np.linalg.norm(scan.points, axis=1) < most
 
 
+def test_the_nearer_surface_hides_the_farther_one(scan: Scan) -> None:
+    """From further down, the car stands before the part of the wall that was seen over its roof."""
+    mount = Mount(-0.9)
+    truth, found = record(HDL64E, mount), Transfer(HDL64E, mount)(scan)
+    at_truth, at_found = image(truth), image(found)
+    both = (at_truth >= 0) & (at_found >= 0)
+    on_car = truth.label[at_truth[both]] == CAR
+    assert on_car.sum() > 1000 and (found.label[at_found[both]][on_car] == CAR).mean() > 0.97
+
+
+@pytest.mark.parametrize("target", ["uneven", "hdl32e"])
+def test_no_return_hangs_between_surfaces(scan: Scan, target: str) -> None:
+    """Between the outline of the car and the wall behind it."""
+    points = Transfer(TARGETS[target])(scan).points.astype(float)
+    off = [np.abs(points[:, 2] - GROUND)]
+    for box in (CAR_BOX, WALL):
+        c, s = np.cos(box[6]), np.sin(box[6])
+        local = (points - box[:3]) @ np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)])
+        off.append(np.linalg.norm(np.maximum(np.abs(local) - np.array(box[3:6]) / 2, 0), axis=1))
+    assert (np.min(off, 0) > 0.3).mean() < 1e-3
+
+
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_a_plane_stays_a_plane(scan: Scan, mount: str) -> None:
     found = Transfer(UNEVEN, MOUNTS[mount])(scan[scan.label == ROAD])
@@ -67,13 +89,13 @@ def test_a_plane_stays_a_plane(scan: Scan, mount: str) -> None:
 
 @pytest.mark.parametrize("target", TARGETS)
 def test_returns_lie_on_the_beams_and_firings_of_the_target(scan: Scan, target: str) -> None:
-    rays = rays_of(TARGETS[target])
-    found = Transfer(TARGETS[target], Mount(0.2))(scan)
-    along = np.hypot(*found.points[:, :2].T)
-    np.testing.assert_allclose(
-        (found.points[:, 2] - rays.height[found.ring]) / along, rays.slope[found.ring], atol=2e-5
-    )
-    firing = (-np.arctan2(found.points[:, 1], found.points[:, 0]) - rays.first[found.ring]) / rays.step
+    sensor = TARGETS[target]
+    found = Transfer(sensor, Mount(0.2))(scan)
+    elevation = np.arctan2(found.points[:, 2].astype(float), np.hypot(*found.points[:, :2].T))
+    off = np.degrees(np.abs(elevation - sensor.laser_elevations[found.ring]))
+    assert off.max() < 1e-3 if sensor.heights is None else np.median(off) < 0.2
+    azimuths = sensor.firing_azimuths()
+    firing = (-np.arctan2(found.points[:, 1], found.points[:, 0]) - azimuths[found.ring, 0]) / np.diff(azimuths)[0, 0]
     assert np.abs(firing - np.rint(firing)).max() < 1e-3
 
 

@@ -16,6 +16,9 @@ from lidar_synth.geometry.transfer.kernels import find_level, neighbours_below, 
 GROUND = np.isin(np.arange(256), [TRAIN_ID[n] for n in ("road", "parking", "sidewalk", "other-ground", "terrain")])
 """(256,) whether a train id is a class of the ground."""
 
+ORDERED = np.radians(2.0)
+"""Median step of azimuth between successive points of a file that may be in ring order, radians."""
+
 SCATTERED = 0.1
 """Neighbours along a ring differ in elevation by less than this share of the gap between rings, in the median: by 0.01
 in scans of KITTI and nuScenes, by 0.35 or more if they are opened as scans of a sensor with fewer beams."""
@@ -89,9 +92,11 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
     if scan.ring is not None:
         return scan.ring.astype(np.int64), False
     lasers = scan.sensor.by_beams()
-    ring = ring_numbers(scan.points)
-    if ring[-1] > 0 and not fault_of(scan.points, ring, lasers):
-        return ring.astype(np.int64), False
+    turn = np.abs(np.diff(np.arctan2(scan.points[:, 1], scan.points[:, 0])))
+    if len(turn) and np.median(turn) < ORDERED:
+        ring = ring_numbers(scan.points)
+        if ring[-1] > 0 and not fault_of(scan.points, ring, lasers):
+            return ring.astype(np.int64), False
     sine = scan.points[:, 2] / np.maximum(np.linalg.norm(scan.points, axis=1), 1e-6)
     elevation = np.arcsin(np.clip(sine, -1, 1))
     rows = [np.searchsorted(-s.edges[1:-1], -elevation) for s in (scan.sensor, lasers)]
