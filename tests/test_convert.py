@@ -9,18 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from banks import some_image, write_bank
+from blocks import record
 from conversions import a_sequence, app
-from layouts import MAKERS, WRITTEN_AS, some_scan, write_all
+from layouts import MAKERS, WRITTEN_AS, some_camera, some_scan, write_all
 from typer.testing import CliRunner
 
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import READERS, WRITERS, open_scans
+from lidar_synth.formats.as_sensor import AsSensor
 from lidar_synth.formats.convert import SETTINGS, Report, convert, reproject
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
-from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor, presets
+from lidar_synth.geometry.transfer import Mount, Transfer
+from lidar_synth.noise import keyed_rng
 
 
 def files(root: Path) -> dict[str, bytes]:
@@ -165,16 +168,38 @@ def test_a_full_target_stops_the_run_for_every_policy(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", presets())
 def test_conversion_to_another_sensor(tmp_path: Path, name: str) -> None:
-    scan, sensor = some_scan(count=5000), load_sensor(name)
-    convert([scan], WRITERS["npz"](tmp_path), as_sensor=sensor, progress=False)
-    read = open_scans(tmp_path)[0]
-    image = project(scan, sensor)
-    assert read.sensor == sensor and len(read) == image.mask.sum() > 0
-    again = project(read)
-    assert np.array_equal(again.mask, image.mask)
-    np.testing.assert_allclose(again.range, image.range, rtol=3e-7)
-    assert all(np.array_equal(again.channels[k], image.channels[k]) for k in image.channels)
+    scan, sensor = record(load_sensor("hdl64e_kitti")), load_sensor(name)
+    report = convert([scan], WRITERS["npz"](tmp_path), as_sensor=sensor, progress=False)
+    read, expected = open_scans(tmp_path)[0], Transfer(sensor)(scan, keyed_rng(0, 0))
+    assert read.sensor == sensor and np.array_equal(read.points, expected.points)
+    assert all(np.array_equal(read.fields()[k], v) for k, v in expected.fields().items() if k != "time")
     assert np.array_equal(read.pose, scan.pose) and read.boxes is not None
+    assert report.seen == [Transfer(sensor).cast(scan).seen]
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """Three scans of a drive, with poses and a camera."""
+    scans = [record(load_sensor("hdl64e_semantic_kitti"), at=1.0 * i) for i in range(3)]
+    write_all("semantic_kitti", tmp_path / "drive", scans, calibration=some_camera())
+    return tmp_path / "drive"
+
+
+def test_poses_and_calibration_move_with_the_mount(tmp_path: Path, drive: Path) -> None:
+    """A point of the street has the same pixel and the same place in the world before and after."""
+    before, transfer = open_scans(drive), Transfer(load_sensor("hdl32e_nuscenes"), Mount(0.3, 4.0))
+    out = WRITERS["semantic_kitti"](tmp_path / "out")
+    report = convert(before, out, as_sensor=AsSensor(transfer, sweeps=1), progress=False)
+    assert report.written == 3 and "times.txt" in report.left_out[0]
+    after, corners = open_scans(out.root), record(before.sensor).boxes.corners()[0]
+    moved = transfer.mount.points(corners)
+    for a, b in zip(before.calibration(0).pixels(corners), after.calibration(0).pixels(moved), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-2)
+    for a, b in zip(before, after, strict=True):
+        np.testing.assert_allclose(b.pose, a.pose @ transfer.mount.matrix, atol=1e-5)
+    alone = convert(before, WRITERS["semantic_kitti"](tmp_path / "alone"), as_sensor=transfer, progress=False)
+    assert alone.written == 3
+    assert all(len(a) < len(b) for a, b in zip(open_scans(tmp_path / "alone"), after, strict=True))
 
 
 @pytest.fixture
@@ -183,15 +208,33 @@ def dataset(tmp_path: Path) -> Iterator[Path]:
     yield tmp_path / "in"
 
 
-def test_the_command(dataset: Path, tmp_path: Path) -> None:
+def test_the_command(drive: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    options = ["--to", "range", "--as-sensor", "os1_128", "--split", "r2flow/test"]
-    result = CliRunner().invoke(app, [str(dataset), str(out), *options])
+    options = ["--to", "range", "--as-sensor", "os1_128", "--mount", "0.1,2", "--sweeps", "1", "--like", str(drive)]
+    result = CliRunner().invoke(app, [str(drive), str(out), *options])
     assert result.exit_code == 0, result.output
     assert "3 scans written, 0 were there already, 0 skipped" in result.output
+    assert "of the field of view of os1_128 was seen" in result.output
     assert open_scans(out)[0].sensor == load_sensor("os1_128")
-    result = CliRunner().invoke(app, [str(dataset), str(out), *options])
+    result = CliRunner().invoke(app, [str(drive), str(out), *options])
     assert "0 scans written, 3 were there already, 0 skipped" in result.output
+
+
+WRONG = {
+    "--mount without a sensor": (["--mount", "0,0"], "mount without --as-sensor"),
+    "a mount of one number": (["--as-sensor", "os1_128", "--mount", "0.1"], "--mount 0.1; expected metres and degrees"),
+    "an impossible mount": (["--as-sensor", "os1_128", "--mount", "9,0"], "at most 5 m"),
+    "fewer than no sweeps": (["--as-sensor", "os1_128", "--sweeps", "-1"], "-1 sweeps"),
+    "noise of metres": (["--as-sensor", "os1_128", "--range-noise", "2"], "range_noise=2"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_options_of_another_sensor(drive: Path, tmp_path: Path, case: str) -> None:
+    options, message = WRONG[case]
+    with pytest.raises(ConfigError, match=message):
+        CliRunner().invoke(app, [str(drive), str(tmp_path / "out"), "--to", "kitti", *options], catch_exceptions=False)
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_prints_skipped_scans_with_reasons(dataset: Path, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ FURTHER = {
     "lidar_synth.flow.solvers": ("solve",),
     "lidar_synth.geometry.normalize": ("Normalisation",),
     "lidar_synth.geometry.projection": ("fill_points", "locate", "project_batch"),
+    "lidar_synth.geometry.transfer": ("Mount", "SeenAs", "Transfer"),
     "lidar_synth.labels.augment": ("compose",),
     "lidar_synth.mixing": ("Generated", "MixedScans.batches", "MixedScans.domain", "MixedScans.wrap"),
     "lidar_synth.noise": ("gaussian",),

@@ -49,7 +49,8 @@ SCANS: dict[str, tuple[Callable[[], list[Scan]], tuple[float, ...]]] = {
     "motion compensated, with times": (lambda: [compensated(s, 12.0, 0.2) for s in some()], BEAMS),
     "motion compensated, without": (lambda: untimed([compensated(s, 12.0, 0.2) for s in some()]), BEAMS),
     "the town's os1_128": (
-        lambda: [Town(0, "os1_128", 1, motion=False)[0]], tuple(np.degrees(load_sensor("os1_128").row_elevations()).tolist())
+        lambda: [Town(0, "os1_128", 1, motion=False)[0]],
+        tuple(np.degrees(load_sensor("os1_128").row_elevations()).tolist())
     ),
 }  # fmt: skip
 
@@ -75,7 +76,8 @@ def test_heights_and_speeds_are_found() -> None:
 
 @pytest.mark.slow
 def test_the_place_of_the_sensor_on_a_vehicle_is_found() -> None:
-    scans = moved(shuffled([Town(0, "os1_128", 1, motion=False)[0]]), *MOUNT)
+    town = Town(0, "os1_128", 40, motion=False)
+    scans = moved(shuffled([town[0], town[30]]), *MOUNT)
     fit = fit_sensor([replace(scan, ring=None) for scan in scans])
     assert np.allclose(fit.mount[:3, 3], MOUNT[0], atol=0.02) and fit.sensor.heights is None
     assert np.allclose(fit.mount[2, :2], MOUNT[1][2, :2], atol=1e-3)

@@ -2,9 +2,13 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from lidar_synth.formats import ScanFiles
+    from lidar_synth.geometry.scan import Scan
 
 
 def convert(
@@ -21,7 +25,24 @@ def convert(
     ] = None,
     layout: Annotated[str | None, typer.Option(help="layout of the input [detected]")] = None,
     split: Annotated[str | None, typer.Option(help="split of the input, for instance r2flow/train")] = None,
-    as_sensor: Annotated[str | None, typer.Option(help="re-project to this sensor: a preset or a YAML file")] = None,
+    as_sensor: Annotated[
+        str | None, typer.Option(help="scans as this sensor would have recorded them: a preset or a YAML file")
+    ] = None,
+    mount: Annotated[
+        str | None,
+        typer.Option(metavar="Z,PITCH", help="of --as-sensor: metres higher, degrees looking further down [0,0]"),
+    ] = None,
+    sweeps: Annotated[
+        int, typer.Option(help="of --as-sensor: scans before and after, which fill gaps by their poses")
+    ] = 0,
+    like: Annotated[
+        Path | None, typer.Option(help="of --as-sensor: real scans of that sensor, to match its reflectance")
+    ] = None,
+    range_noise: Annotated[float, typer.Option(help="of --as-sensor: metres, noise beyond that of the input")] = 0.0,
+    reach: Annotated[
+        float | None,
+        typer.Option(help="of --as-sensor: metres at which it loses every second ray to a surface of 10 % reflectance"),
+    ] = None,
     unfold: Annotated[
         bool, typer.Option("--unfold", help="assign one row to each laser, from KITTI's order of points")
     ] = False,
@@ -46,7 +67,7 @@ def convert(
 
       lidar-synth convert scans out --to pcd --on-bad skip
 
-      lidar-synth convert SemanticKITTI out --to range --as-sensor os1_128
+      lidar-synth convert SemanticKITTI out --to kitti --as-sensor hdl32e_nuscenes --mount 0.1,0
 
       lidar-synth convert bank out --to webdataset --jobs 4
 
@@ -57,17 +78,54 @@ def convert(
     from lidar_synth.formats import WRITERS, open_scans
     from lidar_synth.formats.convert import convert as run
     from lidar_synth.formats.source import choose
-    from lidar_synth.geometry.sensor import load_sensor
 
     writer = choose("format", to, WRITERS)(out)
     given = {"layout": layout, "split": split, "fields": fields, "reflectance_max": reflectance_max}
     scans = open_scans(source, sensor=sensor, on_bad=on_bad, **given)  # type: ignore[arg-type]
-    target = None if as_sensor is None else load_sensor(as_sensor)
-    report = run(scans, writer, jobs=jobs, on_bad=on_bad, as_sensor=target, unfold=unfold)  # type: ignore[arg-type]
+    change = _change(scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach)
+    report = run(scans, writer, jobs=jobs, on_bad=on_bad, as_sensor=change, unfold=unfold)  # type: ignore[arg-type]
     print(f"{out}: {report.written} scans written, {report.kept} were there already, {len(report.skipped)} skipped")
+    if report.seen:
+        print(f"  {100 * sum(report.seen) / len(report.seen):.0f} % of the field of view of {as_sensor} was seen")
     for name, reason in report.skipped.items():
         print(f"  skipped {name}: {reason}", file=sys.stderr)
     for name, count in report.dropped.items():
         print(f"  dropped {count} points of {name}, which are NaN or infinite", file=sys.stderr)
     for what in report.left_out:
         print(f"  left out {what}", file=sys.stderr)
+
+
+def _change(
+    scans: "ScanFiles", as_sensor: str | None, mount: str | None, sweeps: int, like: Path | None, **how: Any
+) -> Any:
+    """What ``--as-sensor`` and its options do to the scans; None without it."""
+    from lidar_synth.errors import ConfigError
+    from lidar_synth.formats import open_scans
+    from lidar_synth.formats.as_sensor import AsSensor
+    from lidar_synth.geometry.sensor import load_sensor
+    from lidar_synth.geometry.transfer import Measurement, Response, Transfer
+
+    if as_sensor is None:
+        given = {k: v for k, v in {"mount": mount, "sweeps": sweeps, "like": like, **how}.items() if v}
+        if given:
+            raise ConfigError(f"{', '.join(given)} without --as-sensor", "the sensor that the scans are turned into")
+        return None
+    target = load_sensor(as_sensor)
+    response = None if like is None else Response.match(_some(scans), _some(open_scans(like, sensor=target)))
+    return AsSensor(Transfer(target, _mount(mount), Measurement(**how, response=response)), sweeps)
+
+
+def _mount(text: str | None) -> Any:
+    from lidar_synth.errors import ConfigError
+    from lidar_synth.geometry.transfer import Mount
+
+    try:
+        z, pitch = map(float, (text or "0,0").split(","))
+    except ValueError:
+        raise ConfigError(f"--mount {text}", "metres and degrees, for instance 0.1,0") from None
+    return Mount(z, pitch)
+
+
+def _some(scans: "ScanFiles") -> "list[Scan]":
+    """Ten scans spread over a source."""
+    return [scans.load(i) for i in sorted({round(k * (len(scans) - 1) / 9) for k in range(10)})]

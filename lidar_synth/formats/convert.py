@@ -18,12 +18,14 @@ from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import OnBad, ScanFiles, Writer
+from lidar_synth.formats.as_sensor import AsSensor
 from lidar_synth.formats.description import NAME, Origin, add_origin
 from lidar_synth.formats.writer import claim
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.projection import unfold as unfold_rings
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.transfer import Transfer
 
 CHUNK = 8
 """Number of scans that a worker takes at a time."""
@@ -43,6 +45,7 @@ class Report:
         skipped: {id: reason} of the scans that could not be read or written.
         dropped: {id: number} of points that were dropped because they are NaN or infinite.
         left_out: descriptions of files that the format supports but the source does not have.
+        seen: for each scan that another sensor saw, the share of its rays within the first sensor's field of view.
     """
 
     written: int = 0
@@ -50,6 +53,7 @@ class Report:
     skipped: dict[str, str] = field(default_factory=dict)
     dropped: dict[str, int] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list, compare=False)
+    seen: list[float] = field(default_factory=list, compare=False)
 
 
 class Outcome(NamedTuple):
@@ -60,12 +64,14 @@ class Outcome(NamedTuple):
         skipped: the reason why it was not written; "" if it was.
         dropped: number of points that were dropped.
         origin: where the scan comes from; None if it was not written.
+        seen: as in ``Report``; None without another sensor.
     """
 
     number: int
     skipped: str = ""
     dropped: int = 0
     origin: Origin | None = None
+    seen: float | None = None
 
 
 def convert(
@@ -74,7 +80,7 @@ def convert(
     *,
     jobs: int = 1,
     on_bad: OnBad = "error",
-    as_sensor: Sensor | None = None,
+    as_sensor: AsSensor | Transfer | Sensor | None = None,
     unfold: bool = False,
     progress: bool = True,
 ) -> Report:
@@ -87,9 +93,8 @@ def convert(
         on_bad: ``"error"`` stops at the first scan that cannot be read, or that the format cannot represent;
             ``"skip"`` skips and reports it; ``"drop-points"`` drops points that are NaN or infinite, counts them, and
             stops at any other fault.
-        as_sensor: re-project every scan to this sensor's grid first.
-        unfold: unfold every scan to a grid with one row per laser (``projection.unfold``), with the lasers of
-            ``as_sensor`` or of the scan's own sensor.
+        as_sensor: turn every scan into one of this sensor first (``geometry.transfer``).
+        unfold: unfold every scan to a grid with one row per laser (``projection.unfold``).
         progress: whether to show a progress bar.
 
     Returns:
@@ -103,16 +108,19 @@ def convert(
     """
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
+    change = _change(as_sensor)
     if isinstance(source, ScanFiles):
         source.check_sensor()  # both first, so that a wrong sensor leaves no settings behind
-        target = as_sensor or source.sensor
+        target = source.sensor if change is None else change.transfer.target
         writer.require_grid(target.by_beams() if unfold else target)
-    claim(writer.root / SETTINGS, _settings(source, writer, as_sensor, unfold))
+    claim(writer.root / SETTINGS, _settings(source, writer, change, unfold))
     missing, report = _compare(source, writer, on_bad)
-    if isinstance(source, ScanFiles):
+    if change is not None and change.moves:
+        if type(writer).carry is not Writer.carry:
+            report.left_out = ["files such as times.txt, which are copied only where the sensor stays in its place"]
+    elif isinstance(source, ScanFiles):
         report.left_out = writer.carry(source)
-    grid = partial(reproject, sensor=as_sensor, unfold=unfold) if unfold or as_sensor is not None else None
-    work = partial(convert_one, source, writer, grid, on_bad)
+    work = partial(convert_one, source, writer, change, unfold, on_bad)
     with in_processes(work, missing, jobs, CHUNK) as results:
         for done in tqdm(results, total=len(missing), unit="scan", disable=not (progress and missing)):
             _count(report, done, name_of(source, done.number) or str(done.number))
@@ -129,6 +137,14 @@ def _count(report: Report, done: Outcome, name: str) -> None:
         report.written += 1
     if done.dropped:
         report.dropped[name] = done.dropped
+    if done.seen is not None:
+        report.seen.append(done.seen)
+
+
+def _change(as_sensor: AsSensor | Transfer | Sensor | None) -> AsSensor | None:
+    if isinstance(as_sensor, AsSensor | None):
+        return as_sensor
+    return AsSensor(as_sensor if isinstance(as_sensor, Transfer) else Transfer(as_sensor))
 
 
 def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], Report]:
@@ -160,14 +176,14 @@ def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], 
 
 
 def convert_one(
-    source: Source, writer: Writer, grid: Callable[[Scan], Scan] | None, on_bad: OnBad, index: int
+    source: Source, writer: Writer, change: AsSensor | None, unfold: bool, on_bad: OnBad, index: int
 ) -> Outcome:
-    """Write the scan at ``index``, re-projected if a grid is given.
+    """Write the scan at ``index``, as another sensor would have recorded it if one is given.
 
     Raises:
         DataError, FileError: as ``convert``.
     """
-    camera, dropped = None, 0
+    camera, dropped, seen = None, 0, None
     try:
         if isinstance(source, ScanFiles):
             # Not source[index]: with on_bad="skip" that would be the next scan, under the name of the bad one.
@@ -175,7 +191,10 @@ def convert_one(
             dropped = source.dropped.get(source.ids[index], 0)
         else:
             scan = source[index]
-        scan = scan if grid is None else grid(scan)
+        if change is not None:
+            scan, seen = change.cast(scan, source, index)
+            camera = change.calibration(camera)
+        scan = reproject(scan, unfold=True) if unfold else scan
     except (DataError, FileError) as error:
         if on_bad != "skip":
             raise
@@ -186,7 +205,7 @@ def convert_one(
         if on_bad != "skip":
             raise
         return Outcome(index, str(error))
-    return Outcome(index, "", dropped, Origin.of(scan))
+    return Outcome(index, "", dropped, Origin.of(scan), seen)
 
 
 def reproject(scan: Scan, sensor: Sensor | None = None, unfold: bool = False) -> Scan:
@@ -213,11 +232,13 @@ def name_of(source: Source, index: int) -> str | None:
     return source.ids[index] if isinstance(source, ScanFiles) else None
 
 
-def _settings(source: Source, writer: Writer, as_sensor: Sensor | None, unfold: bool) -> dict[str, Any]:
+def _settings(source: Source, writer: Writer, change: AsSensor | None, unfold: bool) -> dict[str, Any]:
     """The settings that determine which scans are written, as far as the source has them."""
     settings: dict[str, Any] = {"scans": len(source), "writer": type(writer).__name__, "unfold": unfold}
     if isinstance(source, ScanFiles):
-        settings |= {"root": str(source.root.resolve()), "sensor": (as_sensor or source.sensor).to_dict()}
+        settings |= {"root": str(source.root.resolve()), "sensor": source.sensor.to_dict()}
+    if change is not None:
+        settings["sensor"] = change.identity
     return settings
 
 

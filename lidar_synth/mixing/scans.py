@@ -4,12 +4,15 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels import LabelPolicy, make_policy
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
@@ -60,6 +63,10 @@ class MixedScans(Dataset[Any]):
             your own function.
         unlabelled: ``"error"`` refuses a batch without any valid label; ``"allow"`` returns it, which is always the
             case with ``labels="none"``.
+        as_sensor: turns every synthetic scan into one of this sensor, before the label policy and in the process that
+            loads the sample: a ``Transfer``, a preset's name, a YAML file or a ``Sensor``. So a bank of one sensor
+            serves the scans of another. Losses and noise are new for every position of an epoch. Real scans stay
+            unchanged; ``SeenAs(real, transfer)`` turns those into scans of another sensor.
         real_as_is: whether real samples are returned unchanged, because they are not ``Scan`` but already have the
             trainer's form; see ``wrap``.
         compare: with ``real_as_is``, whether to compare the first real sample with a synthetic one at construction;
@@ -102,6 +109,7 @@ class MixedScans(Dataset[Any]):
         to_sample: ToSample = to_item,
         collate: Form | Callable[[Any], Any] = "offsets",
         unlabelled: Unlabelled = "error",
+        as_sensor: Transfer | Sensor | str | Path | None = None,
         real_as_is: bool = False,
         compare: bool = True,
     ) -> None:
@@ -109,16 +117,20 @@ class MixedScans(Dataset[Any]):
         synthetics = [(make_synthetic(source, seed), weight) for source, weight in each(synth)]
         self.real = tuple(source for source, _ in reals)
         self.synthetic = tuple(source for source, _ in synthetics)
+        self._transfer = as_sensor if isinstance(as_sensor, Transfer | None) else Transfer(load_sensor(as_sensor))
+        suffix = "" if self._transfer is None else f" as {self._transfer.identity}"
         self.mixture = Mixture(
             tuple(PlannedSource(len(source), weight, identity_of(source)) for source, weight in reals),
-            tuple(PlannedSource(source.length, weight, source.identity) for source, weight in synthetics),
+            tuple(PlannedSource(source.length, weight, source.identity + suffix) for source, weight in synthetics),
             make_schedule(ratio), seed, epoch_size, reuse, balanced,
         )  # fmt: skip
         sources = self.synthetic if real_as_is else self.real + self.synthetic
-        sensors = check_together(sources)
+        target = None if self._transfer is None else self._transfer.target
+        sensors = check_together(sources, [None] * (len(sources) - len(synthetics)) + [target] * len(synthetics))
         scans = None if real_as_is else real
         options = dict(label_options or {})
-        self._policies = [make_policy(labels, real=scans, fields=s.fields, **options) for s in self.synthetic]
+        rings = frozenset() if target is None else frozenset({"ring"})
+        self._policies = [make_policy(labels, real=scans, fields=s.fields | rings, **options) for s in self.synthetic]
         self._augment, self._augment_real = augment, augment_real
         self._to_sample, self._real_as_is = to_sample, real_as_is
         if isinstance(collate, str):
@@ -293,7 +305,7 @@ class MixedScans(Dataset[Any]):
         return self._to_sample(real, rng)
 
     def finish(self, scan: Scan, epoch: int, position: int) -> Any:
-        """Make the sample of a synthetic scan at its position: label policy, augmentation, ``to_sample``.
+        """Make the sample of a synthetic scan at its position: sensor, label policy, augmentation, ``to_sample``.
 
         This is for callers that make the scan elsewhere, such as in the main process on a GPU.
         """
@@ -302,6 +314,8 @@ class MixedScans(Dataset[Any]):
         return self._finish(plan[position][0] - plan.reals, scan, rng)
 
     def _finish(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
+        if self._transfer is not None:
+            scan = self._transfer(scan, rng)
         scan = self._policies[source](scan, rng)
         if self._augment is not None:
             scan = self._augment(scan, rng)

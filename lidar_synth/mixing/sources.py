@@ -89,23 +89,27 @@ def sensor_of(source: Any) -> Sensor:
     return first.sensor
 
 
-def check_together(sources: Sequence[Any]) -> list[Sensor]:
-    """Check that scans of several sources fit into one training set, and return the sources' sensors.
+def check_together(sources: Sequence[Any], as_sensors: Sequence[Sensor | None]) -> list[Sensor]:
+    """Check that scans of several sources fit into one training set, and return the sensors of the samples.
 
     Sensors agree if their rows and columns have the same directions; range limits and names may differ. A source's
     attribute ``classes`` (names by train id) defines its labels; by default they are SemanticKITTI's 19 classes.
 
+    Args:
+        sources: the sources.
+        as_sensors: for each source, the sensor that its scans are turned into; None for its own.
+
     Raises:
         ConfigError: on different grids or classes.
     """
-    sensors = [sensor_of(source) for source in sources]
+    sensors = [wanted or sensor_of(source) for source, wanted in zip(sources, as_sensors, strict=True)]
     for sensor in sensors[1:]:
         if sensor.shape != sensors[0].shape or not np.array_equal(sensor.edges, sensors[0].edges):
             raise ConfigError(
                 f"sources of the sensors {_grid(sensors[0])} and {_grid(sensor)}",
                 "one grid for all real and synthetic scans",
-                "Open the real scans with the generator's sensor (sensor=generator.sensor), or use a model or bank "
-                "of the real scans' sensor.",
+                "Turn the synthetic scans into scans of the real ones' sensor (as_sensor=real.sensor), or open the "
+                "real scans with the generator's sensor (sensor=generator.sensor).",
             )
     for source in sources:
         classes = tuple(getattr(source, "classes", NAMES))

@@ -44,6 +44,11 @@ TOPICS = {
 
 FURTHER = (
     "lidar_synth.geometry.projection.batch.project_batch",
+    "lidar_synth.geometry.transfer.transfer.Transfer",
+    "lidar_synth.geometry.transfer.transfer.SeenAs",
+    "lidar_synth.geometry.transfer.mount.Mount",
+    "lidar_synth.geometry.transfer.returns.Measurement",
+    "lidar_synth.geometry.transfer.response.Response",
     "lidar_synth.mixing.synthetic.Generated",
     "lidar_synth.mixing.items.to_item",
     "lidar_synth.mixing.collate.Collate",

@@ -1,0 +1,79 @@
+"""From hits to returns: losses, noise of the range, limits and quantisation of the target sensor."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.transfer.response import Response
+
+DARKEST = 0.02
+"""Reflectance that a return has at least, for the strength of its signal."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """How the target sensor measures other than the recording one; not at all by default.
+
+    Args:
+        range_noise: metres, standard deviation that is added to the range: of the target beyond that of the source.
+        loss: share of returns that are lost at random, in [0, 1).
+        reach: metres at which a surface of 10 % reflectance that faces the sensor returns every second ray; the signal
+            falls with the square of the distance, with the reflectance and with the cosine of the angle of incidence.
+            None loses nothing.
+        response: from the reflectance of the recording sensor to that of the target; None changes nothing.
+
+    Raises:
+        ConfigError: on values out of range.
+    """
+
+    range_noise: float = 0.0
+    loss: float = 0.0
+    reach: float | None = None
+    response: Response | None = None
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.range_noise <= 1 and 0 <= self.loss < 1 and (self.reach is None or self.reach > 0)):
+            raise ConfigError(
+                f"range_noise={self.range_noise}, loss={self.loss}, reach={self.reach}",
+                "0 to 1 m, a share below 1, and metres above 0 or None",
+            )
+
+    def returned(
+        self,
+        distance: NDArray[np.float64],
+        reflectance: NDArray[np.float64],
+        facing: NDArray[np.float64],
+        rng: np.random.Generator,
+    ) -> NDArray[np.bool_]:
+        """(N,) which of N hits return.
+
+        Args:
+            distance: (N,) metres.
+            reflectance: (N,) in [0, 1].
+            facing: (N,) cosine of the angle of incidence.
+            rng: samples the losses.
+        """
+        kept = np.full(len(distance), 1 - self.loss)
+        if self.reach is not None:
+            signal = np.maximum(reflectance, DARKEST) * facing * (self.reach / distance) ** 2 / 0.1
+            kept *= signal**2 / (1 + signal**2)
+        return np.asarray(rng.random(len(distance)) < kept)
+
+    def ranges(self, distance: NDArray[np.float64], target: Sensor, rng: np.random.Generator) -> NDArray[np.float64]:
+        """(N,) measured ranges of hits at a distance (N,), metres, in the steps of the target."""
+        if self.range_noise:
+            distance = distance + self.range_noise * rng.standard_normal(len(distance))
+        step = target.range_step
+        return distance if step is None else np.round(distance / step) * step
+
+    def reflectances(self, reflectance: NDArray[np.float64], target: Sensor) -> NDArray[np.float32]:
+        """(N,) measured reflectances in [0, 1], in the levels of the target: multiples of 1 / levels below 1."""
+        if self.response is not None:
+            reflectance = self.response(reflectance)
+        levels = target.reflectance_levels
+        if levels is not None:
+            reflectance = np.minimum(np.round(reflectance * levels), levels - 1) / levels
+        return np.clip(reflectance, 0, 1).astype(np.float32)

@@ -1,0 +1,204 @@
+"""``Transfer``: what another sensor on another mount would have recorded of the same scene."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.transfer.casting import Hits, first_hits
+from lidar_synth.geometry.transfer.mount import Mount
+from lidar_synth.geometry.transfer.rays import Rays, rays_of
+from lidar_synth.geometry.transfer.returns import Measurement
+from lidar_synth.geometry.transfer.surfaces import Surfaces, estimate
+from lidar_synth.geometry.transfer.sweeps import moved
+from lidar_synth.noise import keyed_rng
+
+SECTORS = 360
+"""Sectors of azimuth, in which a scan has returns where its sensor looked."""
+
+
+class Transferred(NamedTuple):
+    """A scan of the target sensor.
+
+    Args:
+        scan: its returns, row by row.
+        seen: share of the target's rays, in [0, 1], that lie within the field of view of the recording sensor; the
+            others have no return.
+    """
+
+    scan: Scan
+    seen: float
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Turns scans of one sensor into scans of another.
+
+    Surfaces are estimated from the returns: neighbours are joined unless the step between them or their labels say
+    that they belong to different surfaces. The target's rays are cast at these surfaces from the target's mount.
+    A return with no neighbour of its surface stands for the patch between it and the neighbouring rays, so that
+    leaves and poles keep their share of returns. Where the recording sensor saw nothing, there is no return.
+
+    Label, raw label, instance, confidence and time are those of the nearest return; reflectance is interpolated; the
+    ring is the target's laser. Boxes, pose and the rest move to the target's frame.
+
+    Args:
+        target: the sensor to imitate: its lasers, firings, limits and quantisation.
+        mount: the target's place relative to the recording sensor.
+        measurement: how the target measures other than the recording sensor.
+        vehicle: (length, width) in metres of the footprint around the recording sensor, below it, whose returns are of
+            the vehicle that carries it. If the target has another mount they are left out; otherwise they would stand
+            in its way.
+
+    Example:
+        >>> from lidar_synth import Town, load_sensor
+        >>> from lidar_synth.geometry.transfer import Mount, Transfer
+        >>> transfer = Transfer(load_sensor("hdl32e_nuscenes"), Mount(z=0.1))
+        >>> scan, seen = transfer.cast(Town(seed=0, scans=1)[0])
+        >>> scan.sensor.name, int(scan.ring.max()) < 32, round(seen, 2)
+        ('hdl32e_nuscenes', True, 0.66)
+    """
+
+    target: Sensor
+    mount: Mount = field(default_factory=Mount)
+    measurement: Measurement = field(default_factory=Measurement)
+    vehicle: tuple[float, float] = (4.0, 2.0)
+
+    def __call__(self, scan: Scan, rng: np.random.Generator | None = None) -> Scan:
+        """The scan as the target sensor would have recorded it; see ``cast``."""
+        return self.cast(scan, rng).scan
+
+    def cast(self, scan: Scan, rng: np.random.Generator | None = None, sweeps: Sequence[Scan] = ()) -> Transferred:
+        """The scan as the target sensor would have recorded it, and the share of its field of view that was seen.
+
+        Args:
+            scan: N returns; with ``ring``, or in the order of a file of KITTI, or on the beams of its sensor.
+            rng: samples losses and noise; by default the same for every scan.
+            sweeps: other sweeps of the same drive, with poses. Their surfaces fill rays that hit nothing in the scan;
+                moving objects follow their boxes (sweeps.py). The result has no times.
+
+        Raises:
+            DataError: on a scan without a return, with one beam only, with points on no rings or that are not finite;
+                if nothing of it is in the target's field of view; on sweeps without poses.
+        """
+        rays, rng = rays_of(self.target), rng or keyed_rng(0)
+        surfaces = estimate(self._without_vehicle(scan))
+        seen = float(_seen(surfaces, rays, self.mount).mean())
+        upright = self.mount.matrix[2, :3]
+        hits = first_hits(surfaces, self.mount.points(surfaces.scan.points), rays, upright)
+        others = [estimate(self._without_vehicle(sweep)) for sweep in sweeps]
+        if others:
+            placed = [self.mount.points(moved(other.scan, scan)) for other in others]
+            found = [first_hits(other, points, rays, upright) for other, points in zip(others, placed, strict=True)]
+            hits.carried.pop("time", None)  # sweeps count from moments of their own
+            hits.fill(_nearest(found, hits))
+        returns = self._returns(hits, rays, rng)
+        if not len(returns):
+            raise DataError(
+                f"scan {scan.id!r} of {scan.sensor.name!r}: none of its surfaces lies within the field of view and the "
+                f"range of {self.target.name!r} ({self.target.down:.1f} to {self.target.up:.1f} degrees; "
+                f"{100 * seen:.0f} % of it was seen)",
+                "sensors whose fields of view overlap",
+                "Check the two sensors and the mount.",
+            )
+        boxes = None if scan.boxes is None else self.mount.boxes(scan.boxes)
+        pose = None if scan.pose is None else scan.pose @ self.mount.matrix
+        kept = {name: getattr(scan, name) for name in ("image_path", "id", "domain", "provenance")}
+        return Transferred(replace(returns, boxes=boxes, pose=pose, **kept), seen)
+
+    def _without_vehicle(self, scan: Scan) -> Scan:
+        """The scan without returns of the vehicle that carries its sensor, where the target has another mount."""
+        if self.mount == Mount():
+            return scan
+        along, across, above = np.abs(scan.points[:, 0]), np.abs(scan.points[:, 1]), scan.points[:, 2]
+        # Not the road beside a low sensor: a vehicle is at most 1.5 m below the sensor on it.
+        own = (along < self.vehicle[0] / 2) & (across < self.vehicle[1] / 2) & (above < 0) & (above > -1.5)
+        return scan if not own.any() else scan[~own]
+
+    def _returns(self, hits: Hits, rays: Rays, rng: np.random.Generator) -> Scan:
+        """The returns of the rays that hit something, row by row."""
+        row, firing = np.nonzero(np.isfinite(hits.rho))
+        secant = np.sqrt(1 + rays.slope[row] ** 2)
+        distance = hits.rho[row, firing] * secant
+        kept = self.measurement.returned(distance, hits.reflectance[row, firing], hits.facing[row, firing], rng)
+        row, firing, secant = row[kept], firing[kept], secant[kept]
+        rho = self.measurement.ranges(distance[kept], self.target, rng) / secant
+        azimuth = rays.first[row] + firing * rays.step
+        points = np.stack(
+            [rho * np.cos(azimuth), -rho * np.sin(azimuth), rays.height[row] + rho * rays.slope[row]], 1
+        ).astype(np.float32)
+        distance = np.linalg.norm(points, axis=1)
+        inside = (rho > 0) & (distance >= self.target.range_min) & (distance <= self.target.range_max)
+        row, firing = row[inside], firing[inside]
+        carried: dict[str, Any] = {name: values[row, firing] for name, values in hits.carried.items()}
+        reflectance = self.measurement.reflectances(hits.reflectance[row, firing], self.target)
+        return Scan(points[inside], reflectance, self.target, ring=row.astype(np.int16), **carried)
+
+    @property
+    def identity(self) -> str:
+        """A text of everything that determines the scans."""
+        return f"{self.target.to_dict()} {asdict(self.mount)} {asdict(self.measurement)} {self.vehicle}"
+
+
+class SeenAs:
+    """The scans of a source, each as another sensor would have recorded it.
+
+    Args:
+        source: the scans.
+        transfer: from their sensor to the other one.
+        seed: of losses and noise; those of a scan depend on the seed and its index.
+
+    Example:
+        >>> from lidar_synth import load_sensor, open_scans
+        >>> from lidar_synth.geometry.transfer import SeenAs, Transfer
+        >>> scans = SeenAs(open_scans("demo_out/town"), Transfer(load_sensor("os1_128")))
+        >>> scans[0].sensor.name
+        'os1_128'
+    """
+
+    def __init__(self, source: Source, transfer: Transfer, seed: int = 0) -> None:
+        self.source, self.transfer, self.seed = source, transfer, seed
+        self.sensor = transfer.target
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, index: int) -> Scan:
+        return self.transfer(self.source[index], keyed_rng(self.seed, index % len(self)))
+
+
+def _seen(surfaces: Surfaces, rays: Rays, mount: Mount) -> NDArray[np.bool_]:
+    """(H, F) which rays lie within the field of view of the sensor that recorded the surfaces."""
+    azimuth = rays.first[:, None] + np.arange(rays.firings) * rays.step
+    slope = np.broadcast_to(rays.slope[:, None], azimuth.shape)
+    directions = np.stack([np.cos(azimuth), -np.sin(azimuth), slope], -1) @ mount.matrix[:3, :3].T
+    elevation = np.arctan2(directions[..., 2], np.hypot(directions[..., 0], directions[..., 1]))
+    points = surfaces.scan.points
+    looked = np.bincount(_sector(points[:, 0], points[:, 1]), minlength=SECTORS) > 0
+    inside = (elevation >= surfaces.bounds[0]) & (elevation <= surfaces.bounds[1])
+    return np.asarray(inside & looked[_sector(directions[..., 0], directions[..., 1])])
+
+
+def _sector(x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.int64]:
+    return np.asarray(np.floor(np.arctan2(y, x) / (2 * np.pi) * SECTORS), np.int64) % SECTORS
+
+
+def _nearest(several: list[Hits], like: Hits) -> Hits:
+    """The nearest hit of each ray among several."""
+    order = np.argmin(np.stack([hits.rho for hits in several]), 0)
+    names = [n for n in like.carried if all(n in hits.carried for hits in several)]
+
+    def pick(arrays: list[NDArray[Any]]) -> NDArray[Any]:
+        return np.asarray(np.choose(order, arrays))
+
+    return Hits(
+        pick([h.rho for h in several]),
+        pick([h.reflectance for h in several]),
+        pick([h.facing for h in several]),
+        {name: pick([h.carried[name] for h in several]) for name in names},
+    )
