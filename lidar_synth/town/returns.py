@@ -1,9 +1,11 @@
 """The sensor model: from ray hits to returns with range and reflectance, or to no return.
 
-The model is fitted to labelled street scans of an HDL-64E. Reflectance is corrected for distance up to about 25 m and
-then decreases; it hardly depends on the angle of incidence except near grazing incidence; glossy paint and glass
-return light only at normal incidence; number plates and signs are retroreflectors; each laser has its own gain.
-Rays are dropped at random, with a probability that grows as the returned signal falls.
+The model is fitted to 28 labelled street scans of an HDL-64E (SemanticKITTI; docs/research/judge.md). Reflectance is
+corrected for distance up to about 20 m and then decreases; below a knee it falls to 0 faster than the signal, so that
+dark paint and distant asphalt give 0; it hardly depends on the angle of incidence except near grazing incidence;
+glossy paint and glass return light only at normal incidence; number plates and signs are retroreflectors; each laser
+has its own gain. Rays are dropped at random, with a probability that grows as the returned signal falls. Soft surfaces
+(leaves, grass) have relief: their returns lie before or behind the triangle, along the ray.
 """
 
 from dataclasses import dataclass
@@ -32,6 +34,9 @@ _DISTANCE_FACTOR = np.interp(
 _KNEE, _SLOPE = 0.30, 3.0
 """Below this value the measured reflectance falls ``_SLOPE`` times as fast, to 0: dark and distant surfaces give 0."""
 _TAIL = 0.8
+"""Logarithmic standard deviation of the roughness from return to return: most are small, a few are large."""
+_FLATTEST, _DEEPEST = 0.06, 0.1
+"""Least cosine by which relief is divided to give a shift along the ray; largest shift as a share of the range."""
 _ZERO_SHARE = 0.02
 """Share of returns whose reflectance is 0 at random."""
 
@@ -130,30 +135,42 @@ def measure(
     material = surfaces.material[surface]
     facing = np.abs(np.einsum("ij,ij->i", hits.normal[hit], directions[hit]))
     power = surfaces.reflectance[surface] * (1 - _GLOSS[material] * (1 - facing * facing))
-    spreading = np.minimum(1, 900 / np.maximum(distance * distance, 1))
-    signal = power * np.minimum(1, facing * 9) * spreading + np.float32(0.002)
-    return_probability = (1 - _DROPOUT[material]) * signal**2 / (signal**2 + np.float32(noise.threshold) ** 2)
-    returned = np.flatnonzero(rng.random(len(hit), np.float32) < return_probability)
-    hit, distance, material, power, facing = (
-        hit[returned],
-        distance[returned],
-        material[returned],
-        power[returned],
-        facing[returned],
-    )
+    probability = (1 - _DROPOUT[material]) * _return_probability(power, facing, distance, noise)
+    kept = np.flatnonzero(rng.random(len(hit), np.float32) < probability)
+    hit, distance, material, power, facing = hit[kept], distance[kept], material[kept], power[kept], facing[kept]
     gaussian = rng.standard_normal((3, len(hit)), np.float32)
-    distance_bin = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1).astype(np.int32)
     slope = facing + _GRAZING[material]
-    value = power * gains[laser[hit]] * _DISTANCE_FACTOR[distance_bin] * np.clip((slope - 0.015) / 0.06, 0, 1)
-    value = np.maximum(np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0)
+    shift = _displacement(material, origins[hit], directions[hit], distance, gaussian[1:]) / np.clip(
+        slope, _FLATTEST, 1
+    )
+    measured = distance + np.clip(shift, -_DEEPEST * distance, _DEEPEST * distance)
+    measured += np.float32(noise.range_std) * gaussian[1]
+    value = _response(power * gains[laser[hit]], slope, distance)
     value += _SPECKLE[material] * gaussian[0] * np.minimum(1, 4 * value)
     value = value * (rng.random(len(hit), np.float32) > _ZERO_SHARE)
-    displaced = _ROUGHNESS[material] * gaussian[1] * np.exp(_TAIL * gaussian[2])
-    soft = np.flatnonzero(_RELIEF[material])
-    displaced[soft] += _RELIEF[material[soft]] * relief(
-        origins[hit[soft]] + distance[soft, None] * directions[hit[soft]]
-    )
-    shift = displaced / np.clip(slope, 0.06, 1)
-    measured = distance + np.clip(shift, -0.1 * distance, 0.1 * distance) + np.float32(noise.range_std) * gaussian[1]
     reflectance = np.floor(np.clip(value, 0, 0.995) * LEVELS) / LEVELS
     return hit, measured, reflectance.astype(np.float32)
+
+
+def _return_probability(power: Floats, facing: Floats, distance: Floats, noise: Noise) -> Floats:
+    """(N,) probability that the signal of a hit exceeds the sensor's threshold."""
+    spreading = np.minimum(1, 900 / np.maximum(distance * distance, 1))
+    signal = power * np.minimum(1, facing * 9) * spreading + np.float32(0.002)
+    return np.asarray(signal**2 / (signal**2 + np.float32(noise.threshold) ** 2))
+
+
+def _response(power: Floats, slope: Floats, distance: Floats) -> Floats:
+    """(N,) the reflectance that the sensor gives for a reflected power, 0 and more, without noise."""
+    distance_bin = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1).astype(np.int32)
+    value = power * _DISTANCE_FACTOR[distance_bin] * np.clip((slope - 0.015) / 0.06, 0, 1)
+    return np.maximum(np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0)
+
+
+def _displacement(
+    material: NDArray[np.uint8], origins: Floats, directions: Floats, distance: Floats, gaussian: Floats
+) -> Floats:
+    """(N,) metres by which the surface at each hit lies behind its triangle."""
+    displaced = _ROUGHNESS[material] * gaussian[0] * np.exp(_TAIL * gaussian[1])
+    soft = np.flatnonzero(_RELIEF[material])
+    displaced[soft] += _RELIEF[material[soft]] * relief(origins[soft] + distance[soft, None] * directions[soft])
+    return np.asarray(displaced)
