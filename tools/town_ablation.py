@@ -1,20 +1,20 @@
-"""Why a network that learnt from real streets rejects the town: one change at a time, each a line of a table.
+"""What makes the town real to a network that learnt from real streets: one property put back at a time.
 
-    python tools/town_ablation.py SEMANTIC_KITTI --judge FOLDER [--streets 50] [--only NAME ...]
+    python tools/town_ablation.py SEMANTIC_KITTI --judge FOLDER [--streets 50] [--frames 1] [--width 1024] [--only NAME]
 
 SEMANTIC_KITTI is a folder of labelled real scans in that layout, FOLDER an archive of lidar-bonnetal. The first table
-changes one property of the town's surfaces, sensor or points; the second pastes the returns of one class, with
-occlusion, from real scans into scans of the town and from the town into real scans, and gives the share of the pasted
-cells that the network recognises. docs/research/judge.md has the tables.
+puts back one property of the sensor or of the surfaces that an earlier town had; the second pastes the returns of one
+class, with occlusion, from real scans into scans of the town and from the town into real scans, and gives the share of
+the pasted cells that the network recognises. docs/research/judge.md has the tables.
 """
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,73 +23,53 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import TRAIN_ID
+from lidar_synth.evaluate.distances import frechet_distance
 from lidar_synth.evaluate.recognition import Recognition
 from lidar_synth.evaluate.street_judge import StreetJudge, load_archive
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.town import STRETCH_FRAMES, Town, ground, returns
+from lidar_synth.town import STRETCH_FRAMES, Town, returns
 from lidar_synth.town.materials import INDEX
 from lidar_synth.town.returns import Noise
 
 SHOWN = ("car", "road", "sidewalk", "parking", "building", "fence", "vegetation", "terrain", "trunk", "pole")
-LEAVES, SOIL = ("leaf", "foliage"), ("grass", "soil")
+SOFT = ("leaf", "foliage", "grass", "soil", "gravel")
 
 Image = tuple[Tensor, NDArray[np.uint8]]
 """The network's input (5, H, W) and the labels (H, W)."""
 
 
-NONE: Mapping[str, float] = MappingProxyType({})
-
-
 class Change(NamedTuple):
-    """A change of the town.
+    """What is put back.
 
     Args:
-        speckle: factor of the reflectance's standard deviation between returns.
-        kept: factor of it for leaves, grass and soil, if it is another one.
-        range_std: metres, standard deviation of the range.
-        roughness, transmission: by material, in place of its own.
-        lift: metres above the carriageway, by kind of ground, in place of its own.
-        columns: firings per turn.
-        edit: changes each scan.
+        tables: {name of a table of ``town.returns``: {material: value in place of its own}}; "" stands for all.
+        factors: {name of a table: factor of all materials}.
+        constants: {name of a constant of ``town.returns``: value}.
+        town: options of ``Town``.
+        columns: firings per turn, one through the centre of each cell; None for the sensor's own.
     """
 
-    speckle: float = 1.0
-    kept: float | None = None
-    range_std: float = 0.018
-    roughness: Mapping[str, float] = NONE
-    transmission: Mapping[str, float] = NONE
-    lift: Mapping[str, float] = NONE
-    columns: int = 1024
-    edit: Callable[[Scan], Scan] = lambda scan: scan
+    tables: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+    factors: Mapping[str, float] = MappingProxyType({})
+    constants: Mapping[str, float] = MappingProxyType({})
+    town: Mapping[str, Any] = MappingProxyType({})
+    columns: int | None = None
 
 
-def _lower(scan: Scan) -> Scan:
-    return replace(scan, points=scan.points - np.array([0, 0, 0.045], np.float32))
-
-
-_SMOOTH = {"speckle": 0.5, "kept": 0.65, "range_std": 0.006}
 CHANGES = {
     "the town": Change(),
-    "range noise 0.6 cm, not 1.8": Change(range_std=0.006),
-    "speckle x 0.5": Change(speckle=0.5),
-    "speckle x 0.5, of leaves, grass and soil x 0.65": Change(speckle=0.5, kept=0.65),
-    "speckle x 0.2": Change(speckle=0.2),
-    "sensor 4.5 cm lower": Change(edit=_lower),
-    "2048 firings": Change(columns=2048),
-    "leaves rough by 20 cm, not 3": Change(roughness=dict.fromkeys(LEAVES, 0.2)),
-    "leaves let 60 % through, not 10": Change(transmission={"leaf": 0.6}),
-    "grass and soil rough by 5 cm, not 2.5": Change(roughness=dict.fromkeys(SOIL, 0.05)),
-    "grass and soil 13 cm lower": Change(lift=dict.fromkeys(SOIL, -0.03)),
-    "smooth: range noise and speckle as above": Change(**_SMOOTH),
-    "smooth, leaves rough by 20 cm": Change(**_SMOOTH, roughness=dict.fromkeys(LEAVES, 0.2)),
-    "smooth, leaves rough and 60 % open": Change(
-        **_SMOOTH, roughness=dict.fromkeys(LEAVES, 0.2), transmission={"leaf": 0.6}
-    ),
-    "smooth, leaves rough and 60 % open, 2048 firings": Change(
-        **_SMOOTH, roughness=dict.fromkeys(LEAVES, 0.2), transmission={"leaf": 0.6}, columns=2048
-    ),
+    "1,024 firings, not 2,175": Change(columns=1024),
+    "the vehicle stands still": Change(town={"motion": False}),
+    "range noise 1.8 cm, not 0.8": Change(town={"noise": Noise(range_std=0.018)}),
+    "speckle x 2": Change(factors={"_SPECKLE": 2.0}),
+    "speckle x 0.5": Change(factors={"_SPECKLE": 0.5}),
+    "no knee in the response": Change(constants={"_SLOPE": 1.0}),
+    "no relief": Change(factors={"_RELIEF": 0.0}),
+    "no relief, no roughness": Change(factors={"_RELIEF": 0.0, "_ROUGHNESS": 0.0}),
+    "leaves let 10 % through, not 35": Change(tables={"_TRANSMISSION": {"leaf": 0.1}}),
+    "soft surfaces darken at grazing angles": Change(tables={"_GRAZING": dict.fromkeys(SOFT, 0.0)}),
 }
 """The lines of the first table."""
 
@@ -98,39 +78,41 @@ PASTED = ("vegetation", "terrain", "building", "car", "road")
 
 @contextmanager
 def applied(change: Change) -> Iterator[None]:
-    """The town's surfaces with a change; they are restored afterwards."""
-    before = returns._SPECKLE, returns._ROUGHNESS, returns._TRANSMISSION, ground._LIFT
-    speckle, rough, open_, lift = (table.copy() for table in before)
-    soft = [INDEX[name] for name in (*LEAVES, *SOIL)]
-    factor = np.full(len(speckle), change.speckle, np.float32)
-    factor[soft] = change.speckle if change.kept is None else change.kept
-    for table, values, index in (
-        (rough, change.roughness, INDEX),
-        (open_, change.transmission, INDEX),
-        (lift, change.lift, {name: i for i, name in enumerate(ground.NAMES)}),
-    ):
-        for name, value in values.items():
-            table[index[name]] = value
-    returns._SPECKLE, returns._ROUGHNESS, returns._TRANSMISSION, ground._LIFT = speckle * factor, rough, open_, lift
+    """The town's sensor model with a change; it is restored afterwards."""
+    names = {*change.tables, *change.factors, *change.constants}
+    before = {name: getattr(returns, name) for name in names}
+    for name, factor in change.factors.items():
+        setattr(returns, name, getattr(returns, name) * np.float32(factor))
+    for name, values in change.tables.items():
+        table = getattr(returns, name).copy()
+        table[[INDEX[material] for material in values]] = list(values.values())
+        setattr(returns, name, table)
+    for name, value in change.constants.items():
+        setattr(returns, name, value)
     try:
         yield
     finally:
-        returns._SPECKLE, returns._ROUGHNESS, returns._TRANSMISSION, ground._LIFT = before
+        for name, value in before.items():
+            setattr(returns, name, value)
 
 
-def town_scans(change: Change, streets: int, seed: int) -> Iterator[Scan]:
-    """One scan of each of the first streets of a town."""
-    sensor = replace(load_sensor("town"), columns=change.columns)
-    town = Town(seed, sensor, streets * STRETCH_FRAMES, noise=Noise(range_std=change.range_std))
+def town_scans(change: Change, streets: int, frames: int, seed: int) -> Iterator[Scan]:
+    """Evenly spaced scans of each of the first streets of a town."""
+    sensor = load_sensor("town")
+    if change.columns is not None:
+        sensor = replace(sensor, columns=change.columns, firings=None, azimuths=None)
+    town = Town(seed, sensor, streets * STRETCH_FRAMES, **change.town)
     for street in tqdm(range(streets), leave=False):
-        yield change.edit(town[street * STRETCH_FRAMES + 7])
+        for frame in range(frames):
+            yield town[street * STRETCH_FRAMES + (2 * frame + 1) * STRETCH_FRAMES // (2 * frames)]
 
 
-def row(name: str, table: NDArray[np.int64]) -> str:
-    """A line of the first table."""
-    found = Recognition(table, np.zeros((1, 1)))
+def row(name: str, scans: list[Scan], judge: StreetJudge, real: NDArray[np.floating]) -> str:
+    """A line of the first table: points of a scan, distance of the judge's features from real ones, recognition."""
+    found = Recognition(judge.confusion(scans), judge.features(scans))
     ious = found.iou()
-    cells = [f"{100 * found.accuracy:.1f}", f"{100 * found.mean_iou:.1f}"]
+    cells = [f"{np.mean([len(scan) for scan in scans]):,.0f}", f"{frechet_distance(found.features, real):.2f}"]
+    cells += [f"{100 * found.accuracy:.1f}", f"{100 * found.mean_iou:.1f}"]
     cells += [f"{100 * ious[c]:.0f}" if c in ious else "" for c in SHOWN]
     return f"| {name} | {' | '.join(cells)} |"
 
@@ -171,20 +153,26 @@ def main() -> None:
     parser.add_argument("root", type=Path, help="labelled real scans in SemanticKITTI's layout")
     parser.add_argument("--judge", type=Path, required=True, help="archive of lidar-bonnetal")
     parser.add_argument("--streets", type=int, default=50)
+    parser.add_argument("--frames", type=int, default=1, help="of each street")
+    parser.add_argument("--width", type=int, default=1024, help="of the judge's grid")
     parser.add_argument("--seed", type=int, default=7, help="of the town")
     parser.add_argument("--only", nargs="*", choices=list(CHANGES), default=list(CHANGES), metavar="NAME")
     given = parser.parse_args()
 
-    judge, source = load_archive(given.judge, 1024), open_scans(given.root)
+    judge, source = load_archive(given.judge, given.width), open_scans(given.root)
     real = [source[i] for i in range(len(source))]
-    print("| 64 x 1024, % | accuracy | mIoU | " + " | ".join(SHOWN) + " |")
-    print("|---|" + "---:|" * (len(SHOWN) + 2))
-    print(row("real scans", judge.confusion(real)), flush=True)
+    features = judge.features(real)
+    print(f"| 64 x {given.width}, % | points | Frechet | accuracy | mIoU | " + " | ".join(SHOWN) + " |")
+    print("|---|" + "---:|" * (len(SHOWN) + 4))
+    print(row("real scans", real, judge, features), flush=True)
     for name in given.only:
         with applied(CHANGES[name]):
-            print(row(name, judge.confusion(town_scans(CHANGES[name], given.streets, given.seed))), flush=True)
+            scans = list(town_scans(CHANGES[name], given.streets, given.frames, given.seed))
+        print(row(name, scans, judge, features), flush=True)
+    if given.only != list(CHANGES):
+        return
     print("\n| recognised, % | real in real | real in town | town in town | town in real |\n|---|---:|---:|---:|---:|")
-    town = [judge.image(scan) for scan in town_scans(Change(), given.streets, given.seed)]
+    town = [judge.image(scan) for scan in town_scans(Change(), given.streets, 1, given.seed)]
     for line in exchange(judge, [judge.image(scan) for scan in real], town):
         print(line, flush=True)
 
