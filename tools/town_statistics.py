@@ -25,8 +25,6 @@ GROUPS = [(0, 4), (4, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 40), (40, 
 """Rows that one line of the table takes together, 0 = highest."""
 RANGES = (0, 5, 10, 15, 20, 30, 40, 60, 80)
 REFLECTANCE = (0, 1 / 256, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
-FIRINGS = 2083
-"""Firings of a real HDL-64E in a turn at 10 Hz."""
 
 
 def is_ground(points: np.ndarray) -> np.ndarray:
@@ -42,9 +40,11 @@ def statistics(scan: Scan) -> dict[str, float]:
     filled, ranges = image.mask, image.range
     assert image.reflectance is not None
     distance = np.linalg.norm(scan.points, axis=1)
-    whole = scan.sensor.columns if scan.ring is not None else FIRINGS
-    rings = np.bincount(ring_numbers(scan.points) if scan.ring is None else scan.ring, minlength=64)[:64] / whole
-    figures = {"cells filled of 65,536": filled.sum()}
+    assert sensor.firings is not None
+    rings = (
+        np.bincount(ring_numbers(scan.points) if scan.ring is None else scan.ring, minlength=64)[:64] / sensor.firings
+    )
+    figures = {"points": float(len(scan)), "cells filled of 65,536": filled.sum()}
     for a, b in GROUPS:
         figures[f"empty cells, rows {a} to {b - 1}"] = 1 - filled[a:b].mean()
     # A row that no beam reaches is empty, but not because returns were lost.
