@@ -24,6 +24,7 @@ from lidar_synth.town.movers import ego_place, ego_pose, place_movers
 from lidar_synth.town.returns import Noise, laser_gains, measure, see_through
 from lidar_synth.town.scene import Pose
 from lidar_synth.town.shading import render, sample_light
+from lidar_synth.town.skin.skin import Skin, load_skin
 from lidar_synth.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, rng_for
 
 REVOLUTION = 0.1
@@ -41,9 +42,14 @@ class Town:
         scans: number of scans.
         interval: seconds between neighbouring scans of a stretch, 0 < interval < 60.
         noise: the measurement noise of the sensor; by default ``Noise()``.
+        skin: the look of a real sensor's returns, as ``load_skin`` takes it; by default the physical model's alone.
+            Labels, rings and boxes are the same with it; a few returns are missing.
 
     Raises:
-        ConfigError: on a negative seed or number of scans, an interval out of range, or an unknown sensor.
+        ConfigError: on a negative seed or number of scans, an interval out of range, an unknown sensor or skin, or a
+            skin of another sensor.
+        FileError: on a skin that cannot be read.
+        DataError: on a damaged skin.
         LibraryError: if embreex is missing.
 
     Example:
@@ -63,6 +69,7 @@ class Town:
         scans: int = 1000,
         interval: float = 0.4,
         noise: Noise | None = None,
+        skin: str | Path | Skin | None = None,
     ) -> None:
         if seed < 0 or scans < 0 or not 0 < interval < 60:
             raise ConfigError(
@@ -70,7 +77,11 @@ class Town:
                 "seed >= 0, scans >= 0 and 0 < interval < 60 s",
             )
         self.seed, self.sensor, self.interval = seed, load_sensor(sensor), interval
-        self._scans, self._noise = scans, noise or Noise()
+        self.skin = None if skin is None else load_skin(skin)
+        if self.skin is not None:
+            self.skin.check(self.sensor)
+        # A skin has the offsets of the real lasers.
+        self._scans, self._noise = scans, noise or (Noise(gain_std=0) if self.skin else Noise())
         self._worlds: OrderedDict[int, World] = OrderedDict()
         elevation, height = optics(self.sensor)
         # The order in which the sensor writes points: ring by ring from the top, counter-clockwise from straight ahead.
@@ -88,7 +99,7 @@ class Town:
         self._gains = laser_gains(self.sensor, self._noise)
 
     def __reduce__(self) -> tuple[type["Town"], tuple[object, ...]]:
-        return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise)
+        return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise, self.skin)
 
     @property
     def calibration(self) -> Calibration:
@@ -193,6 +204,11 @@ class Town:
         points = far[:, None] * self._rays[back]
         points[:, 2] += self._heights[back]
         points += moved[back] @ turn
+        if self.skin is not None:
+            boxed = surfaces.instance[hits.surface[back]] > 0
+            dressed = self.skin.apply(points, reflectance, self._laser[back], boxed, rng)
+            points += dressed.shift[:, None] * self._rays[back]
+            back, points, reflectance = back[dressed.kept], points[dressed.kept], dressed.reflectance[dressed.kept]
         distance = np.sqrt(np.einsum("ij,ij->i", points, points))
         kept = np.flatnonzero((distance >= self.sensor.range_min) & (distance <= self.sensor.range_max))
         return self._laser[back[kept]], hits.surface[back[kept]], points[kept], reflectance[kept]
