@@ -4,19 +4,23 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.town.skin.domains import PART_LEVELS, STRATUM_LEVELS, Domain
-from lidar_synth.town.skin.features import STRATA, Floats, Ints, features
+from lidar_synth.town.skin.features import BAND, BANDS, STRATA, STRATUM_KIND, Floats, Ints, features
 from lidar_synth.town.skin.skin import MEANS, RESIDUALS, Skin, part_of
 from lidar_synth.town.skin.tables import FEWEST, pooled
 
 ROUNDS, SHARE = 3, 0.6
 """Corrections of the maps after the first, and the share of the remaining difference that each removes."""
 _SMOOTH = 9
-"""Neighbouring lasers over which the trend is taken that is not an offset of lasers."""
+"""Neighbouring lasers over which the running median is taken."""
 _LARGEST_FACTOR = 5.0
+
+BAND_LEVELS = [np.arange(BANDS), np.zeros(BANDS, np.int64)]
+LEVELS = {"mean": BAND_LEVELS, "residual": PART_LEVELS, "range": STRATUM_LEVELS}
 
 Pair = tuple[Floats, NDArray[np.integer]]
 
@@ -31,7 +35,7 @@ def estimate(real: Domain, town: Domain, sensor: Sensor, step: float, provenance
         step: of the real reflectance, 0 if unknown.
         provenance: of the skin.
     """
-    offset = laser_offsets(real, sensor.shape[0])
+    offset = np.stack([laser_offsets(real, sensor.shape[0], kind) for kind in (0, 1)])
     arrays = {"cuts": town.cuts, "offset": offset}
     wanted = _tables(real, offset)
     found = _tables(town, np.zeros_like(offset))
@@ -46,15 +50,16 @@ def estimate(real: Domain, town: Domain, sensor: Sensor, step: float, provenance
 
 def _tables(domain: Domain, offset: Floats, quantiles: Floats | None = None) -> dict[str, Pair]:
     """Values and groups of the local mean, the residual of reflectance and that of range."""
-    mean = np.concatenate([s.found.mean - offset[s.rows] for s in domain.scans])
+    kinds = [np.minimum(STRATUM_KIND[stratum], 1) for stratum in domain.strata]
+    mean = np.concatenate([s.found.mean - offset[k, s.rows] for s, k in zip(domain.scans, kinds, strict=True)])
     residual = np.concatenate([s.bright - s.found.mean for s in domain.scans])
     distance = np.concatenate([s.found.residual for s in domain.scans])
     stratum = np.concatenate(domain.strata)
     if quantiles is None:
-        [quantiles] = pooled([(mean, stratum)], STRATUM_LEVELS, MEANS)
+        [quantiles] = pooled([(mean, BAND[stratum])], BAND_LEVELS, MEANS)
     measured = np.flatnonzero(~np.isnan(distance))
     return {
-        "mean": (mean, stratum),
+        "mean": (mean, BAND[stratum]),
         "residual": (residual, part_of(mean, stratum, quantiles)),
         "range": (distance[measured], stratum[measured]),
     }
@@ -63,7 +68,7 @@ def _tables(domain: Domain, offset: Floats, quantiles: Floats | None = None) -> 
 def _both(name: str, town: Pair, real: Pair) -> tuple[Floats, Floats]:
     """The quantiles of the town and the real ones."""
     count = MEANS if name == "mean" else RESIDUALS
-    one, other = pooled([town, real], PART_LEVELS if name == "residual" else STRATUM_LEVELS, count)
+    one, other = pooled([town, real], LEVELS[name], count)
     return one, other
 
 
@@ -73,7 +78,7 @@ def _corrected(skin: Skin, town: Domain, wanted: dict[str, Pair]) -> Skin:
     The residuals of neighbouring returns depend on each other, so that a map of each does not give their distribution
     at once.
     """
-    zeros = np.zeros(skin.sensor.shape[0], np.float32)
+    zeros = np.zeros((2, skin.sensor.shape[0]), np.float32)
     level = replace(skin, arrays={**skin.arrays, "offset": zeros}, step=0.0)
     scans = []
     for one, stratum in zip(town.scans, town.strata, strict=True):
@@ -91,14 +96,14 @@ def _corrected(skin: Skin, town: Domain, wanted: dict[str, Pair]) -> Skin:
     return replace(skin, arrays=arrays)
 
 
-def laser_offsets(domain: Domain, rows: int) -> Floats:
-    """(rows,) reflectance of each laser beyond the trend of its neighbours.
+def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
+    """(rows,) reflectance of each laser on one kind of surface, beyond that of its neighbours.
 
-    It is the sum of the median differences between neighbouring rings on the same surface, less its running mean.
+    It is the sum of the median differences between neighbouring rings on the same surface, less its running median.
     """
     difference, ring = [], []
-    for scan in domain.scans:
-        pairs = np.flatnonzero(scan.found.below >= 0)
+    for scan, stratum in zip(domain.scans, domain.strata, strict=True):
+        pairs = np.flatnonzero((scan.found.below >= 0) & (STRATUM_KIND[stratum] == kind))
         below = scan.found.below[pairs]
         difference.append(scan.found.mean[below] - scan.found.mean[pairs])
         ring.append(scan.rows[pairs])
@@ -106,7 +111,7 @@ def laser_offsets(domain: Domain, rows: int) -> Floats:
     [table] = pooled([(value, upper)], [np.arange(rows)], 3)
     total = np.concatenate([[0.0], np.cumsum(table[:-1, 1])])
     padded = np.pad(total, _SMOOTH // 2, mode="reflect", reflect_type="odd")
-    return np.asarray(total - np.convolve(padded, np.full(_SMOOTH, 1 / _SMOOTH), "valid"), np.float32)
+    return np.asarray(total - np.median(sliding_window_view(padded, _SMOOTH), axis=1), np.float32)
 
 
 def missing(real: Domain, town: Domain, rows: int) -> tuple[Floats, Floats]:

@@ -26,6 +26,11 @@ ROUGH = 4
 CELLS = (len(RANGES) + 1) * len(KINDS) * (len(HEIGHTS) + 1)
 """Combinations of range, kind and height."""
 STRATA = CELLS * ROUGH
+BANDS = len(RANGES) + 1
+BAND = (np.arange(STRATA) // ROUGH % BANDS).astype(np.int32)
+"""(STRATA,) the bin of range of each stratum."""
+STRATUM_KIND = (np.arange(STRATA) // (ROUGH * BANDS * (len(HEIGHTS) + 1))).astype(np.int32)
+"""(STRATA,) the kind of each stratum."""
 
 _WINDOW = 3
 """Neighbours on each side over which reflectance and roughness are averaged."""

@@ -16,7 +16,7 @@ from safetensors.numpy import load, save
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_file, write_file
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.town.skin.features import CELLS, LARGEST, ROUGH, STRATA, Features, Floats, Ints, features, strata
+from lidar_synth.town.skin.features import BAND, BANDS, CELLS, LARGEST, ROUGH, STRATA, STRATUM_KIND, Features, Floats, Ints, features, strata
 from lidar_synth.town.skin.tables import lookup
 
 FORMAT = "lidar-synth-skin/1"
@@ -32,6 +32,9 @@ TOWN_STEP = 1 / 256
 SOFT, BOXED = 0.3, 0.05
 """Metres by which a point moves at most, and a point of an object with a box."""
 
+WHITE = 0.6
+"""Share of the change of a residual by which its return moves: its neighbours move, too. (White noise has 1 / 1.67.)"""
+
 _FINE = 129
 """Grid points of the tables that are computed from the quantiles."""
 _GRID = np.linspace(0, 1, _FINE, dtype=np.float32)
@@ -44,13 +47,13 @@ def shapes(rows: int) -> dict[str, tuple[int, ...]]:
     """The arrays of a skin for a sensor of ``rows`` lasers."""
     return {
         "cuts": (CELLS, ROUGH - 1),
-        "mean_town": (STRATA, MEANS),
-        "mean_real": (STRATA, MEANS),
+        "mean_town": (BANDS, MEANS),
+        "mean_real": (BANDS, MEANS),
         "residual_town": (STRATA * PARTS, RESIDUALS),
         "residual_real": (STRATA * PARTS, RESIDUALS),
         "range_town": (STRATA, RESIDUALS),
         "range_real": (STRATA, RESIDUALS),
-        "offset": (rows,),
+        "offset": (2, rows),
         "missing": (STRATA,),
         "missing_laser": (rows,),
     }
@@ -159,6 +162,7 @@ class Skin:
             *_dress(
                 found.mean, found.residual, stratum, bright, rows, boxed, uniform, cuts, mean, residual, distance,
                 a["offset"], a["missing"], a["missing_laser"], np.float32(self.step),
+                np.float32(max(np.median(a["mean_real"]), 1e-3)),
             )
         )  # fmt: skip
 
@@ -178,9 +182,9 @@ class Skin:
 
 
 def part_of(mean: Floats, stratum: Ints, quantiles: Floats) -> NDArray[np.int64]:
-    """(N,) stratum and part of each return: the rank of its local mean among the quantiles (STRATA, MEANS)."""
+    """(N,) stratum and part of each return: the rank of its local mean among the quantiles (BANDS, MEANS)."""
     cuts = quantiles[:, _part_quantiles()]
-    part = (mean[:, None] >= cuts[stratum]).sum(1)
+    part = (mean[:, None] >= cuts[BAND[stratum]]).sum(1)
     return stratum.astype(np.int64) * PARTS + part
 
 
@@ -206,7 +210,7 @@ def _root(x: float) -> float:
 def _dress(
     mean: Floats, residual: Floats, stratum: Ints, bright: Floats, ring: Ints, boxed: NDArray[np.bool_],
     uniform: Floats, cuts: Floats, to_mean: Floats, to_residual: Floats, to_range: Floats, offset: Floats,
-    missing: Floats, missing_laser: Floats, step: float,
+    missing: Floats, missing_laser: Floats, step: float, middle: float,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:  # fmt: skip
     count = len(mean)
     shift, value, kept = np.zeros(count, np.float32), np.empty(count, np.float32), np.ones(count, np.bool_)
@@ -214,14 +218,16 @@ def _dress(
         s = stratum[i]
         part = 0
         for k in range(cuts.shape[1]):
-            if mean[i] >= cuts[s, k]:
+            if mean[i] >= cuts[BAND[s], k]:
                 part += 1
-        v = _at(to_mean, s, mean[i]) + _at(to_residual, s * (cuts.shape[1] + 1) + part, _root(bright[i] - mean[i]))
-        v = min(max(v + offset[ring[i]], 0.0), 1.0)
+        v = _at(to_mean, BAND[s], mean[i]) + _at(to_residual, s * (cuts.shape[1] + 1) + part, _root(bright[i] - mean[i]))
+        # The offset of a laser fades out towards 0.
+        v += offset[min(STRATUM_KIND[s], 1), ring[i]] * min(max(v / middle, 0.0), 1.0)
+        v = min(max(v, 0.0), 1.0)
         value[i] = round(v / step) * step if step > 0 else v
         if not np.isnan(residual[i]):
             limit = BOXED if boxed[i] else SOFT
-            moved = _at(to_range, s, _root(residual[i] / LARGEST)) - residual[i]
+            moved = WHITE * (_at(to_range, s, _root(residual[i] / LARGEST)) - residual[i])
             shift[i] = min(max(moved, -limit), limit)
         kept[i] = uniform[i] >= missing[s] * missing_laser[ring[i]]
     return shift, value, kept
