@@ -24,6 +24,7 @@ LIMITS = {
     "docs/how-to/trainers/reader.md": 180,
     "docs/how-to/trainers/other.md": 100,
     "docs/how-to/your-sensor.md": 250,
+    "docs/how-to/skin.md": 330,
     "docs/how-to/your-dataset.md": 300,
     "docs/how-to/train-a-generator.md": 450,
     "docs/how-to/bake.md": 400,
@@ -39,6 +40,7 @@ LIMITS = {
     "docs/models/town.md": 200,
     "docs/models/town-semantic.md": 200,
     "docs/models/town-camera.md": 200,
+    "docs/models/skin-pandar64.md": 200,
     "docs/gallery.md": 100,
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""

@@ -19,6 +19,7 @@ from lidar_synth.cli.evaluate import evaluate
 from lidar_synth.cli.import_ import import_
 from lidar_synth.cli.recipes import recipes
 from lidar_synth.cli.sample import sample
+from lidar_synth.cli.skin import skin
 from lidar_synth.cli.town import town
 from lidar_synth.cli.train import distill, train
 from lidar_synth.cli.view import view
@@ -66,6 +67,7 @@ def _options(
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)
 app.add_typer(bank)
+app.add_typer(skin)
 
 
 def main() -> None:

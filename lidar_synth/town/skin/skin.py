@@ -1,5 +1,6 @@
 """A skin: what the returns of a real sensor look like, as maps from the town's distributions to those of real scans."""
 
+import hashlib
 import json
 from dataclasses import dataclass
 from functools import cached_property
@@ -108,6 +109,9 @@ class Skin:
         if not 0 <= self.step <= 0.5:
             raise ConfigError(f"a skin whose reflectance has a step of {self.step}", "0 to 0.5")
 
+    def __reduce__(self) -> tuple[type["Skin"], tuple[object, ...]]:
+        return Skin, (self.sensor, self.step, self.provenance, self.arrays)
+
     @cached_property
     def _maps(self) -> tuple[Floats, Floats, Floats]:
         a = self.arrays
@@ -166,6 +170,21 @@ class Skin:
             )
         )  # fmt: skip
 
+    def summary(self) -> dict[str, Any]:
+        """Provenance and a few figures, as plain values."""
+        spread = {name: np.ptp(self.arrays[name][:, [RESIDUALS // 4, -1 - RESIDUALS // 4]], axis=1)
+                  for name in ("residual_town", "residual_real", "range_town", "range_real")}  # fmt: skip
+        return {
+            "sensor": self.sensor.name,
+            **{k: v for k, v in self.provenance.items() if k != "town"},
+            **{f"town: {k}": v for k, v in dict(self.provenance.get("town", {})).items()},
+            "reflectance, step": self.step,
+            "reflectance, median": float(np.median(self.arrays["mean_real"]).round(3)),
+            "lasers, spread of reflectance": float(self.arrays["offset"][0].std().round(3)),
+            "returns missing, at most": float(self.arrays["missing"].max().round(3)),
+            **{f"{name}, median spread": float(np.median(v).round(4)) for name, v in spread.items()},
+        }
+
     def save(self, path: str | Path) -> None:
         """Write the skin to a file; the same skin gives the same bytes.
 
@@ -178,6 +197,7 @@ class Skin:
         header = {"format": FORMAT, "sensor": self.sensor.to_dict(), "reflectance_step": self.step,
                   "provenance": self.provenance}  # fmt: skip
         arrays = {name: np.ascontiguousarray(v, np.float16) for name, v in self.arrays.items()}
+        header["checksum"] = _checksum(header, arrays)
         write_file(Path(path), save(arrays, {"lidar_synth": json.dumps(header, sort_keys=True)}), durable=True)
 
 
@@ -233,6 +253,14 @@ def _dress(
     return shift, value, kept
 
 
+def _checksum(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
+    """sha256 of a header and of the names, types, shapes and bytes of arrays."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}\n".encode() + arrays[name].tobytes())
+    return digest.hexdigest()
+
+
 def load_skin(skin: "str | Path | Skin") -> Skin:
     """Load a skin: one that ships with the package by its name, or one of your own from a file.
 
@@ -259,7 +287,10 @@ def load_skin(skin: "str | Path | Skin") -> Skin:
         header = json.loads(json.loads(content[8:start])["__metadata__"]["lidar_synth"])
         if header["format"] != FORMAT:
             raise ConfigError(f"format {header['format']!r}", repr(FORMAT))
-        arrays = {name: values.astype(np.float32) for name, values in load(content).items()}
+        stored = load(content)
+        if header.pop("checksum", None) != _checksum(header, stored):
+            raise ConfigError("content that does not match its checksum", "an intact file", "Copy it again.")
+        arrays = {name: values.astype(np.float32) for name, values in stored.items()}
         return Skin(Sensor.from_dict(header["sensor"]), float(header["reflectance_step"]),
                     dict(header["provenance"]), arrays)  # fmt: skip
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
