@@ -73,6 +73,7 @@ def main() -> None:
     parser.add_argument("--columns", type=int, nargs="+", default=[1024, 2048])
     parser.add_argument("--places", nargs="*", default=[], help="sequences that the skin is learnt from")
     parser.add_argument("--skin", type=Path, help="a skin that was learnt already")
+    parser.add_argument("--lasers", action="store_true", help="learn the offsets of lasers, too")
     parser.add_argument("--rows", nargs="*", default=[], help="rows of the table [all]")
     given = parser.parse_args()
 
@@ -80,7 +81,7 @@ def main() -> None:
     scans = [source[i] for i in range(len(source))]
     learnt = [s for s in scans if not given.places or s.id.split("/")[0] in given.places]
     others = [s for s in scans if given.places and s.id.split("/")[0] not in given.places] or scans
-    skin = load_skin(given.skin) if given.skin else fit_skin(learnt, licence="CC BY-NC-SA 3.0")
+    skin = load_skin(given.skin) if given.skin else fit_skin(learnt, licence="CC BY-NC-SA 3.0", lasers=given.lasers)
     judges = {width: load_archive(given.judge, width) for width in given.columns}
     rows = towns(skin, given.streets * STRETCH_FRAMES, given.seed, given.rows)
     results: dict[tuple[str, int], list[tuple[np.ndarray, np.ndarray]]] = {}

@@ -17,6 +17,7 @@ def fit(
     licence: Annotated[str, typer.Option(help="licence of the scans, which the file states")],
     sensor: Annotated[str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")] = None,
     most: Annotated[int, typer.Option(min=5, help="number of scans to learn from, evenly spaced")] = 100,
+    lasers: Annotated[bool, typer.Option(help="give each laser its own offset of reflectance")] = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the town that they are compared with")] = 0,
 ) -> None:
     """Learns a skin from 20 to 100 real scans, in some minutes; labels are not used.
@@ -34,7 +35,7 @@ def fit(
     source = open_scans(scans, sensor=sensor)
     count = min(most, len(source))
     picked = [source[i * len(source) // count] for i in range(count)]
-    learnt = fit_skin(picked, licence=licence, source=scans.name, seed=seed)
+    learnt = fit_skin(picked, licence=licence, source=scans.name, seed=seed, lasers=lasers)
     learnt.save(out)
     print(f"{out}: learnt from {count} scans of {learnt.sensor.name}")
 

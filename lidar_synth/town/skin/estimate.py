@@ -25,7 +25,9 @@ LEVELS = {"mean": BAND_LEVELS, "residual": PART_LEVELS, "range": STRATUM_LEVELS}
 Pair = tuple[Floats, NDArray[np.integer]]
 
 
-def estimate(real: Domain, town: Domain, sensor: Sensor, step: float, provenance: dict[str, Any]) -> Skin:
+def estimate(
+    real: Domain, town: Domain, sensor: Sensor, step: float, provenance: dict[str, Any], lasers: bool = False
+) -> Skin:
     """Compare two domains.
 
     Args:
@@ -34,8 +36,11 @@ def estimate(real: Domain, town: Domain, sensor: Sensor, step: float, provenance
         sensor: the sensor of both.
         step: of the real reflectance, 0 if unknown.
         provenance: of the skin.
+        lasers: whether lasers get offsets of their own; otherwise their spread is part of the distributions.
     """
     offset = np.stack([laser_offsets(real, sensor.shape[0], kind) for kind in (0, 1)])
+    if not lasers:
+        offset = np.zeros_like(offset)
     arrays = {"cuts": town.cuts, "offset": offset}
     wanted = _tables(real, offset)
     found = _tables(town, np.zeros_like(offset))

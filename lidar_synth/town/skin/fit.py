@@ -38,6 +38,7 @@ def fit_skin(
     source: str = "",
     seed: int = 0,
     streets: int = STREETS,
+    lasers: bool = False,
     progress: bool = True,
 ) -> Skin:
     """Learn the look of a sensor's returns from real scans of it; their labels are not used.
@@ -49,6 +50,7 @@ def fit_skin(
         source: a name for the scans.
         seed: of the town that they are compared with.
         streets: of that town, each with two scans.
+        lasers: whether each laser gets the offset of reflectance that it has in the scans.
         progress: whether to show progress bars.
 
     Raises:
@@ -64,25 +66,25 @@ def fit_skin(
     """
     if len(scans) < FEWEST_SCANS:
         raise DataError(f"{len(scans)} scans", f"at least {FEWEST_SCANS} scans of one sensor, better 20 to 100")
-    lasers = scans[0].sensor if sensor is None else load_sensor(sensor)
+    own = scans[0].sensor if sensor is None else load_sensor(sensor)
     rng = np.random.Generator(np.random.Philox(key=seed))
     step = _step(np.concatenate([scans[i].reflectance for i in range(FEWEST_SCANS)]))
     digest, real = hashlib.sha256(), []
     for i in tqdm(range(len(scans)), desc="real scans", disable=not progress):
         scan = scans[i]
         digest.update(np.ascontiguousarray(scan.points).tobytes() + scan.reflectance.tobytes())
-        real.append(returns_of(scan, lasers, step, rng, centred=True))
-    town = Town(seed, lasers, streets * STRETCH_FRAMES, noise=Noise(gain_std=0))
+        real.append(returns_of(scan, own, step, rng, centred=True))
+    town = Town(seed, own, streets * STRETCH_FRAMES, noise=Noise(gain_std=0))
     picked = [STRETCH_FRAMES * street + frame for street in range(streets) for frame in (4, 14)]
     cast = [
-        returns_of(town[i], lasers, 1 / LEVELS, rng, centred=False)
+        returns_of(town[i], own, 1 / LEVELS, rng, centred=False)
         for i in tqdm(picked, desc="town", disable=not progress)
     ]
     provenance = {
         "source": source, "licence": licence, "scans": len(scans), "sha256": digest.hexdigest(),
         "town": {"version": __version__, "seed": seed, "scans": len(picked)},
     }  # fmt: skip
-    return estimate(Domain.of(real), Domain.of(cast), lasers, step, provenance)
+    return estimate(Domain.of(real), Domain.of(cast), own, step, provenance, lasers)
 
 
 def _step(reflectance: NDArray[np.float32]) -> float:
