@@ -40,7 +40,10 @@ def only(skin: Skin, parts: tuple[str, ...]) -> Skin:
 
 def towns(skin: Skin, count: int, seed: int, names: list[str]) -> dict[str, Town]:
     """The rows of the table."""
-    made = {"physical model": Town(seed, scans=count), "lasers of equal gain": Town(seed, scans=count, noise=Noise(gain_std=0))}
+    made = {
+        "physical model": Town(seed, scans=count),
+        "lasers of equal gain": Town(seed, scans=count, noise=Noise(gain_std=0)),
+    }
     made["the skin"] = Town(seed, scans=count, skin=skin)
     for k in range(1, len(PARTS)):
         made[f"+ {PARTS[k - 1]}"] = Town(seed, scans=count, skin=only(skin, PARTS[:k]))

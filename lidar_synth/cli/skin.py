@@ -12,7 +12,9 @@ skin = typer.Typer(
 
 @skin.command("fit")
 def fit(
-    scans: Annotated[Path, typer.Argument(metavar="SCANS", help="real scans of one sensor, in any layout that is read")],
+    scans: Annotated[
+        Path, typer.Argument(metavar="SCANS", help="real scans of one sensor, in any layout that is read")
+    ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="file to write; its name ends in .skin")],
     licence: Annotated[str, typer.Option(help="licence of the scans, which the file states")],
     sensor: Annotated[str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")] = None,

@@ -17,7 +17,20 @@ from safetensors.numpy import load, save
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_file, write_file
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.town.skin.features import BAND, BANDS, CELLS, LARGEST, ROUGH, STRATA, STRATUM_KIND, Features, Floats, Ints, features, strata
+from lidar_synth.town.skin.features import (
+    BAND,
+    BANDS,
+    CELLS,
+    LARGEST,
+    ROUGH,
+    STRATA,
+    STRATUM_KIND,
+    Features,
+    Floats,
+    Ints,
+    features,
+    strata,
+)
 from lidar_synth.town.skin.tables import lookup
 
 FORMAT = "lidar-synth-skin/1"
@@ -240,7 +253,9 @@ def _dress(
         for k in range(cuts.shape[1]):
             if mean[i] >= cuts[BAND[s], k]:
                 part += 1
-        v = _at(to_mean, BAND[s], mean[i]) + _at(to_residual, s * (cuts.shape[1] + 1) + part, _root(bright[i] - mean[i]))
+        v = _at(to_mean, BAND[s], mean[i]) + _at(
+            to_residual, s * (cuts.shape[1] + 1) + part, _root(bright[i] - mean[i])
+        )
         # The offset of a laser fades out towards 0.
         v += offset[min(STRATUM_KIND[s], 1), ring[i]] * min(max(v / middle, 0.0), 1.0)
         v = min(max(v, 0.0), 1.0)
