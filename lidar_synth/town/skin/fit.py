@@ -6,13 +6,13 @@ it the real distribution.
 
 import hashlib
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lidar_synth import __version__
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -82,7 +82,7 @@ def fit_skin(
     ]
     provenance = {
         "source": source, "licence": licence, "scans": len(scans), "sha256": digest.hexdigest(),
-        "town": {"version": __version__, "seed": seed, "scans": len(picked)},
+        "town": {"version": version("lidar_synth"), "seed": seed, "scans": len(picked)},
     }  # fmt: skip
     return estimate(Domain.of(real), Domain.of(cast), own, step, provenance, lasers)
 
