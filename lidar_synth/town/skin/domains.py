@@ -65,8 +65,8 @@ def returns_of(scan: Scan, lasers: Sensor, step: float, rng: np.random.Generator
         )  # fmt: skip
     dither = (rng.random(len(points), np.float32) - (0.5 if centred else 0)) * step
     bright = (reflectance + dither).astype(np.float32)
-    rows = rows.astype(np.int32)
-    return Returns(features_of(points, bright, rows, lasers), points, bright, rows, boxed)
+    laser = rows.astype(np.int32)
+    return Returns(features_of(points, bright, laser, lasers), points, bright, laser, boxed)
 
 
 @dataclass(frozen=True)

@@ -178,8 +178,8 @@ class Skin:
         return Dressed(
             *_dress(
                 found.mean, found.residual, stratum, bright, rows, boxed, uniform, cuts, mean, residual, distance,
-                a["offset"], a["missing"], a["missing_laser"], np.float32(self.step),
-                np.float32(max(np.median(a["mean_real"]), 1e-3)),
+                a["offset"], a["missing"], a["missing_laser"], float(self.step),
+                max(float(np.median(a["mean_real"])), 1e-3),
             )
         )  # fmt: skip
 
@@ -217,12 +217,12 @@ class Skin:
 def part_of(mean: Floats, stratum: Ints, quantiles: Floats) -> NDArray[np.int64]:
     """(N,) stratum and part of each return: the rank of its local mean among the quantiles (BANDS, MEANS)."""
     cuts = quantiles[:, _part_quantiles()]
-    part = (mean[:, None] >= cuts[BAND[stratum]]).sum(1)
+    part: NDArray[np.int64] = (mean[:, None] >= cuts[BAND[stratum]]).sum(1)
     return stratum.astype(np.int64) * PARTS + part
 
 
 def _part_quantiles() -> NDArray[np.intp]:
-    return np.arange(1, PARTS) * (MEANS - 1) // PARTS
+    return np.asarray(np.arange(1, PARTS) * (MEANS - 1) // PARTS, np.intp)
 
 
 @njit(cache=True)
@@ -236,7 +236,7 @@ def _at(table: Floats, row: int, x: float) -> float:
 @njit(cache=True)
 def _root(x: float) -> float:
     """The place of a residual x in [-1, 1] on the grid, in [0, 1]."""
-    return 0.5 + 0.5 * np.sqrt(x) if x >= 0 else 0.5 - 0.5 * np.sqrt(-x)
+    return float(0.5 + 0.5 * np.sqrt(x) if x >= 0 else 0.5 - 0.5 * np.sqrt(-x))
 
 
 @njit(cache=True)
