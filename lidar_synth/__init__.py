@@ -36,6 +36,7 @@ _HOME = {
     "Scan": "geometry.scan",
     "SemanticKITTI": "formats",
     "Sensor": "geometry.sensor",
+    "Skin": "town",
     "Source": "geometry.scan",
     "Sources": "mixing",
     "SensorFit": "geometry.fitting",
@@ -44,8 +45,10 @@ _HOME = {
     "assign_beams": "geometry.fitting",
     "deskew": "geometry.fitting",
     "fit_sensor": "geometry.fitting",
+    "fit_skin": "town",
     "load_generator": "generate.generator",
     "load_sensor": "geometry.sensor",
+    "load_skin": "town",
     "make_policy": "labels",
     "open_scans": "formats",
     "project": "geometry.projection",
@@ -91,7 +94,10 @@ if TYPE_CHECKING:
     from lidar_synth.mixing import Sources as Sources
     from lidar_synth.mixing.service import BatchMixer as BatchMixer
     from lidar_synth.mixing.service import RollingBank as RollingBank
+    from lidar_synth.town import Skin as Skin
     from lidar_synth.town import Town as Town
+    from lidar_synth.town import fit_skin as fit_skin
+    from lidar_synth.town import load_skin as load_skin
 
 
 def __getattr__(name: str) -> Any:

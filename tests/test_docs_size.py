@@ -29,6 +29,7 @@ LIMITS = {
     "docs/how-to/label-kitti360.md": 200,
     "docs/how-to/any-sensor.md": 500,
     "docs/how-to/another-sensor.md": 300,
+    "docs/how-to/skin.md": 330,
     "docs/how-to/train-a-generator.md": 450,
     "docs/how-to/bake.md": 400,
     "docs/how-to/look.md": 150,
@@ -44,6 +45,7 @@ LIMITS = {
     "docs/models/town.md": 200,
     "docs/models/town-semantic.md": 200,
     "docs/models/town-camera.md": 200,
+    "docs/models/skin-pandar64.md": 200,
     "docs/gallery.md": 100,
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""

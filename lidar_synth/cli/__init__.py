@@ -21,6 +21,7 @@ from lidar_synth.cli.label import label
 from lidar_synth.cli.recipes import recipes
 from lidar_synth.cli.sample import sample
 from lidar_synth.cli.sensor import sensor
+from lidar_synth.cli.skin import skin
 from lidar_synth.cli.town import town
 from lidar_synth.cli.train import distill, train
 from lidar_synth.cli.view import view
@@ -70,6 +71,7 @@ for _name, _command in COMMANDS.items():
     app.command(_name)(_command)
 app.add_typer(bank)
 app.add_typer(sensor)
+app.add_typer(skin)
 
 
 def main() -> None:

@@ -21,6 +21,9 @@ def town(
         bool, typer.Option("--accumulate", help="also write KITTI-360's accumulated clouds, for lidar-synth label")
     ] = False,
     jobs: Annotated[int, typer.Option(help="number of worker processes")] = 1,
+    skin: Annotated[
+        str | None, typer.Option(help="look of a real sensor's returns: a shipped skin by name, or a .skin file")
+    ] = None,
 ) -> None:
     """Writes street scans of a procedural town with labels, boxes, poses and images, in the layout of a public dataset.
 
@@ -32,9 +35,10 @@ def town(
       lidar-synth town my_town --scans 100 --layout kitti
       lidar-synth town my_town --scans 500 --sensor os1_128 --no-camera
       lidar-synth town my_town --scans 100 --accumulate --no-camera
+      lidar-synth town my_town --scans 500 --skin my.skin --no-camera
     """
     from lidar_synth.town import Town, export_town
 
-    source = Town(seed, sensor, scans, interval)
+    source = Town(seed, sensor, scans, interval, skin=skin)
     written, kept = export_town(source, out, layout, sequence=sequence, camera=camera, accumulate=accumulate, jobs=jobs)
     print(f"{out}: {written} scans written, {kept} were there already")

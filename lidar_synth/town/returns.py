@@ -47,7 +47,7 @@ class Noise:
 
     Args:
         range_std: metres, standard deviation of the range.
-        gain_std: standard deviation of the lasers' gains.
+        gain_std: standard deviation of the lasers' gains; 0 for lasers of equal gain.
         threshold: signal strength at which half of the rays are dropped.
     """
 
@@ -58,6 +58,8 @@ class Noise:
 
 def laser_gains(sensor: Sensor, noise: Noise) -> Floats:
     """(H,) gain of each laser, the same for every scan of a sensor; a few lasers are weak."""
+    if not noise.gain_std:
+        return np.ones(sensor.shape[0], np.float32)
     rng = np.random.Generator(np.random.Philox(key=sensor.shape[0]))
     gains = rng.normal(1.0, noise.gain_std, sensor.shape[0])
     gains[rng.random(sensor.shape[0]) < 0.1] *= 0.84

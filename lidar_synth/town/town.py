@@ -24,6 +24,7 @@ from lidar_synth.town.movers import ego_place, ego_pose, place_movers
 from lidar_synth.town.returns import Noise, laser_gains, measure, see_through
 from lidar_synth.town.scene import Pose
 from lidar_synth.town.shading import render, sample_light
+from lidar_synth.town.skin.skin import Skin, load_skin
 from lidar_synth.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, rng_for
 
 REVOLUTION = 0.1
@@ -43,9 +44,14 @@ class Town:
         noise: the measurement noise of the sensor; by default ``Noise()``.
         motion: whether the vehicle moves while the sensor turns. The points are motion compensated, as SemanticKITTI's:
             in the frame of the scan's pose, each cast from where the sensor was. Other objects stand still.
+        skin: the look of a real sensor's returns, as ``load_skin`` takes it; by default the physical model's alone.
+            Labels, rings and boxes are the same with it; a few returns are missing.
 
     Raises:
-        ConfigError: on a negative seed or number of scans, an interval out of range, or an unknown sensor.
+        ConfigError: on a negative seed or number of scans, an interval out of range, an unknown sensor or skin, or a
+            skin of another sensor.
+        FileError: on a skin that cannot be read.
+        DataError: on a damaged skin.
         LibraryError: if embreex is missing.
 
     Example:
@@ -66,6 +72,7 @@ class Town:
         interval: float = 0.4,
         noise: Noise | None = None,
         motion: bool = True,
+        skin: str | Path | Skin | None = None,
     ) -> None:
         if seed < 0 or scans < 0 or not 0 < interval < 60:
             raise ConfigError(
@@ -73,7 +80,12 @@ class Town:
                 "seed >= 0, scans >= 0 and 0 < interval < 60 s",
             )
         self.seed, self.sensor, self.interval = seed, load_sensor(sensor), interval
-        self._scans, self._noise, self._motion = scans, noise or Noise(), motion
+        self.skin = None if skin is None else load_skin(skin)
+        if self.skin is not None:
+            self.skin.check(self.sensor)
+        # A skin has the offsets of the real lasers.
+        self._noise = noise or (Noise(gain_std=0) if self.skin else Noise())
+        self._scans, self._motion = scans, motion
         self._worlds: OrderedDict[int, World] = OrderedDict()
         elevation, height = optics(self.sensor)
         # The order in which the sensor writes points: ring by ring from the top, counter-clockwise from straight ahead.
@@ -91,7 +103,7 @@ class Town:
         self._gains = laser_gains(self.sensor, self._noise)
 
     def __reduce__(self) -> tuple[type["Town"], tuple[object, ...]]:
-        return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise, self._motion)
+        return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise, self._motion, self.skin)
 
     @property
     def calibration(self) -> Calibration:
@@ -199,6 +211,11 @@ class Town:
         points = far[:, None] * self._rays[back]
         points[:, 2] += self._heights[back]
         points += moved[back] @ turn
+        if self.skin is not None:
+            boxed = surfaces.instance[hits.surface[back]] > 0
+            dressed = self.skin.apply(points, reflectance, self._laser[back], boxed, rng)
+            points += dressed.shift[:, None] * self._rays[back]
+            back, points, reflectance = back[dressed.kept], points[dressed.kept], dressed.reflectance[dressed.kept]
         distance = np.sqrt(np.einsum("ij,ij->i", points, points))
         kept = np.flatnonzero((distance >= self.sensor.range_min) & (distance <= self.sensor.range_max))
         return self._laser[back[kept]], hits.surface[back[kept]], points[kept], reflectance[kept]

@@ -4,13 +4,14 @@ from lidar_synth.geometry.projection.batch import BatchImage, project_batch, unp
 from lidar_synth.geometry.projection.fill import fill_points
 from lidar_synth.geometry.projection.rings import ring_numbers
 from lidar_synth.geometry.projection.spherical import Cells, carry, locate, project, unproject
-from lidar_synth.geometry.projection.unfold import unfold
+from lidar_synth.geometry.projection.unfold import laser_rows, unfold
 
 __all__ = [
     "BatchImage",
     "Cells",
     "carry",
     "fill_points",
+    "laser_rows",
     "locate",
     "project",
     "project_batch",

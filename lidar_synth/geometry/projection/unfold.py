@@ -59,19 +59,34 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         ((64, 1024), 'town/beams')
     """
     lasers = (sensor or scan.sensor).by_beams()
-    height, width = lasers.shape
     cell, distance, _ = locate(scan.points, lasers)
-    rows, ring = np.arange(height), scan.ring
-    if ring is None:
-        ring = ring_numbers(scan.points)
-        if fault := fault_of(scan.points, ring, lasers):
-            raise _not_in_rings(scan, fault)
-        rows = _rows_of_rings(scan, ring, distance, lasers, anchor)
-    elif len(scan) and not 0 <= ring.min() <= ring.max() < height:
-        raise _not_in_rings(scan, f"rings {ring.min()} to {ring.max()} for the {height} lasers of {lasers.name!r}")
-    cell = np.where(cell < 0, -1, rows[ring] * width + cell % width).astype(np.int32)
+    width = lasers.shape[1]
+    cell = np.where(cell < 0, -1, laser_rows(scan, lasers, anchor) * width + cell % width).astype(np.int32)
     image, index = nearest_in(cell, distance, lasers)
     return RangeImage(image, lasers, carry(scan, index))
+
+
+def laser_rows(scan: Scan, lasers: Sensor, anchor: Anchor = "elevation") -> NDArray[np.int64]:
+    """(N,) row of the laser that measured each point, 0 = highest.
+
+    Args:
+        scan: N points in raw ring order, or in any order with ``scan.ring``.
+        lasers: a sensor with one row per laser.
+        anchor: how rows are assigned to rings if the scan has no ``ring``.
+
+    Raises:
+        DataError: as ``unfold``.
+    """
+    height = lasers.shape[0]
+    if scan.ring is not None:
+        if len(scan) and not 0 <= scan.ring.min() <= scan.ring.max() < height:
+            rings = f"rings {scan.ring.min()} to {scan.ring.max()}"
+            raise _not_in_rings(scan, f"{rings} for the {height} lasers of {lasers.name!r}")
+        return scan.ring.astype(np.int64)
+    ring = ring_numbers(scan.points)
+    if fault := fault_of(scan.points, ring, lasers):
+        raise _not_in_rings(scan, fault)
+    return _rows_of_rings(scan, ring, lasers, anchor)[ring]
 
 
 def _not_in_rings(scan: Scan, reason: str) -> DataError:
@@ -82,14 +97,13 @@ def _not_in_rings(scan: Scan, reason: str) -> DataError:
     )
 
 
-def _rows_of_rings(
-    scan: Scan, ring: NDArray[np.int16], distance: NDArray[np.float32], lasers: Sensor, anchor: Anchor
-) -> NDArray[np.int64]:
+def _rows_of_rings(scan: Scan, ring: NDArray[np.int16], lasers: Sensor, anchor: Anchor) -> NDArray[np.int64]:
     """(R,) the row of each ring."""
     bounds = np.flatnonzero(np.diff(ring)) + 1
     count = len(bounds) + 1
     if anchor == "last":
         return np.arange(count) + lasers.shape[0] - count
+    distance = np.linalg.norm(scan.points, axis=1)
     sine = scan.points[:, 2] / np.where(distance > 0, distance, 1)
     medians = np.arcsin([np.median(s) for s in np.split(sine, bounds)])
     return _rows_by_elevation(medians, lasers.laser_elevations)

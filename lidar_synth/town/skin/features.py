@@ -1,0 +1,211 @@
+"""What a skin looks at: features of each return that come from the scan alone, without labels.
+
+Points are in the order ring by ring, each ring by azimuth. A neighbour lies on the same surface if it is in the same
+ring, at most a few firings away, and at nearly the same distance.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lidar_synth.geometry.sensor import Sensor
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+RANGES = np.array([4, 7, 10, 14, 20, 28, 40, 55], np.float32)
+"""Metres, limits between the bins of range."""
+HEIGHTS = np.array([-0.4, 0.25, 0.8, 1.6, 3.0], np.float32)
+"""Metres above the road, limits between the bins of height."""
+KINDS = ("level", "upright", "isolated")
+"""Orientation of the surface, by the slope to the neighbouring ring."""
+ROUGH = 4
+"""Bins of the rank of roughness among the returns of the same range, kind and height in one domain."""
+CELLS = (len(RANGES) + 1) * len(KINDS) * (len(HEIGHTS) + 1)
+"""Combinations of range, kind and height."""
+STRATA = CELLS * ROUGH
+BANDS = len(RANGES) + 1
+BAND = (np.arange(STRATA) // ROUGH % BANDS).astype(np.int32)
+"""(STRATA,) the bin of range of each stratum."""
+STRATUM_KIND = (np.arange(STRATA) // (ROUGH * BANDS * (len(HEIGHTS) + 1))).astype(np.int32)
+"""(STRATA,) the kind of each stratum."""
+
+_WINDOW = 3
+"""Neighbours on each side over which reflectance and roughness are averaged."""
+_FARTHEST = 8
+"""Firings between a return and the neighbours that belong to its surface."""
+LARGEST = 0.6
+"""Metres: a larger residual of the range is an edge, not noise."""
+_LEVEL = 0.3
+"""Slope below which a surface is level."""
+
+
+class Features(NamedTuple):
+    """Features of N returns.
+
+    Args:
+        mean: (N,) mean reflectance over the neighbours on the same surface.
+        residual: (N,) metres, range minus the mean of the two neighbours in the ring; NaN at edges.
+        roughness: (N,) metres, mean absolute residual around the return; an edge counts as ``LARGEST``.
+        cell: (N,) number of the combination of range, kind and height.
+        below: (N,) the return of the next ring below in the same direction, -1 if there is none on the same surface.
+        gap: (N,) firings to the next return of the ring, if that lies on the same surface; otherwise 0.
+    """
+
+    mean: Floats
+    residual: Floats
+    roughness: Floats
+    cell: Ints
+    below: Ints
+    gap: Ints
+
+
+def features(points: Floats, reflectance: Floats, ring: Ints, sensor: Sensor) -> Features:
+    """Compute the features of a scan.
+
+    Args:
+        points: (N, 3) metres, ring by ring, each ring by azimuth in either sense.
+        reflectance: (N,) in [0, 1].
+        ring: (N,) row of each point's laser, 0 = highest, not decreasing.
+        sensor: whose firings give the distance between neighbours.
+    """
+    firings = sensor.firings or sensor.columns
+    turn = np.arctan2(points[:, 1], points[:, 0]) * np.float32(firings / (2 * np.pi))
+    level = np.hypot(points[:, 0], points[:, 1])
+    distance = np.sqrt(np.einsum("ij,ij->i", points, points))
+    rows, z = np.ascontiguousarray(ring, np.int32), np.ascontiguousarray(points[:, 2])
+    mean, residual, gap = _along(rows, turn, distance, np.ascontiguousarray(reflectance, np.float32), firings)
+    roughness = _roughness(rows, residual)
+    kind, below = _across(rows, turn, distance, level, z, sensor.shape[0], firings)
+    cell = _cells(distance, kind, z - ground_height(z, level, kind))
+    return Features(mean, residual, roughness, cell, below, gap)
+
+
+def ground_height(z: Floats, level: Floats, kind: Ints) -> np.float32:
+    """Metres, height of the road below the sensor: the most frequent height of level surfaces within 15 m."""
+    near = z[(kind == 0) & (level > 3) & (level < 15) & (np.abs(z) < 5)]
+    if not len(near):
+        return np.float32(-1.73)
+    bins = np.bincount(((near + 5) * 20).astype(np.int64), minlength=201)
+    smooth = bins[:-2] + 2 * bins[1:-1] + bins[2:]
+    return np.float32((np.argmax(smooth) + 1.5) / 20 - 5)
+
+
+def strata(found: Features, cuts: Floats) -> Ints:
+    """(N,) stratum of each return, by its cell and the rank of its roughness.
+
+    Args:
+        found: the features.
+        cuts: (CELLS, ROUGH - 1) limits of roughness between the ranks in this domain.
+    """
+    return _strata(found.cell, found.roughness, cuts)
+
+
+@njit(cache=True)
+def _along(
+    ring: Ints, turn: Floats, distance: Floats, reflectance: Floats, firings: int
+) -> tuple[Floats, Floats, Ints]:
+    count = len(ring)
+    mean, residual = np.empty(count, np.float32), np.empty(count, np.float32)
+    gap = np.zeros(count, np.int32)
+    for i in range(count):
+        total, weight = reflectance[i], np.float32(1)
+        limit = np.float32(0.15) + np.float32(0.02) * distance[i]
+        for j in range(max(i - _WINDOW, 0), min(i + _WINDOW + 1, count)):
+            if j == i or ring[j] != ring[i] or abs(distance[j] - distance[i]) > limit:
+                continue
+            step = abs(turn[j] - turn[i])
+            if min(step, firings - step) <= _FARTHEST:
+                total += reflectance[j]
+                weight += np.float32(1)
+        mean[i] = total / weight
+        residual[i] = np.nan
+        if i + 1 < count and ring[i + 1] == ring[i]:
+            step = abs(turn[i + 1] - turn[i])
+            step = min(step, firings - step)
+            if abs(distance[i + 1] - distance[i]) <= limit and step <= _FARTHEST:
+                gap[i] = max(1, int(step + 0.5))
+            if i > 0 and ring[i - 1] == ring[i]:
+                back = abs(turn[i] - turn[i - 1])
+                back = min(back, firings - back)
+                if step < 3.5 and back < 3.5:
+                    value = distance[i] - (distance[i - 1] + distance[i + 1]) / 2
+                    ends = max(abs(distance[i - 1] - distance[i]), abs(distance[i + 1] - distance[i]))
+                    if abs(value) < LARGEST and ends < LARGEST + limit:
+                        residual[i] = value
+    return mean, residual, gap
+
+
+@njit(cache=True)
+def _roughness(ring: Ints, residual: Floats) -> Floats:
+    count = len(ring)
+    out = np.empty(count, np.float32)
+    for i in range(count):
+        total, weight = np.float32(0), np.float32(0)
+        for j in range(max(i - _WINDOW, 0), min(i + _WINDOW + 1, count)):
+            if ring[j] == ring[i]:
+                total += np.float32(LARGEST) if np.isnan(residual[j]) else abs(residual[j])
+                weight += np.float32(1)
+        out[i] = total / weight
+    return out
+
+
+@njit(cache=True)
+def _across(
+    ring: Ints, turn: Floats, distance: Floats, level: Floats, z: Floats, rows: int, firings: int
+) -> tuple[Ints, Ints]:
+    """Kind of each return, and the return below it on the same surface."""
+    count = len(ring)
+    table = np.full((rows, firings), -1, np.int32)
+    column = np.empty(count, np.int32)
+    for i in range(count):
+        column[i] = int(np.floor(turn[i])) % firings
+        table[ring[i], column[i]] = i
+    kind, below = np.full(count, 2, np.int32), np.full(count, -1, np.int32)
+    for i in range(count):
+        for side in (1, -1):
+            row = ring[i] + side
+            if row < 0 or row >= rows:
+                continue
+            other = -1
+            for offset in (0, 1, -1, 2, -2):
+                other = table[row, (column[i] + offset) % firings]
+                if other >= 0:
+                    break
+            if other < 0:
+                continue
+            along = abs(level[i] - level[other])
+            rise = abs(z[i] - z[other])
+            if kind[i] == 2:
+                kind[i] = 0 if rise < _LEVEL * along else 1
+            if side == 1 and (abs(distance[i] - distance[other]) < 0.1 + 0.02 * distance[i] or rise < 0.05 * along):
+                below[i] = other
+    return kind, below
+
+
+@njit(cache=True)
+def _cells(distance: Floats, kind: Ints, height: Floats) -> Ints:
+    out = np.empty(len(distance), np.int32)
+    for i in range(len(distance)):
+        a = 0
+        while a < len(RANGES) and distance[i] >= RANGES[a]:
+            a += 1
+        b = 0
+        while b < len(HEIGHTS) and height[i] >= HEIGHTS[b]:
+            b += 1
+        out[i] = (kind[i] * (len(HEIGHTS) + 1) + b) * (len(RANGES) + 1) + a
+    return out
+
+
+@njit(cache=True)
+def _strata(cell: Ints, roughness: Floats, cuts: Floats) -> Ints:
+    out = np.empty(len(cell), np.int32)
+    for i in range(len(cell)):
+        rank = 0
+        for k in range(ROUGH - 1):
+            if roughness[i] >= cuts[cell[i], k]:
+                rank += 1
+        out[i] = cell[i] * ROUGH + rank
+    return out

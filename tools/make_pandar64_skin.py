@@ -1,0 +1,123 @@
+"""Learn the skin ``pandar64`` that ships with the package, and measure it on later frames.
+
+    python tools/make_pandar64_skin.py FRAMES --elevations pandar64_elevations.csv [--measure]
+
+FRAMES is a folder of Pandar64 scans from PandaSet as NN.npz (points, reflectance 0..255, ring) in the sensor's frame.
+The skin is learnt from frames 00 to 30; ``--measure`` compares the town with frames 60 and later instead of writing it.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from lidar_synth.files.parsing import read_arrays
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.town import STRETCH_FRAMES, Town, fit_skin, load_skin
+from lidar_synth.town.returns import LEVELS, Noise
+from lidar_synth.town.skin.domains import Domain, returns_of
+
+OUT = Path("lidar_synth/town/skin/pandar64.skin")
+LAST_LEARNT, FIRST_MEASURED = 30, 60
+LICENCE = (
+    "CC BY 4.0 with the PandaSet Dataset Terms: attribution to Scale AI and Hesai; no use of their names or marks "
+    "beyond attribution; no attempt to identify persons"
+)
+SOURCE = "PandaSet by Scale AI and Hesai (https://pandaset.org), sequence 002, Pandar64, frames 00 to 30"
+
+
+def pandar64(elevations: Path) -> Sensor:
+    """The sensor from its table of ring, elevation and azimuth offset in degrees."""
+    table = np.loadtxt(elevations, delimiter=",", skiprows=1)
+    return Sensor(
+        "pandar64", columns=1800, range_min=0.5, range_max=200.0, elevations=tuple(table[:, 1]),
+        azimuths=tuple(table[:, 2]), range_step=0.004, reflectance_levels=256,
+        description="Hesai Pandar64 as in PandaSet; 64 x 1800",
+    )  # fmt: skip
+
+
+def frames(folder: Path, sensor: Sensor, first: int, last: int) -> list[Scan]:
+    """The frames with numbers from ``first`` to ``last``."""
+    scans = []
+    for path in sorted(folder.glob("[0-9][0-9].npz")):
+        if first <= int(path.stem) <= last:
+            a = read_arrays(path, ("points", "reflectance", "ring"))
+            scans.append(
+                Scan(a["points"], a["reflectance"].astype(np.float32) / 255, sensor, ring=a["ring"].astype(np.int16),
+                     id=path.stem)
+            )  # fmt: skip
+    return scans
+
+
+def distances(real: Domain, town: Domain) -> list[float]:
+    """Wasserstein distances of reflectance, its residual and the range's residual (mm), weighted by range and kind."""
+    from scipy.stats import wasserstein_distance
+
+    from lidar_synth.town.skin.features import BAND, STRATUM_KIND
+
+    def values(domain: Domain) -> tuple[np.ndarray, list[np.ndarray]]:
+        stratum = np.concatenate(domain.strata)
+        columns = [
+            np.concatenate([s.bright for s in domain.scans]),
+            np.concatenate([s.bright - s.found.mean for s in domain.scans]),
+            1e3 * np.concatenate([s.found.residual for s in domain.scans]),
+        ]
+        return BAND[stratum] * 3 + STRATUM_KIND[stratum], columns
+
+    (group, one), (other_group, other) = values(real), values(town)
+    out = []
+    for a, b in zip(one, other, strict=True):
+        total = weight = 0.0
+        for g in np.unique(group):
+            x, y = a[group == g], b[other_group == g]
+            x, y = x[~np.isnan(x)], y[~np.isnan(y)]
+            if len(x) > 1000 and len(y) > 1000:
+                total, weight = total + len(x) * wasserstein_distance(x[::7], y[::7]), weight + len(x)
+        out.append(total / weight)
+    return out
+
+
+def measure(folder: Path, sensor: Sensor, streets: int, seed: int) -> None:
+    """Prints the distances to the measured frames of the learnt frames, the physical model and the skin."""
+    rng = np.random.default_rng(0)
+
+    def domain(scans: list[Scan], step: float, centred: bool) -> Domain:
+        return Domain.of([returns_of(scan, sensor, step, rng, centred) for scan in scans])
+
+    real = domain(frames(folder, sensor, FIRST_MEASURED, 99), 1 / 255, True)
+    count = streets * STRETCH_FRAMES
+    skin = load_skin(OUT)
+    towns = {
+        "physical model": (Town(seed, sensor, count), 1 / LEVELS, False),
+        "lasers of equal gain": (Town(seed, sensor, count, noise=Noise(gain_std=0)), 1 / LEVELS, False),
+        "skin": (Town(seed, sensor, count, skin=skin), 1 / 255, True),
+    }
+    print("| frames 60 and later against | reflectance | its residual | residual of range, mm | points |")
+    print("|---|---:|---:|---:|---:|")
+    rows = {"frames 00 to 30": domain(frames(folder, sensor, 0, LAST_LEARNT), 1 / 255, True)}
+    for name, (town, step, centred) in towns.items():
+        rows[name] = domain([town[k * STRETCH_FRAMES + 7] for k in range(streets)], step, centred)
+    for name, found in rows.items():
+        a, b, c = distances(real, found)
+        points = np.mean([len(s.bright) for s in found.scans])
+        print(f"| {name} | {a:.3f} | {b:.3f} | {c:.1f} | {points:,.0f} |")
+
+
+def main() -> None:
+    """Writes the skin, or prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("frames", type=Path)
+    parser.add_argument("--elevations", type=Path, required=True)
+    parser.add_argument("--measure", action="store_true")
+    parser.add_argument("--streets", type=int, default=12, help="of the town that is measured")
+    given = parser.parse_args()
+    sensor = pandar64(given.elevations)
+    if given.measure:
+        measure(given.frames, sensor, given.streets, seed=7)
+        return
+    fit_skin(frames(given.frames, sensor, 0, LAST_LEARNT), licence=LICENCE, source=SOURCE).save(OUT)
+
+
+if __name__ == "__main__":
+    main()
