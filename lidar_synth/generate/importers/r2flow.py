@@ -129,7 +129,7 @@ def _sensor(data: Mapping[str, Any]) -> Sensor:
     sensor = replace(sensor, columns=columns, range_min=data["min_depth"], range_max=data["max_depth"])
     if rows != sensor.shape[0]:
         linear = {"rows": rows, "fov_up": sensor.up, "fov_down": sensor.down, "elevations": None}
-        sensor = replace(sensor, **linear, beams=None, heights=None)
+        sensor = replace(sensor, **linear, beams=None, heights=None, azimuths=None)
     return sensor
 
 

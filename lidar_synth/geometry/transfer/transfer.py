@@ -60,8 +60,8 @@ class Transfer:
         >>> from lidar_synth.geometry.transfer import Mount, Transfer
         >>> transfer = Transfer(load_sensor("hdl32e_nuscenes"), Mount(z=0.1))
         >>> scan, seen = transfer.cast(Town(seed=0, scans=1)[0])
-        >>> scan.sensor.name, int(scan.ring.max()) < 32, round(seen, 2)
-        ('hdl32e_nuscenes', True, 0.66)
+        >>> scan.sensor.name, int(scan.ring.max()) < 32, 0.5 < seen < 0.8
+        ('hdl32e_nuscenes', True, True)
     """
 
     target: Sensor
