@@ -1,6 +1,6 @@
 """What makes the town real to a network that learnt from real streets: one property put back at a time.
 
-    python tools/town_ablation.py SEMANTIC_KITTI --judge FOLDER [--streets 50] [--frames 1] [--width 1024] [--only NAME]
+    python tools/town_ablation.py SEMANTIC_KITTI --judge FOLDER [--streets 50] [--frames 1] [--skin FILE] [--only NAME]
 
 SEMANTIC_KITTI is a folder of labelled real scans in that layout, FOLDER an archive of lidar-bonnetal. The first table
 puts back one property of the sensor or of the surfaces that an earlier town had; the second pastes the returns of one
@@ -154,6 +154,7 @@ def main() -> None:
     parser.add_argument("--judge", type=Path, required=True, help="archive of lidar-bonnetal")
     parser.add_argument("--streets", type=int, default=50)
     parser.add_argument("--frames", type=int, default=1, help="of each street")
+    parser.add_argument("--skin", help="of the town in all lines: a shipped one by name, or a file")
     parser.add_argument("--width", type=int, default=1024, help="of the judge's grid")
     parser.add_argument("--seed", type=int, default=7, help="of the town")
     parser.add_argument("--only", nargs="*", choices=list(CHANGES), default=list(CHANGES), metavar="NAME")
@@ -166,8 +167,9 @@ def main() -> None:
     print("|---|" + "---:|" * (len(SHOWN) + 4))
     print(row("real scans", real, judge, features), flush=True)
     for name in given.only:
-        with applied(CHANGES[name]):
-            scans = list(town_scans(CHANGES[name], given.streets, given.frames, given.seed))
+        change = CHANGES[name]._replace(town={**CHANGES[name].town, "skin": given.skin})
+        with applied(change):
+            scans = list(town_scans(change, given.streets, given.frames, given.seed))
         print(row(name, scans, judge, features), flush=True)
     if given.only != list(CHANGES):
         return

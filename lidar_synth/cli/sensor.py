@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from lidar_synth.geometry.fitting import SensorFit
 
 
-def fit(
+def fit_from_scans(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="file, folder or root of a dataset with scans")],
     out: Annotated[Path, typer.Option(help="YAML file to write, for --sensor of any command")],
     scans: Annotated[int, typer.Option(min=1, max=20, help="number of scans to use, evenly spaced")] = 8,
@@ -83,4 +83,4 @@ def _values(found: "SensorFit") -> dict[str, object]:
 
 
 sensor = typer.Typer(name="sensor", help="Fits a sensor to scans.", no_args_is_help=True)
-sensor.command("fit")(fit)
+sensor.command("fit")(fit_from_scans)

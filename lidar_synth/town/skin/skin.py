@@ -286,6 +286,12 @@ def load_skin(skin: "str | Path | Skin") -> Skin:
         ConfigError: on an unknown name.
         FileError: on a path that cannot be read.
         DataError: on a file that is not a skin of this version, or damaged.
+
+    Example:
+        >>> from lidar_synth import load_skin
+        >>> skin = load_skin("pandar64")
+        >>> skin.sensor.name, skin.sensor.shape[0]
+        ('pandar64', 64)
     """
     if isinstance(skin, Skin):
         return skin
