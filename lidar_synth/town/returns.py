@@ -165,7 +165,7 @@ def _response(power: Floats, slope: Floats, distance: Floats) -> Floats:
     """(N,) the reflectance that the sensor gives for a reflected power, 0 and more, without noise."""
     distance_bin = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1).astype(np.int32)
     value = power * _DISTANCE_FACTOR[distance_bin] * np.clip((slope - 0.015) / 0.06, 0, 1)
-    return np.maximum(np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0)
+    return np.asarray(np.maximum(np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0))
 
 
 def _displacement(
