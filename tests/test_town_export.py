@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from lidar_synth.formats import KITTI360, KITTIObject, SemanticKITTI, open_scans
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.mixing import MixedScans
-from lidar_synth.town import LAYOUTS, Town, export_town
+from lidar_synth.town import LAYOUTS, Town, export_town, load_skin
 from lidar_synth.town.export import _groups
+from lidar_synth.town.returns import Noise
 
 COUNT = 3
 
@@ -165,6 +167,25 @@ def test_a_folder_that_holds_another_town_is_refused(tmp_path: Path, town: Town)
     export_town(Town(seed=5, scans=0), tmp_path, "kitti", camera=False, progress=False)
     with pytest.raises(ConfigError, match=r"was filled with .*'seed': 5"):
         export_town(Town(seed=6, scans=1), tmp_path, "kitti", camera=False, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [({"skin": "pandar64"}, "'skin': None"), ({"motion": False}, "'motion': True"),
+     ({"noise": Noise(range_std=0.03)}, "'noise'")],
+)  # fmt: skip
+def test_a_folder_is_not_continued_by_a_town_whose_scans_differ(
+    tmp_path: Path, options: dict[str, Any], named: str
+) -> None:
+    export_town(Town(5, "pandar64", 0), tmp_path, "kitti", camera=False, progress=False)
+    with pytest.raises(ConfigError, match=f"was filled with .*{named}"):
+        export_town(Town(5, "pandar64", 1, **options), tmp_path, "kitti", camera=False, progress=False)
+
+
+def test_scans_name_their_skin_and_its_licence() -> None:
+    scan = Town(5, "pandar64", 1, skin="pandar64")[0]
+    assert "PandaSet" in scan.provenance["skin_licence"]
+    assert scan.provenance["skin"] == load_skin("pandar64").digest
 
 
 @pytest.mark.parametrize(

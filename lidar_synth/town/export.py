@@ -108,10 +108,11 @@ def _claim_folder(out: Path, town: Town, layout: str, sequence: int, camera: boo
     Raises:
         ConfigError: if the folder was written with other settings.
     """
-    settings = {"layout": layout, "sequence": sequence, "seed": town.seed, "interval": town.interval, "camera": camera}
-    claim(out / SETTINGS, settings | {"sensor": town.sensor.to_dict()})
+    settings = {"layout": layout, "sequence": sequence, "camera": camera, **town.settings}
+    claim(out / SETTINGS, settings)
     if not (out / "README.md").exists():
-        text = _README.format(**settings, sensor=town.sensor.name, frames=STRETCH_FRAMES, settings=SETTINGS)
+        names = {"sensor": town.sensor.name, "frames": STRETCH_FRAMES, "settings": SETTINGS}
+        text = _README.format(**settings | names)
         write_file(out / "README.md", text.encode())
 
 

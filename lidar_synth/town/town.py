@@ -5,7 +5,9 @@ accumulating scans by pose never mixes two of them.
 """
 
 from collections import OrderedDict
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,6 +108,18 @@ class Town:
         return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise, self._motion, self.skin)
 
     @property
+    def provenance(self) -> dict[str, Any]:
+        """Where the scans come from: the town's seed and interval, and its skin with the licence of that."""
+        skin = {} if self.skin is None else {"skin": self.skin.digest, "skin_licence": self.skin.provenance["licence"]}
+        return {"made_by": "town", "seed": self.seed, "interval": self.interval, **skin}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Plain values that determine the scans, apart from their number."""
+        plain = {"seed": self.seed, "interval": self.interval, "sensor": self.sensor.to_dict()}
+        return {**plain, "noise": asdict(self._noise), "motion": self._motion, "skin": self.skin and self.skin.digest}
+
+    @property
     def calibration(self) -> Calibration:
         """The calibration of the camera next to the sensor."""
         return CAMERA
@@ -174,7 +188,7 @@ class Town:
             pose=placed,
             id=f"town-{self.seed}-{index:06d}",
             domain=SYNTHETIC,
-            provenance={"made_by": "town", "seed": self.seed, "interval": self.interval},
+            provenance=self.provenance,
         )
 
     def _travelled(self, index: int) -> NDArray[np.float32]:

@@ -198,6 +198,17 @@ class Skin:
             **{f"{name}, median spread": float(np.median(v).round(4)) for name, v in spread.items()},
         }
 
+    @cached_property
+    def digest(self) -> str:
+        """sha256 of everything that the file holds."""
+        return _checksum(*self._content())
+
+    def _content(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """The header of the file, without its checksum, and the arrays."""
+        header = {"format": FORMAT, "sensor": self.sensor.to_dict(), "reflectance_step": self.step,
+                  "provenance": self.provenance}  # fmt: skip
+        return header, {name: np.ascontiguousarray(v, np.float16) for name, v in self.arrays.items()}
+
     def save(self, path: str | Path) -> None:
         """Write the skin to a file; the same skin gives the same bytes.
 
@@ -207,9 +218,7 @@ class Skin:
         """
         if Path(path).suffix != SUFFIX:
             raise ConfigError(f"skin {path}", f"a name that ends in {SUFFIX}")
-        header = {"format": FORMAT, "sensor": self.sensor.to_dict(), "reflectance_step": self.step,
-                  "provenance": self.provenance}  # fmt: skip
-        arrays = {name: np.ascontiguousarray(v, np.float16) for name, v in self.arrays.items()}
+        header, arrays = self._content()
         header["checksum"] = _checksum(header, arrays)
         write_file(Path(path), save(arrays, {"lidar_synth": json.dumps(header, sort_keys=True)}), durable=True)
 
