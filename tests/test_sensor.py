@@ -9,6 +9,7 @@ import yaml
 
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
+from lidar_synth.geometry.transfer.rays import rays_of
 
 DESIGN = {"hdl64e_kitti360", "hdl64e_kitti", "hdl32e_nuscenes", "os1_128", "town"}
 
@@ -73,6 +74,19 @@ def test_laser_elevations_are_the_beams_or_the_rows() -> None:
     linear = presets()["os1_128"]
     assert np.array_equal(linear.laser_elevations, linear.row_elevations())
     assert linear.by_beams() is linear
+
+
+def test_lasers_of_a_fitted_sensor_point_where_they_were_fitted() -> None:
+    """Beams are corrected for the height of their laser; the elevations of ``fit_sensor`` are the lasers' own."""
+    fitted = Sensor("fitted", 8, 1.0, 90.0, elevations=(2.0, -8.0), heights=(0.05, -0.05))
+    elevation, height = fitted.optics()
+    assert np.allclose(np.degrees(elevation), [2.0, -8.0], atol=1e-5) and height.tolist() == [0.05, -0.05]
+    rays = rays_of(fitted)
+    assert np.allclose(rays.height + 9.0 * rays.slope, 9.0 * np.tan(np.radians([2.0, -8.0])) + height, atol=1e-6)
+    town = presets()["town"]
+    lower = np.asarray(town.heights) > 0
+    assert (town.optics()[0][lower] < town.laser_elevations[lower]).all()
+    assert town.by_beams().heights is None
 
 
 GOOD = {"name": "x", "columns": 8, "range_min": 1.0, "range_max": 9.0, "rows": 4, "fov_up": 2.0, "fov_down": -2.0}

@@ -18,7 +18,7 @@ from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.town.boxes import boxes_of
 from lidar_synth.town.camera import CAMERA, pixel_rays
 from lidar_synth.town.cast import Snapshot, trace
-from lidar_synth.town.ego import free_rays, optics
+from lidar_synth.town.ego import free_rays
 from lidar_synth.town.materials import MATERIALS
 from lidar_synth.town.movers import ego_place
 from lidar_synth.town.prototype import Prototype
@@ -205,7 +205,7 @@ def test_no_ray_passes_through_walls_or_cars(town: Town) -> None:
         world, scan = town.world(index), still[index]
         snapshot, pose, _ = town.moment(index)
         assert scan.ring is not None and scan.instance is not None
-        start = np.zeros((len(scan), 3)) + np.array((0, 0, 1)) * optics(scan.sensor)[1][scan.ring][:, None]
+        start = np.zeros((len(scan), 3)) + np.array((0, 0, 1)) * scan.sensor.optics()[1][scan.ring][:, None]
         offset = scan.points - start
         measured = np.linalg.norm(offset, axis=1)
         origins = (start @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
@@ -285,7 +285,7 @@ def test_points_are_in_ring_order(scans: dict[int, Scan]) -> None:
 
 def test_points_lie_on_their_lasers_rays(scans: dict[int, Scan]) -> None:
     sensor = load_sensor("town")
-    elevation, height = optics(sensor)
+    elevation, height = sensor.optics()
     scan = Town(scans=5, motion=False)[4]
     x, y, z = scan.points.T
     assert np.allclose(np.arctan2(z - height[scan.ring], np.hypot(x, y)), elevation[scan.ring], atol=1e-5)
@@ -298,7 +298,7 @@ def test_points_lie_on_their_lasers_rays(scans: dict[int, Scan]) -> None:
 def test_the_vehicle_moves_while_the_sensor_turns() -> None:
     """What is measured later is measured from farther along the street."""
     still, moving = Town(scans=5, motion=False)[4], Town(scans=5)[4]
-    elevation, height = optics(still.sensor)
+    elevation, height = still.sensor.optics()
     for scan, largest in ((still, 1e-4), (moving, 2.0)):
         x, y, z = scan.points.T
         start = np.hypot(x, y) + (z - height[scan.ring]) / np.tan(-elevation[scan.ring])  # of the ray, towards behind
@@ -310,7 +310,7 @@ def test_the_vehicle_moves_while_the_sensor_turns() -> None:
 
 def test_returns_from_a_level_road_have_the_elevations_of_the_beams() -> None:
     sensor = load_sensor("town")
-    elevation, height = optics(sensor)
+    elevation, height = sensor.optics()
     down = sensor.laser_elevations < np.radians(-6)
     reach = (1.73 + height[down]) / np.tan(-elevation[down])
     seen = np.arctan2(-1.73, reach)

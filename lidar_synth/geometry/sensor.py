@@ -27,6 +27,9 @@ cell) or the upper left corner, as in the public code of R2Flow and LiDM."""
 MOST_CELLS = 1 << 22
 """Rows times columns of a sensor; the largest that are sold have 2^19."""
 
+_MOUNT = 1.73
+"""Metres between the road and a sensor whose ``beams`` were measured from its returns."""
+
 _INTEGERS = ("columns", "rows", "firings", "reflectance_levels")
 _NUMBERS = ("range_min", "range_max", "fov_up", "fov_down", "range_step")
 _OPTIONAL = ("rows", "fov_up", "fov_down", "firings", "range_step", "reflectance_levels")
@@ -196,6 +199,20 @@ class Sensor:
         fraction = (np.arange(self.columns) + offset) / self.columns
         return ((2 * fraction - 1) * np.pi).astype(np.float32)
 
+    def optics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(H,) elevation of each laser in radians, and (H,) metres above the origin at which it starts.
+
+        ``beams`` are the elevations of typical returns as seen from the origin, so that a laser that starts above the
+        origin points further down. Most returns of a beam come from a level road; objects shorten the typical distance.
+        ``elevations`` without ``beams``, as ``fit_sensor`` gives them, are the lasers' own.
+        """
+        seen = self.laser_elevations.astype(np.float64)
+        heights = np.zeros(len(seen)) if self.heights is None else np.asarray(self.heights)
+        if self.beams is None:
+            return seen, heights
+        typical = np.minimum(1 / (np.maximum(np.sin(-seen), 1e-3) / _MOUNT + 1 / 110), 20.0)
+        return seen - heights / typical, heights
+
     def firing_azimuths(self) -> NDArray[np.float64]:
         """(H, F) azimuth of each laser at each of its firings, radians, in the order of firing from behind the sensor.
 
@@ -215,10 +232,10 @@ class Sensor:
         return _ray_directions(self, rays)
 
     def by_beams(self) -> "Sensor":
-        """The same sensor with one row per laser at the laser's own elevation, for unfolded scans."""
+        """The same sensor with one row per laser, at the elevation of its returns, for unfolded scans."""
         if self.beams is None:
             return self
-        return replace(self, name=f"{self.name}/beams", elevations=self.beams, beams=None,
+        return replace(self, name=f"{self.name}/beams", elevations=self.beams, beams=None, heights=None,
                        rows=None, fov_up=None, fov_down=None)  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:

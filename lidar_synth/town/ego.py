@@ -35,28 +35,10 @@ def body() -> Mesh:
     ])  # fmt: skip
 
 
-def optics(sensor: Sensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The elevations of a sensor's lasers and the heights above its origin at which they start.
-
-    A sensor's ``beams`` are the elevations of the returns from a street as seen from the sensor's origin; a laser that
-    starts above the origin points further down than its beam.
-
-    Returns:
-        (H,) elevations in radians and (H,) heights in metres.
-    """
-    beams = sensor.laser_elevations.astype(float)
-    if sensor.heights is None:
-        return beams, np.zeros(len(beams))
-    heights = np.asarray(sensor.heights)
-    # Most returns of a beam come from the level road; objects on the road shorten the typical distance.
-    typical = np.minimum(1 / (np.maximum(np.sin(-beams), 1e-3) / HEIGHT + 1 / 110), 20.0)
-    return beams - heights / typical, heights
-
-
 @lru_cache(maxsize=8)
 def free_rays(sensor: Sensor) -> NDArray[np.bool_]:
     """(H, F) which rays of a sensor's firings the ego vehicle does not block; read-only."""
-    elevation, height = optics(sensor)
+    elevation, height = sensor.optics()
     a = sensor.firing_azimuths()
     e = np.broadcast_to(elevation[:, None], a.shape)
     rays = np.stack([np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)], -1)

@@ -20,7 +20,7 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.town.boxes import boxes_of
 from lidar_synth.town.camera import CAMERA
 from lidar_synth.town.cast import Snapshot
-from lidar_synth.town.ego import HEIGHT, free_rays, optics
+from lidar_synth.town.ego import HEIGHT, free_rays
 from lidar_synth.town.materials import SurfaceTable
 from lidar_synth.town.movers import ego_place, ego_pose, place_movers
 from lidar_synth.town.returns import Noise, laser_gains, measure, see_through
@@ -89,7 +89,7 @@ class Town:
         self._noise = noise or (Noise(gain_std=0) if self.skin else Noise())
         self._scans, self._motion = scans, motion
         self._worlds: OrderedDict[int, World] = OrderedDict()
-        elevation, height = optics(self.sensor)
+        elevation, height = self.sensor.optics()
         # The order in which the sensor writes points: ring by ring from the top, counter-clockwise from straight ahead.
         azimuths = self.sensor.firing_azimuths()
         order = np.argsort(-azimuths % (2 * np.pi), axis=1)

@@ -8,9 +8,6 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
 
-HEIGHT = 1.73
-"""Typical height of a roof-mounted sensor above the road, metres."""
-
 
 class Rays(NamedTuple):
     """H lasers with F firings each. Laser h fires at azimuth ``first[h] + f * step`` for f = 0 .. F - 1.
@@ -32,15 +29,8 @@ class Rays(NamedTuple):
 
 @lru_cache(maxsize=16)
 def rays_of(sensor: Sensor) -> Rays:
-    """The rays of a sensor.
-
-    ``sensor.beams`` are the elevations of typical returns as seen from the origin, so that a laser that starts above
-    the origin points further down. Most returns of a beam come from the level road; objects on the road shorten the
-    typical distance.
-    """
-    elevation = sensor.laser_elevations.astype(np.float64)
-    height = np.zeros(len(elevation)) if sensor.heights is None else np.asarray(sensor.heights)
-    typical = np.minimum(1 / (np.maximum(np.sin(-elevation), 1e-3) / HEIGHT + 1 / 110), 20.0)
+    """The rays of a sensor."""
+    elevation, height = sensor.optics()
     azimuth = sensor.firing_azimuths()
     count = azimuth.shape[1]
-    return Rays(np.tan(elevation - height / typical), height, azimuth[:, 0].copy(), 2 * np.pi / count, count)
+    return Rays(np.tan(elevation), height, azimuth[:, 0].copy(), 2 * np.pi / count, count)
