@@ -5,8 +5,7 @@ from functools import cache
 import numpy as np
 
 from lidar_synth.town import fences, furniture
-from lidar_synth.town.boundaries import KINDS as BOUNDARIES
-from lidar_synth.town.boundaries import put_boundary
+from lidar_synth.town.boundaries import put_boundary, sample_kind
 from lidar_synth.town.buildings import building
 from lidar_synth.town.facades import BuildingPlan, finishes
 from lidar_synth.town.furniture import StaticObject
@@ -45,7 +44,7 @@ def line_side_streets(street: Street, scene: Scene, rng: Rng) -> None:
                 continue
             for direction in (-1, 1):
                 edge = c.s + direction * (c.half + c.pavement + 0.35)
-                kind = str(rng.choice(BOUNDARIES))
+                kind = sample_kind(rng)
                 corner = street.front(side) + 1.0
                 _line(scene, (corner, corner + 18), edge, side, kind, rng)
                 t = corner + 20

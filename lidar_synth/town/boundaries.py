@@ -9,8 +9,16 @@ from lidar_synth.town.furniture import StaticObject
 from lidar_synth.town.materials import Finish
 from lidar_synth.town.scene import Scene
 
-KINDS = ("hedge", "hedge", "thicket", "thicket", "wall", "bars", "boards", "wire", "wallhedge", "none", "none", "none")
-"""Kinds of boundary; a kind that is listed twice is twice as frequent."""
+KINDS = {
+    "hedge": 5, "thicket": 5, "wall": 1, "bars": 2, "boards": 1, "wire": 1, "wallhedge": 2, "none": 7,
+}  # fmt: skip
+"""{kind of boundary: weight}."""
+
+
+def sample_kind(rng: np.random.Generator) -> str:
+    """A kind of boundary, sampled by the weights of ``KINDS``."""
+    weights = np.array(list(KINDS.values()), float)
+    return str(rng.choice(list(KINDS), p=weights / weights.sum()))
 
 
 def put_boundary(

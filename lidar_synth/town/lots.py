@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidar_synth.town.boundaries import KINDS
+from lidar_synth.town.boundaries import sample_kind
 from lidar_synth.town.facades import BuildingPlan
 from lidar_synth.town.paving import PLAZA_DEPTH, Paint
 from lidar_synth.town.street import LEFT, RIGHT, Street
@@ -89,7 +89,7 @@ def sample_lots(street: Street, rng: Rng) -> list[Lot]:
     lots = []
     for side in (RIGHT, LEFT):
         front = street.front(side)
-        boundary = str(rng.choice(KINDS))
+        boundary = sample_kind(rng)
         setback = rng.uniform(2.0, 8.0) if street.kind in ("residential", "edge") else rng.uniform(0.0, 6.0)
         for low, high in street.gaps(side, 1.0):
             s = low
@@ -134,7 +134,7 @@ def _sample_lot(
         middle = (room[0] + room[1]) / 2
         driveway = (middle - 1.4, middle + 1.4)
     if rng.random() < 0.25 and style not in ("shop", "row"):
-        boundary = str(rng.choice(KINDS))
+        boundary = sample_kind(rng)
     near = -45 < s + width / 2 < street.length + 50
     plan = replace(sample_house(style, width, rng.uniform(8, 12), rng), detail=near)
     return Lot(

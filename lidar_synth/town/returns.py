@@ -2,10 +2,10 @@
 
 The model is fitted to 28 labelled street scans of an HDL-64E (SemanticKITTI; docs/research/judge.md). Reflectance is
 corrected for distance up to about 20 m and then decreases; below a knee it falls to 0 faster than the signal, so that
-dark paint and distant asphalt give 0; it hardly depends on the angle of incidence except near grazing incidence;
-glossy paint and glass return light only at normal incidence; number plates and signs are retroreflectors; each laser
-has its own gain. Rays are dropped at random, with a probability that grows as the returned signal falls. Soft surfaces
-(leaves, grass) have relief: their returns lie before or behind the triangle, along the ray.
+dark paint and distant asphalt give 0, and above a shoulder it rises faster; it hardly depends on the angle of incidence
+except near grazing incidence; glossy paint and glass return light only at normal incidence; number plates and signs are
+retroreflectors; each laser has its own gain. Rays are dropped at random, with a probability that grows as the returned
+signal falls. Soft surfaces (leaves, grass) have relief: their returns lie before or behind the triangle, along the ray.
 """
 
 from dataclasses import dataclass
@@ -33,6 +33,8 @@ _DISTANCE_FACTOR = np.interp(
 """Factor of reflectance by distance, in steps of ``_STEP`` metres."""
 _KNEE, _SLOPE = 0.30, 3.0
 """Below this value the measured reflectance falls ``_SLOPE`` times as fast, to 0: dark and distant surfaces give 0."""
+_SHOULDER, _RISE = 0.42, 1.6
+"""Above this value it rises ``_RISE`` times as fast: white paint and bright leaves give more than 0.5."""
 _TAIL = 0.8
 """Logarithmic standard deviation of the roughness from return to return: most are small, a few are large."""
 _FLATTEST, _DEEPEST = 0.06, 0.1
@@ -165,6 +167,7 @@ def _response(power: Floats, slope: Floats, distance: Floats) -> Floats:
     """(N,) the reflectance that the sensor gives for a reflected power, 0 and more, without noise."""
     distance_bin = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1).astype(np.int32)
     value = power * _DISTANCE_FACTOR[distance_bin] * np.clip((slope - 0.015) / 0.06, 0, 1)
+    value = value + np.float32(_RISE - 1) * np.maximum(value - np.float32(_SHOULDER), 0)
     return np.asarray(np.maximum(np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0))
 
 
