@@ -51,7 +51,8 @@ class Sensor:
         elevations: instead of ``rows``, ``fov_up`` and ``fov_down``, the elevation of each row in degrees, highest
             first; the edges of a row lie halfway between the beams.
         beams: the measured elevation of each laser in degrees, highest first, if the rows only approximate it.
-        heights: metres above the origin at which each laser starts, one per row; 0 by default.
+        heights: metres above the origin at which each laser starts, one per row; 0 by default. With ``elevations`` and
+            without ``beams``, the rows are the lasers, and the rays of their cells start there.
         firings: of each laser in one revolution; as many as columns by default.
         azimuths: degrees, clockwise, by which each laser points away from the direction of its firing, one per row;
             0 by default.
@@ -212,6 +213,17 @@ class Sensor:
             return seen, heights
         typical = np.minimum(1 / (np.maximum(np.sin(-seen), 1e-3) / _MOUNT + 1 / 110), 20.0)
         return seen - heights / typical, heights
+
+    @cached_property
+    def starts(self) -> NDArray[np.float32]:
+        """(H,) metres above the origin at which the rays of each row start; empty where they start at the origin.
+
+        Rows with ``elevations`` and ``heights`` but without ``beams`` are the lasers themselves, as ``fit_sensor``
+        gives them.
+        """
+        if self.elevations is None or self.beams is not None or not any(self.heights or ()):
+            return np.empty(0, np.float32)
+        return np.asarray(self.heights, np.float32)
 
     def firing_azimuths(self) -> NDArray[np.float64]:
         """(H, F) azimuth of each laser at each of its firings, radians, in the order of firing from behind the sensor.

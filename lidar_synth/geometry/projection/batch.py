@@ -32,7 +32,17 @@ def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor
     r = torch_sqrt(x * x + y * y + z * z)
     in_range = (r >= float(grid.range_min)) & (r <= float(grid.range_max)) & (r > 0)
     elevation = torch_asin(z / torch.where(r > 0, r, 1.0))
-    if len(grid.edges):
+    if len(grid.slopes):
+        slopes, lifts, starts = (
+            torch.from_numpy(part).to(points.device) for part in (grid.slopes, grid.lifts, grid.starts)
+        )
+        squared = x * x + y * y
+        flat = torch_sqrt(squared)[:, None]
+        row = (z[:, None] <= lifts[1:-1] + flat * slopes[1:-1]).sum(1)
+        rise = z - starts[row]
+        r = torch_sqrt(squared + rise * rise)
+        in_range = (r >= float(grid.range_min)) & (r <= float(grid.range_max)) & (r > 0)
+    elif len(grid.edges):
         inner = torch.from_numpy(grid.edges[1:-1].copy()).to(points.device)
         row = torch.searchsorted(-inner, -elevation.contiguous(), right=True)
     else:
@@ -103,7 +113,10 @@ def unproject_batch(image: torch.Tensor, sensor: Sensor, rays: Rays = "centre") 
     if tuple(image.shape[1:]) != sensor.shape:
         raise DataError(f"range images {tuple(image.shape)}", f"(B, {sensor.shape[0]}, {sensor.shape[1]})")
     directions = torch.tensor(sensor.ray_directions(rays), device=image.device).movedim(-1, 0)
-    return image[:, None] * directions
+    points = image[:, None] * directions
+    if len(sensor.starts):
+        points[:, 2] += (image > 0) * torch.tensor(sensor.starts, device=image.device)[:, None]
+    return points
 
 
 def torch_atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:

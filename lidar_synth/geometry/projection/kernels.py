@@ -11,6 +11,7 @@ Everything that is compiled for ``project`` is in this one file: numba's cache o
 that defines a function, but not of a file whose functions were inlined into it.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numba
@@ -36,6 +37,9 @@ class Grid(NamedTuple):
     Args:
         up, down: edges of the field of view, radians.
         edges: (H+1,) edges of the rows, highest first, radians; empty where rows are linear.
+        slopes: (H+1,) tangents of the edges; empty unless lasers start above the origin.
+        lifts: (H+1,) metres above the origin at which the edges start; as ``slopes``.
+        starts: (H,) metres above the origin at which the lasers start; as ``slopes``.
         rows, columns: H, W.
         range_min, range_max: metres, inclusive.
     """
@@ -43,17 +47,26 @@ class Grid(NamedTuple):
     up: np.float32
     down: np.float32
     edges: NDArray[np.float32]
+    slopes: NDArray[np.float32]
+    lifts: NDArray[np.float32]
+    starts: NDArray[np.float32]
     rows: int
     columns: int
     range_min: np.float32
     range_max: np.float32
 
 
+@lru_cache(maxsize=16)
 def grid_of(sensor: Sensor) -> Grid:
     """The ``Grid`` of a sensor."""
-    up, down = np.radians(_f(sensor.up)), np.radians(_f(sensor.down))
-    edges = sensor.edges if sensor.elevations is not None else np.empty(0, np.float32)
-    return Grid(up, down, edges, *sensor.shape, _f(sensor.range_min), _f(sensor.range_max))
+    up, down, none = np.radians(_f(sensor.up)), np.radians(_f(sensor.down)), np.empty(0, np.float32)
+    edges, starts = sensor.edges if sensor.elevations is not None else none, sensor.starts
+    slopes = lifts = none
+    if len(starts):
+        slopes, between = np.tan(edges), (starts[1:] + starts[:-1]) / 2
+        lifts = np.concatenate([starts[:1], between, starts[-1:]])
+    limits = _f(sensor.range_min), _f(sensor.range_max)
+    return Grid(up, down, edges, slopes, lifts, starts, *sensor.shape, *limits)
 
 
 @numba.njit(inline="always")
@@ -111,6 +124,20 @@ def row_in_table(elevation, edges):  # type: ignore[no-untyped-def]
     return np.int32(low - 1)
 
 
+@numba.njit(inline="always")
+def row_of_lasers(z, flat, slopes, lifts):  # type: ignore[no-untyped-def]
+    """Row of a point at height z and horizontal distance ``flat`` (metres) between edges that start above the
+    origin; the first or last row outside the field of view."""
+    low, high = 1, len(slopes) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if z <= lifts[middle] + flat * slopes[middle]:
+            low = middle + 1
+        else:
+            high = middle
+    return np.int32(low - 1)
+
+
 @numba.njit(error_model="numpy", cache=True)
 def _locate_block(x, y, z, grid, cell, distance):  # type: ignore[no-untyped-def]
     """Cells and ranges of one block of points; outside the range limits: cell 0, range inf."""
@@ -123,7 +150,16 @@ def _locate_block(x, y, z, grid, cell, distance):  # type: ignore[no-untyped-def
         flat_index = row_of(elevation, up, down, rows) * columns + column_of(-atan2(y[i], x[i]), columns)
         cell[i] = flat_index if in_range else np.int32(0)
         distance[i] = r if in_range else _INF
-    if len(grid.edges) > 0:
+    if len(grid.slopes) > 0:  # ranges are measured from the lasers
+        for i in range(len(x)):
+            squared = x[i] * x[i] + y[i] * y[i]
+            row = row_of_lasers(z[i], np.sqrt(squared), grid.slopes, grid.lifts)
+            rise = z[i] - grid.starts[row]
+            r = np.sqrt(squared + rise * rise)
+            in_range = (r >= low) & (r <= high) & (r > 0)
+            distance[i] = r if in_range else _INF
+            cell[i] = row * columns + column_of(-atan2(y[i], x[i]), columns) if in_range else np.int32(0)
+    elif len(grid.edges) > 0:
         for i in range(len(x)):
             if distance[i] < _INF:
                 cell[i] = cell[i] % columns + row_in_table(asin(z[i] / distance[i]), grid.edges) * columns

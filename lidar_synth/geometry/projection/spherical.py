@@ -169,6 +169,8 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
         raise DataError(f"range image of sensor {image.sensor.name!r} with negative or non-finite range", "metres")
     points = np.empty((count + 1, 3), np.float32)
     along_rays(flat, directions, points)
+    if len(starts := image.sensor.starts):
+        points[:count, 2] += starts[np.flatnonzero(flat > 0) // image.sensor.columns]
     fields: dict[str, Any] = {}
     for name in [n for n in image.channels if n in POINT_FIELDS]:
         values = np.ascontiguousarray(image.channels[name]).reshape(len(directions))

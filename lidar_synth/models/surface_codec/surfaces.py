@@ -1,0 +1,129 @@
+"""Patches of a range image as mixtures of surfaces.
+
+A patch of a few rows and columns shows K surfaces. A surface is a plane with a class, a reflectance and a probability
+of a return; each cell of the patch shows one of them. The likelihood of a cell is that of the mixture, so that the
+range, the label and the reflectance of a cell belong together::
+
+    p(cell) = sum_k  w_k  (1 - q_k)                                                    without a return
+    p(cell) = sum_k  w_k  q_k  Laplace(range)  ZeroInflatedLogistic(reflectance)  p_k(class)     with one
+
+Seen from a laser, the inverse range of a plane is linear in the ray's direction, and within a patch in row and column:
+three numbers describe it.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lidar_synth.geometry.normalize import Normalisation
+from lidar_synth.models.town_codec.planes import laplace_noise
+from lidar_synth.models.town_codec.reflectance import ZeroInflatedLogistic
+
+SLOPES = 0.3, 0.05
+"""Relative change of the inverse range per row and per column for a slope of 1."""
+SPREADS = 3e-3, 0.3
+"""Limits of a range's scale, normalised."""
+DIM = -4.6, 0.0
+"""Limits of the logarithm of a reflectance's scale."""
+NUMBERS = 8
+"""Values of a surface beside its class: log range, two slopes, log scale of the range, return, and the reflectance's
+median, log scale and logit of 0."""
+PER_CELL = 2
+"""Values of a cell beside its choice of a surface: offsets of the logit of a return and of the reflectance."""
+
+DRAWS = 4
+"""Random numbers per cell."""
+
+
+class Surfaces(NamedTuple):
+    """The distributions of the cells of N patches with K surfaces and P cells each.
+
+    Args:
+        inverse: (N, K, P) inverse range, 1 / metres.
+        scale: (N, K, 1) scale of the normalised range.
+        returned: (N, K, P) logits of a return.
+        reflectance: of (N, K, P) normalised reflectances.
+        classes: (N, K, C) log probabilities of the classes.
+        weights: (N, K, P) log probabilities of the surfaces.
+    """
+
+    inverse: Tensor
+    scale: Tensor
+    returned: Tensor
+    reflectance: ZeroInflatedLogistic
+    classes: Tensor
+    weights: Tensor
+
+    def log_likelihood(
+        self, x: Tensor, value: Tensor, code: Tensor, normalisation: Normalisation, temper: tuple[float, float]
+    ) -> Tensor:
+        """(N, P) log likelihoods of cells.
+
+        Args:
+            x: (N, P) normalised ranges, -1 without a return.
+            value: (N, P) normalised reflectances.
+            code: (N, P) classes, int64.
+            normalisation: of the ranges.
+            temper: exponents of the likelihoods of range and reflectance.
+        """
+        x, value = x[:, None], value[:, None]
+        far = normalised(self.inverse, normalisation)
+        distance = -(x - far).abs() / self.scale - self.scale.log()
+        shown = -self.reflectance.nll(value)
+        index = code[:, None].expand(-1, self.classes.shape[1], -1)
+        seen = F.logsigmoid(self.returned) + temper[0] * distance + temper[1] * shown + self.classes.gather(2, index)
+        return torch.logsumexp(self.weights + torch.where(x > -1, seen, F.logsigmoid(-self.returned)), 1)
+
+    def sample(self, uniform_noise: Tensor, roughness: Tensor, normalisation: Normalisation) -> Tensor:
+        """(N, 4, P) range, -1 without a return, reflectance, class and its probability, of sampled cells.
+
+        Args:
+            uniform_noise: (N, DRAWS, P) numbers in (0, 1): for the surface, the return, the range and the reflectance.
+            roughness: (C,) by class, the share of ``scale`` that is noise of the surface, not doubt about its place.
+            normalisation: of the ranges.
+        """
+        which, back, near, dim = uniform_noise.unbind(1)
+        shares = self.weights.softmax(1).cumsum(1)
+        chosen = (which[:, None] > shares[:, :-1]).sum(1, keepdim=True)
+        likely, code = self.classes.exp().max(2, keepdim=True)
+        values = ZeroInflatedLogistic(*(_pick(part, chosen) for part in self.reflectance)).sample(dim)
+        distance = normalised(_pick(self.inverse, chosen), normalisation)
+        distance = distance + _pick(roughness[code] * self.scale, chosen) * laplace_noise(near)
+        returned = _pick(self.returned, chosen) + torch.logit(back) > 0
+        distance = torch.where(returned, distance, -1.0)
+        return torch.stack(
+            [distance, values, _pick(code, chosen).float(), _pick(likely, chosen), chosen[:, 0].float()], 1
+        )
+
+
+def _pick(x: Tensor, chosen: Tensor) -> Tensor:
+    """(N, P) of (N, K, P or 1), the surface that each cell (N, 1, P) shows."""
+    out = x[:, 0]
+    for k in range(1, x.shape[1]):
+        out = torch.where(chosen[:, 0] == k, x[:, k], out)
+    return out
+
+
+def normalised(inverse: Tensor, normalisation: Normalisation) -> Tensor:
+    """Inverse ranges as normalised ranges, inside the limits of a return."""
+    low, high = normalisation.range_min, normalisation.range_max
+    return normalisation.encode(1 / inverse.clamp(1 / (0.999 * high), 1 / (1.001 * low)))
+
+
+def surfaces_of(x: Tensor, surfaces: int, classes: int, patch: tuple[int, int]) -> Surfaces:
+    """The surfaces that the numbers (N, K (NUMBERS + C) + P (K + PER_CELL)) of N patches describe, float32."""
+    cells = patch[0] * patch[1]
+    whole, each = x.float().split([surfaces * (NUMBERS + classes), cells * (surfaces + PER_CELL)], 1)
+    numbers, kinds = whole.unflatten(1, (surfaces, -1)).split([NUMBERS, classes], 2)
+    choice, offsets = each.unflatten(1, (-1, cells)).split([surfaces, PER_CELL], 1)
+    distance, down, across, spread, returned, median, dim, blank = numbers[..., None].unbind(2)
+    cell = torch.arange(cells, device=x.device)
+    i, j = cell // patch[1] - (patch[0] - 1) / 2, cell % patch[1] - (patch[1] - 1) / 2
+    slopes = 1 + SLOPES[0] * down * i + SLOPES[1] * across * j
+    inverse = (-distance.clamp(-1, 5)).exp() * slopes.clamp_min(0.05)
+    reflectance = ZeroInflatedLogistic(median + offsets[:, 1:2], dim.clamp(*DIM), blank)
+    scale = spread.clamp(*map(math.log, SPREADS)).exp()
+    return Surfaces(inverse, scale, returned + offsets[:, :1], reflectance, kinds.log_softmax(2), choice.log_softmax(1))
