@@ -1,6 +1,6 @@
 """Learn the skin ``pandar64`` that ships with the package, and measure it on later frames.
 
-    python tools/make_pandar64_skin.py FRAMES --elevations pandar64_elevations.csv [--measure]
+    python tools/make_pandar64_skin.py FRAMES [--measure]
 
 FRAMES is a folder of Pandar64 scans from PandaSet as NN.npz (points, reflectance 0..255, ring) in the sensor's frame.
 The skin is learnt from frames 00 to 30; ``--measure`` compares the town with frames 60 and later instead of writing it.
@@ -13,7 +13,7 @@ import numpy as np
 
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.town import STRETCH_FRAMES, Town, fit_skin, load_skin
 from lidar_synth.town.returns import LEVELS, Noise
 from lidar_synth.town.skin.domains import Domain, returns_of
@@ -25,16 +25,6 @@ LICENCE = (
     "beyond attribution; no attempt to identify persons"
 )
 SOURCE = "PandaSet by Scale AI and Hesai (https://pandaset.org), sequence 002, Pandar64, frames 00 to 30"
-
-
-def pandar64(elevations: Path) -> Sensor:
-    """The sensor from its table of ring, elevation and azimuth offset in degrees."""
-    table = np.loadtxt(elevations, delimiter=",", skiprows=1)
-    return Sensor(
-        "pandar64", columns=1800, range_min=0.5, range_max=200.0, elevations=tuple(table[:, 1]),
-        azimuths=tuple(table[:, 2]), range_step=0.004, reflectance_levels=256,
-        description="Hesai Pandar64 as in PandaSet; 64 x 1800",
-    )  # fmt: skip
 
 
 def frames(folder: Path, sensor: Sensor, first: int, last: int) -> list[Scan]:
@@ -108,11 +98,10 @@ def main() -> None:
     """Writes the skin, or prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("frames", type=Path)
-    parser.add_argument("--elevations", type=Path, required=True)
     parser.add_argument("--measure", action="store_true")
     parser.add_argument("--streets", type=int, default=12, help="of the town that is measured")
     given = parser.parse_args()
-    sensor = pandar64(given.elevations)
+    sensor = load_sensor("pandar64")
     if given.measure:
         measure(given.frames, sensor, given.streets, seed=7)
         return

@@ -3,7 +3,7 @@
     python tools/transfer_trial.py SEMANTIC_KITTI PANDASET [--seeds 3] [--steps 400] [--jobs 1] [--out TABLE.md]
 
 SEMANTIC_KITTI is a root with labels (64 beams, HDL-64E). PANDASET is a folder of Pandar64 frames as arrays
-(``sensor_frame/NN.npz`` with points, reflectance, ring and PandaSet's classes, beside ``pandar64_elevations.csv``).
+(``sensor_frame/NN.npz`` with points, reflectance, ring and PandaSet's classes).
 
 Every arm has the same network, iterations, order and augmentation, and is tested on the same frames of PandaSet: the
 last 15. Classes are pooled to those that both datasets label alike. The reference is trained on the first 15 frames of
@@ -11,7 +11,6 @@ PandaSet, of the same street as the test: what the change of sensor, place and l
 """
 
 import argparse
-import csv
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lidar_synth import Scan, Sensor, load_sensor, open_scans, unfold
+from lidar_synth import Scan, load_sensor, open_scans, unfold
 from lidar_synth.datasets.classes import IGNORE, NAMES, TRAIN_ID
 from lidar_synth.evaluate.segmentation import class_ious, confusion, mean_iou
 from lidar_synth.geometry.transfer import Measurement, Mount, Response, Transfer
@@ -61,16 +60,9 @@ def table(classes: dict[str, Sequence[int]]) -> NDArray[np.uint8]:
     return ids
 
 
-def pandar64(path: Path) -> Sensor:
-    """The sensor of PandaSet from Hesai's table of elevations and azimuth offsets."""
-    rows = list(csv.reader(path.read_text().splitlines()))[1:]
-    elevations, azimuths = zip(*((float(e), float(a)) for _, e, a in rows), strict=True)
-    return Sensor("pandar64", 1800, 0.3, 200.0, elevations=elevations, azimuths=azimuths, reflectance_levels=256)
-
-
 def read_pandaset(folder: Path) -> list[Scan]:
     """The frames of PandaSet in order, with pooled classes."""
-    sensor, pooled, scans = pandar64(next(folder.glob("**/pandar64_elevations.csv"))), table(PANDASET), []
+    sensor, pooled, scans = load_sensor("pandar64"), table(PANDASET), []
     for path in sorted(folder.glob("sensor_frame/*.npz")):
         frame = np.load(path)
         reflectance = frame["reflectance"].astype(np.float32) / 255

@@ -8,56 +8,70 @@ import typer
 
 if TYPE_CHECKING:
     from lidar_synth.formats import ScanFiles
+    from lidar_synth.formats.convert import Report
     from lidar_synth.geometry.scan import Scan
 
 
+Source = Annotated[Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")]
+Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
+To = Annotated[
+    str,
+    typer.Option(
+        help="format: kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | png | webdataset"
+    ),
+]
+InputSensor = Annotated[
+    str | None, typer.Option(help="sensor of the input: a preset or a YAML file [named by the files]")
+]
+Layout = Annotated[str | None, typer.Option(help="layout of the input [detected]")]
+Split = Annotated[str | None, typer.Option(help="split of the input, for instance r2flow/train")]
+AsSensorName = Annotated[
+    str | None, typer.Option(help="scans as this sensor would have recorded them: a preset or a YAML file")
+]
+MountText = Annotated[
+    str | None,
+    typer.Option(metavar="Z,PITCH", help="of --as-sensor: metres higher, degrees looking further down [0,0]"),
+]
+Sweeps = Annotated[int, typer.Option(help="of --as-sensor: scans before and after, which fill gaps by their poses")]
+Like = Annotated[Path | None, typer.Option(help="of --as-sensor: real scans of that sensor, to match its reflectance")]
+RangeNoise = Annotated[float, typer.Option(help="of --as-sensor: metres, noise beyond that of the input")]
+Reach = Annotated[
+    float | None,
+    typer.Option(help="of --as-sensor: metres at which it loses every second ray to a surface of 10 % reflectance"),
+]
+Unfold = Annotated[bool, typer.Option("--unfold", help="assign one row to each laser, from KITTI's order of points")]
+Fields = Annotated[int | None, typer.Option(help="floats per point in plain .bin files [4]")]
+ReflectanceMax = Annotated[
+    float | None, typer.Option(help="highest reflectance value in plain files, for instance 255 [1]")
+]
+OnBad = Annotated[
+    str,
+    typer.Option(
+        help="bad scans: error = stop at the first one | skip = leave them out | drop-points = leave out their NaN "
+        "and infinite points"
+    ),
+]
+Jobs = Annotated[int, typer.Option(help="number of worker processes")]
+
+
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
-    to: Annotated[
-        str,
-        typer.Option(
-            help="format: kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | png | webdataset"
-        ),
-    ],
-    sensor: Annotated[
-        str | None, typer.Option(help="sensor of the input: a preset or a YAML file [named by the files]")
-    ] = None,
-    layout: Annotated[str | None, typer.Option(help="layout of the input [detected]")] = None,
-    split: Annotated[str | None, typer.Option(help="split of the input, for instance r2flow/train")] = None,
-    as_sensor: Annotated[
-        str | None, typer.Option(help="scans as this sensor would have recorded them: a preset or a YAML file")
-    ] = None,
-    mount: Annotated[
-        str | None,
-        typer.Option(metavar="Z,PITCH", help="of --as-sensor: metres higher, degrees looking further down [0,0]"),
-    ] = None,
-    sweeps: Annotated[
-        int, typer.Option(help="of --as-sensor: scans before and after, which fill gaps by their poses")
-    ] = 0,
-    like: Annotated[
-        Path | None, typer.Option(help="of --as-sensor: real scans of that sensor, to match its reflectance")
-    ] = None,
-    range_noise: Annotated[float, typer.Option(help="of --as-sensor: metres, noise beyond that of the input")] = 0.0,
-    reach: Annotated[
-        float | None,
-        typer.Option(help="of --as-sensor: metres at which it loses every second ray to a surface of 10 % reflectance"),
-    ] = None,
-    unfold: Annotated[
-        bool, typer.Option("--unfold", help="assign one row to each laser, from KITTI's order of points")
-    ] = False,
-    fields: Annotated[int | None, typer.Option(help="floats per point in plain .bin files [4]")] = None,
-    reflectance_max: Annotated[
-        float | None, typer.Option(help="highest reflectance value in plain files, for instance 255 [1]")
-    ] = None,
-    on_bad: Annotated[
-        str,
-        typer.Option(
-            help="bad scans: error = stop at the first one | skip = leave them out | drop-points = leave out their NaN "
-            "and infinite points"
-        ),
-    ] = "error",
-    jobs: Annotated[int, typer.Option(help="number of worker processes")] = 1,
+    source: Source,
+    out: Out,
+    to: To,
+    sensor: InputSensor = None,
+    layout: Layout = None,
+    split: Split = None,
+    as_sensor: AsSensorName = None,
+    mount: MountText = None,
+    sweeps: Sweeps = 0,
+    like: Like = None,
+    range_noise: RangeNoise = 0.0,
+    reach: Reach = None,
+    unfold: Unfold = False,
+    fields: Fields = None,
+    reflectance_max: ReflectanceMax = None,
+    on_bad: OnBad = "error",
+    jobs: Jobs = 1,
 ) -> None:
     """Converts scans from one format to another. Run it again to resume an interrupted conversion.
 
@@ -84,6 +98,11 @@ def convert(
     scans = open_scans(source, sensor=sensor, on_bad=on_bad, **given)  # type: ignore[arg-type]
     change = _change(scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach)
     report = run(scans, writer, jobs=jobs, on_bad=on_bad, as_sensor=change, unfold=unfold)  # type: ignore[arg-type]
+    _print(report, out, as_sensor)
+
+
+def _print(report: "Report", out: Path, as_sensor: str | None) -> None:
+    """What was written, and on standard error what was not."""
     print(f"{out}: {report.written} scans written, {report.kept} were there already, {len(report.skipped)} skipped")
     if report.seen:
         print(f"  {100 * sum(report.seen) / len(report.seen):.0f} % of the field of view of {as_sensor} was seen")
