@@ -118,7 +118,7 @@ def test_a_real_street_of_the_town_too() -> None:
         found = Transfer(scan.sensor)(replace(scan, ring=scan.ring))
         ranges = [project(s).range for s in (scan, found)]
         both = (ranges[0] > 0) & (ranges[1] > 0)
-        assert both.sum() > 0.9 * (ranges[0] > 0).sum()
+        assert both.sum() > 0.87 * (ranges[0] > 0).sum()
         assert np.median(np.abs(ranges[0] - ranges[1])[both]) < 0.05
 
 
