@@ -144,13 +144,16 @@ def decode_labels(bits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         (B, H, W) uint8 train ids, 255 = ignore, and (B, H, W) float32 confidence: 1 on the code, falling
         with the distance (in the maximum norm) to 0 where a bit is no nearer to its value than to the other.
     """
-    codes = torch.arange(NO_LABEL + 1, device=bits.device, dtype=torch.uint8)
-    codes = torch.where(codes == NO_LABEL, IGNORE, codes)
-    corners = encode_labels(codes[None, None].to(torch.uint8))[0, :, 0].to(bits.dtype)  # (5, 20)
-    # All codes have the same norm, so the nearest one has the largest dot product with the bits.
-    nearest = torch.einsum("bchw,ck->bkhw", bits, corners).argmax(1)
-    gap = (bits - corners[:, nearest].movedim(0, 1)).abs().amax(1)
-    return codes[nearest].to(torch.uint8), (1 - gap).clamp(0, 1).float()
+    powers = torch.tensor([1 << b for b in reversed(range(LABEL_BITS))], device=bits.device)
+    nearest = ((bits > 0) * powers.view(1, -1, 1, 1)).sum(1)
+    if bool((unused := nearest > NO_LABEL).any()):  # all codes have the same norm: the nearest has the largest product
+        codes = torch.arange(NO_LABEL + 1, device=bits.device)
+        corners = (codes[:, None] & powers).sign() * 2.0 - 1.0
+        nearest[unused] = (bits.movedim(1, -1)[unused].float() @ corners.T).argmax(1)
+    corner = (nearest[:, None] & powers.view(1, -1, 1, 1)).sign() * 2.0 - 1.0
+    gap = (bits - corner).abs().amax(1)
+    label = torch.where(nearest == NO_LABEL, IGNORE, nearest).to(torch.uint8)
+    return label, (1 - gap).clamp(0, 1).float()
 
 
 CHANNELS = {"range": 1, "reflectance": 1, "label": LABEL_BITS}

@@ -24,6 +24,7 @@ from lidar_synth.models.lidm.diffusion import DiffusionUNet
 from lidar_synth.models.lidm.unet import UNet
 from lidar_synth.models.lidm.vqvae import VQVAE
 from lidar_synth.models.network import Encoder, Network
+from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
 
 NETWORKS: dict[str, type[Network]] = {
@@ -33,6 +34,7 @@ NETWORKS: dict[str, type[Network]] = {
     "diffusion_unet": DiffusionUNet,
     "vqvae": VQVAE,
     "autoencoder": Autoencoder,
+    "surfaces": SurfaceAutoencoder,
     "semantic_map": SemanticMapEncoder,
     "views": ViewEncoder,
     "clip_views": ClipViewEncoder,

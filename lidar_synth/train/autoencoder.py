@@ -13,8 +13,9 @@ An autoencoder trains in the same loop as a flow: one network, one optimiser, on
                      the autoencoder's term uses the discriminator with frozen weights, the discriminator's term
                      uses detached reconstructions
 
-The architecture "autoencoder" predicts distributions. Its loss is the negative log-likelihood of the scan: of the
-return, of the class, and, given a return, of the range and the other values.
+The architectures "autoencoder" and "surfaces" predict distributions. Their loss is the negative log-likelihood of the
+scan: of the return, of the class, and, given a return, of the range and the other values. "surfaces" takes them
+together, with ``weights`` as exponents of the likelihoods of range and reflectance.
 """
 
 import math
@@ -33,6 +34,9 @@ from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models.convolution import Norm, WrapConv
 from lidar_synth.models.lidm.vqvae import VQVAE, Encoding
+from lidar_synth.models.surface_codec.autoencoder import PATCH, SurfaceAutoencoder
+from lidar_synth.models.surface_codec.blocks import to_patches
+from lidar_synth.models.surface_codec.surfaces import Surfaces
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
 from lidar_synth.models.town_codec.distributions import CellDistributions
 from lidar_synth.train.data import Batch
@@ -97,7 +101,7 @@ class Autoencoding(nn.Module):
 
     def __init__(
         self,
-        network: VQVAE | Autoencoder,
+        network: VQVAE | Autoencoder | SurfaceAutoencoder,
         tensors: TensorFormat,
         sensor: Sensor,
         losses: Losses,
@@ -113,11 +117,11 @@ class Autoencoding(nn.Module):
 
     def forward(self, x: Tensor, noise: Tensor | None = None) -> Tensor:
         """The loss of a batch of tensors (B, C, H, W), a scalar; ``noise`` is standard normal, of the same shape."""
-        if isinstance(self.network, Autoencoder):
+        if isinstance(self.network, Autoencoder | SurfaceAutoencoder):
             shape = self.network.latent_shape
             noise = torch.zeros_like(x) if noise is None else noise
             some = noise.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
-            return self._nll(self.network(x, self.losses.noise * some), x)
+            return self.nll(self.network(x, self.losses.noise * some), x)
         encoding: Encoding = self.network(x)
         output, mask = encoding.output.float().tensor_split([self.tensors.size], 1)
         loss = self.reconstruction(output, x)
@@ -140,8 +144,23 @@ class Autoencoding(nn.Module):
             loss = loss + self.weights.get(name, 1.0) * part
         return loss
 
-    def _nll(self, heads: CellDistributions, x: Tensor) -> Tensor:
-        """The negative log-likelihood of images under the predicted distributions, a scalar."""
+    def nll(self, predicted: CellDistributions | Surfaces, x: Tensor) -> Tensor:
+        """The negative log-likelihood of images (B, C, H, W) under the predicted distributions, a scalar."""
+        if isinstance(predicted, Surfaces):
+            return self._nll_of_surfaces(predicted, x)
+        return self._nll_of_cells(predicted, x)
+
+    def _nll_of_surfaces(self, surfaces: Surfaces, x: Tensor) -> Tensor:
+        code = _code(x[:, 2:])
+        distance, value, weight = to_patches(
+            torch.cat([x[:, :2], self._rarity(code, surfaces.classes.shape[2])[:, None]], 1), PATCH
+        ).unbind(1)
+        codes = to_patches(code[:, None], PATCH)[:, 0]
+        temper = self.weights.get("range", 1.0), self.weights.get("reflectance", 1.0)
+        likely = surfaces.log_likelihood(distance, value, codes, self.tensors.normalisation, temper)
+        return -(weight * likely).sum() / weight.sum()
+
+    def _nll_of_cells(self, heads: CellDistributions, x: Tensor) -> Tensor:
         count = 1 + heads.readings.middles.shape[1]
         distance, values = x[:, :1], x[:, 1:count]
         returned = (distance > -1).float()

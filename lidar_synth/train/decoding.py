@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.flow.path import Example, Metric, Velocity, interpolate
+from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
 from lidar_synth.train.autoencoder import Autoencoding
 from lidar_synth.train.data import Batch
@@ -22,11 +23,11 @@ from lidar_synth.train.loop import Task
 class Decoding(Autoencoding):
     """The trained module: a decoder; the encoder is frozen. Takes the arguments of ``Autoencoding``."""
 
-    network: Autoencoder
+    network: Autoencoder | SurfaceAutoencoder
 
     def forward(self, z: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]  # it does not make its latents
         """The loss of images (B, C, H, W) under what latents (B, *latent_shape) say, a scalar."""
-        return self._nll(self.network.expand(self.network.bounded(z), x), x)
+        return self.nll(self.network.expand(self.network.bounded(z), x), x)
 
 
 def decoding_loss(network: nn.Module, example: Example, metric: Metric) -> Tensor:
@@ -35,7 +36,7 @@ def decoding_loss(network: nn.Module, example: Example, metric: Metric) -> Tenso
     return loss
 
 
-def decoding_task(autoencoder: Autoencoder, velocity: Velocity, time: float, noise: float) -> Task:
+def decoding_task(autoencoder: Autoencoder | SurfaceAutoencoder, velocity: Velocity, time: float, noise: float) -> Task:
     """Latents as a flow leaves them; the answer is the image.
 
     Args:

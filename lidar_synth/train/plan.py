@@ -24,6 +24,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS
+from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
 from lidar_synth.train.autoencoder import Autoencoding, autoencoder_loss, reconstruction_task
 from lidar_synth.train.cache import Other, cache_latents, cache_scans
@@ -114,7 +115,7 @@ def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> TrainingPla
     """The decoder of a latent model, on latents that its flow generates."""
     networks, header = start_networks(config)
     network = networks[CODEC]
-    if not isinstance(network, Autoencoder):
+    if not isinstance(network, Autoencoder | SurfaceAutoencoder):
         raise ConfigError(f"decoder with init {config.init}", "a model whose autoencoder predicts distributions")
     frozen = {
         name: part.requires_grad_(False).to(accelerator.device) for name, part in networks.items() if name != CODEC

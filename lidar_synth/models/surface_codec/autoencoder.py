@@ -17,7 +17,7 @@ from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.models.codebook import follow
 from lidar_synth.models.convolution import check_shape, pair, reduced
 from lidar_synth.models.network import Network
-from lidar_synth.models.surface_codec.blocks import Block, cell_norm, split
+from lidar_synth.models.surface_codec.blocks import Block, cell_norm, from_patches, split, to_patches
 from lidar_synth.models.surface_codec.surfaces import DRAWS, NUMBERS, PER_CELL, Surfaces, surfaces_of
 from lidar_synth.models.town_codec.autoencoder import Residual
 
@@ -84,7 +84,8 @@ class SurfaceAutoencoder(Network):
         # Learned biases by row: on a road, a beam's elevation gives its range.
         self.place_stem = _rows(encoder_widths[0], rows // PATCH[0])
         self.place_latent, self.place_outer = _rows(inner, rows // DOWN[0]), _rows(outer, rows // PATCH[0])
-        self.stem = nn.Conv2d(channels + 1, encoder_widths[0], PATCH, PATCH)
+        # Not a convolution: oneDNN's with this kernel and stride gives wrong values in bfloat16 (torch 2.13).
+        self.stem = nn.Linear((channels + 1) * cells, encoder_widths[0])
         self.encode_outer = Residual(encoder_widths[0])
         self.merge = nn.Conv2d(*encoder_widths, 2, 2)
         self.encode_inner = nn.Sequential(*(Residual(encoder_widths[1]) for _ in range(2)))
@@ -122,16 +123,18 @@ class SurfaceAutoencoder(Network):
         check_shape(x, (self.channels, *self.resolution), "an image")
         x = x.to(self.stem.weight.dtype)
         returned = (x[:, :1] > -1).to(x.dtype)
-        h = self.stem(torch.cat([x, returned], 1).contiguous(memory_format=torch.channels_last))
+        patches = to_patches(torch.cat([x, returned], 1), PATCH).flatten(1)
+        rows, columns = self.resolution[0] // PATCH[0], self.resolution[1] // PATCH[1]
+        h = self.stem(patches).unflatten(0, (-1, rows, columns)).movedim(-1, 1)
         h = self.encode_outer(h + self.place_stem)
         return torch.tanh(self.to_latent(self.encode_inner(self.merge(h))).float())
 
-    def expand(self, z: Tensor) -> Surfaces:
-        """Bounded latents (B, *latent_shape) to the surfaces of all patches, N = B H W / 16 row by row."""
+    def expand(self, z: Tensor, image: Tensor | None = None) -> Surfaces:
+        """Bounded latents (B, *latent_shape) to the surfaces of all patches, N = B H W / 16 row by row; they do not
+        depend on the image."""
         z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
         h = self.decode_inner(self.from_latent(z) + self.place_latent)
-        h = split(self.split(h).movedim(1, -1), 2, 2).movedim(-1, 1)
-        h = self.decode_outer(h + self.place_outer)
+        h = self.decode_outer(split(self.split(h), (2, 2)) + self.place_outer)
         return surfaces_of(self.head(cell_norm(h).movedim(1, -1).flatten(0, 2)), self.surfaces, self.codes, PATCH)
 
     def encode(self, x: Tensor) -> Tensor:
@@ -151,20 +154,13 @@ class SurfaceAutoencoder(Network):
             grows with its probability.
         """
         check_shape(z, self.latent_shape, "a latent")
-        surfaces, batch, (rows, columns) = self.expand(self.bounded(z)), len(z), self.resolution
-        noise = self._quiet(batch, z.device) if uniform_noise is None else uniform_noise
-        noise = noise.reshape(batch, DRAWS, -1, PATCH[0] * PATCH[1]).transpose(1, 2).flatten(0, 1)
-        cells = surfaces.sample(noise, self.roughness, self.normalisation)
-        cells = cells.reshape(batch, rows // PATCH[0], columns // PATCH[1], -1, *PATCH)
-        cells = cells.permute(0, 3, 1, 4, 2, 5).reshape(batch, -1, rows, columns)
-        distance, value, code, likely = cells.unbind(1)
-        bits = torch.stack([(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
-        return torch.cat([
-            distance[:, None], value[:, None], bits * (2 * torch.atanh(likely.clamp(max=0.9999)))[:, None]
-        ], 1)  # fmt: skip
-
-    def _quiet(self, batch: int, device: torch.device) -> Tensor:
-        return torch.full((batch, DRAWS, *self.resolution), 0.5, device=device)
+        surfaces = self.expand(self.bounded(z))
+        if uniform_noise is None:
+            uniform_noise = torch.full((len(z), DRAWS, *self.resolution), 0.5, device=z.device)
+        cells = surfaces.sample(to_patches(uniform_noise, PATCH), self.roughness, self.normalisation)
+        distance, value, code, likely = from_patches(cells, PATCH, self.resolution).split(1, 1)
+        bits = torch.cat([(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
+        return torch.cat([distance, value, bits * (2 * torch.atanh(likely.clamp(max=0.9999)))], 1)
 
     def bounded(self, z: Tensor) -> Tensor:
         """Normalised latents (B, *latent_shape) back to the bounded ones of ``squeeze``."""

@@ -94,9 +94,7 @@ class Surfaces(NamedTuple):
         distance = distance + _pick(roughness[code] * self.scale, chosen) * laplace_noise(near)
         returned = _pick(self.returned, chosen) + torch.logit(back) > 0
         distance = torch.where(returned, distance, -1.0)
-        return torch.stack(
-            [distance, values, _pick(code, chosen).float(), _pick(likely, chosen), chosen[:, 0].float()], 1
-        )
+        return torch.stack([distance, values, _pick(code, chosen).float(), _pick(likely, chosen)], 1)
 
 
 def _pick(x: Tensor, chosen: Tensor) -> Tensor:
