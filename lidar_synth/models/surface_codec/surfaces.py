@@ -71,7 +71,7 @@ class Surfaces(NamedTuple):
         """
         x, value = x[:, None], value[:, None]
         far = normalised(self.inverse, normalisation)
-        distance = -(x - far).abs() / self.scale - self.scale.log()
+        distance = -(x - far).abs() / self.scale - (2 * self.scale).log()
         shown = -self.reflectance.nll(value)
         index = code[:, None].expand(-1, self.classes.shape[1], -1)
         seen = F.logsigmoid(self.returned) + temper[0] * distance + temper[1] * shown + self.classes.gather(2, index)

@@ -1,0 +1,170 @@
+"""The autoencoder of dense models: patches, the likelihood of cells, sampling, training."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.flow.path import METRICS
+from lidar_synth.generate.codec import Latent
+from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.models.surface_codec.autoencoder import PATCH, SurfaceAutoencoder
+from lidar_synth.models.surface_codec.blocks import from_patches, split, to_patches
+from lidar_synth.models.surface_codec.surfaces import DRAWS, NUMBERS, PER_CELL, Surfaces, surfaces_of
+from lidar_synth.models.town_codec.reflectance import ZeroInflatedLogistic
+from lidar_synth.noise import uniform
+from lidar_synth.town import Town
+from lidar_synth.train.autoencoder import Autoencoding, Losses
+
+K, CODES, CELLS = 3, 20, PATCH[0] * PATCH[1]
+SCALE = NORMALISATIONS["r2flow"]
+FORMAT = TensorFormat(("range", "reflectance", "label"), SCALE)
+COARSE = Sensor("coarse", 256, 1.45, 80.0, rows=16, fov_up=3.0, fov_down=-25.0)
+
+
+def small(**changes: object) -> SurfaceAutoencoder:
+    """A network for 16 x 256 cells."""
+    torch.manual_seed(0)
+    arguments = {"encoder_widths": (16, 24), "widths": (16, 24), "reaches": (1, 2), "depth": 1}
+    return SurfaceAutoencoder(COARSE.shape, **arguments | changes)  # type: ignore[arg-type]
+
+
+def random_surfaces(patches: int, spread: float = 1.0) -> Surfaces:
+    generator = torch.Generator().manual_seed(3)
+    numbers = K * (NUMBERS + CODES) + CELLS * (K + PER_CELL)
+    x = spread * torch.randn(patches, numbers, generator=generator)
+    x[:, : K * (NUMBERS + CODES)].view(patches, K, -1)[:, :, 0] += torch.tensor([1.5, 2.3, 3.0])
+    return surfaces_of(x, K, CODES, PATCH)
+
+
+@settings(max_examples=20, deadline=None)
+@given(batch=st.integers(1, 3), channels=st.integers(1, 4), rows=st.integers(1, 3), columns=st.integers(1, 4))
+def test_patches_have_an_inverse(batch: int, channels: int, rows: int, columns: int) -> None:
+    x = torch.randn(batch, channels, rows * PATCH[0], columns * PATCH[1])
+    patches = to_patches(x, PATCH)
+    assert patches.shape == (batch * rows * columns, channels, CELLS)
+    assert torch.equal(from_patches(patches, PATCH, (x.shape[2], x.shape[3])), x)
+    assert torch.equal(patches[-1, 0], x[-1, 0, -PATCH[0] :, -PATCH[1] :].flatten())
+
+
+def test_splitting_puts_the_cells_of_a_patch_beside_each_other() -> None:
+    x = torch.arange(2 * 2 * 3, dtype=torch.float32).view(1, 12, 1, 1)  # 2 x 2 cells of 3 channels
+    assert split(x, (2, 2))[0, :, 1, 0].tolist() == [6, 7, 8]
+    assert split(x, (2, 2))[0, :, 0, 1].tolist() == [3, 4, 5]
+
+
+def test_the_likelihoods_of_all_that_a_cell_can_show_sum_to_one() -> None:
+    """Numerically over ranges and reflectances, and over classes and lost returns."""
+    surfaces = random_surfaces(1)
+    far, bright = torch.linspace(-0.9999, 1, 601), torch.linspace(-1, 9, 401)
+    bright[0] += 1e-6  # -1 is reflectance 0, which has a probability, not a density
+    grid = torch.cartesian_prod(far, bright)
+    area = (far[1] - far[0]) * (bright[2] - bright[1])
+    one = Surfaces(
+        surfaces.inverse[..., :1], torch.full((1, K, 1), 0.02), surfaces.returned[..., :1],
+        ZeroInflatedLogistic(*(part[..., :1] for part in surfaces.reflectance)), surfaces.classes,
+        surfaces.weights[..., :1],
+    )  # fmt: skip
+    nothing = torch.zeros(1, 1).long()
+    total = one.log_likelihood(torch.tensor([[-1.0]]), torch.tensor([[-1.0]]), nothing, SCALE, (1.0, 1.0)).exp()
+    for code in range(CODES):
+        codes = torch.full((1, len(grid)), code)
+        cells = one.log_likelihood(grid[None, :, 0], grid[None, :, 1], codes, SCALE, (1.0, 1.0)).exp()
+        dark = one.log_likelihood(far[None], torch.full((1, len(far)), -1.0), codes[:, : len(far)], SCALE, (1.0, 1.0))
+        total = total + cells.sum() * area + dark.exp().sum() * (far[1] - far[0])
+    assert total.item() == pytest.approx(1, abs=0.01)
+
+
+def test_samples_have_the_predicted_frequencies() -> None:
+    surfaces = random_surfaces(1)
+    many = Surfaces(*(_repeat(part, 4000) for part in surfaces[:3]), ZeroInflatedLogistic(
+        *(_repeat(part, 4000) for part in surfaces.reflectance)), *(_repeat(part, 4000) for part in surfaces[4:]),
+    )  # fmt: skip
+    noise = uniform(0, [0], (4000, DRAWS, CELLS))[0]
+    distance, value, code, likely = many.sample(noise, torch.zeros(CODES), SCALE).unbind(1)
+    shares = surfaces.weights.exp()
+    returned = (shares * surfaces.returned.sigmoid()).sum(1)
+    assert torch.allclose((distance > -1).float().mean(0), returned[0], atol=0.03)
+    for k, best in enumerate(surfaces.classes[0].argmax(1).tolist()):
+        same = [j for j in range(K) if surfaces.classes[0, j].argmax() == best]
+        assert torch.allclose((code == best).float().mean(0), shares[0, same].sum(0), atol=0.03), k
+    assert ((value >= -1) & (likely > 0) & (likely <= 1)).all()
+
+
+def _repeat(part: Tensor, times: int) -> Tensor:
+    return part.expand(times, *part.shape[1:])
+
+
+def test_a_wall_is_exact_in_every_cell_of_a_patch() -> None:
+    """Within a patch the inverse range of a plane is linear in row and column."""
+    x = torch.zeros(1, K * (NUMBERS + CODES) + CELLS * (K + PER_CELL))
+    numbers = x[:, : K * (NUMBERS + CODES)].view(K, -1)
+    numbers[0, :3] = torch.tensor([np.log(10.0), 0.5, -0.4])
+    inverse = surfaces_of(x, K, CODES, PATCH).inverse[0, 0].view(PATCH)
+    assert torch.allclose(inverse.diff(dim=1), inverse.diff(dim=1)[0, 0].expand(2, 7), atol=1e-6)
+    assert inverse.mean() == pytest.approx(0.1)
+
+
+def test_images_are_decoded_with_valid_labels_and_ranges() -> None:
+    network = small().eval()
+    z = torch.randn(2, *network.latent_shape)
+    noise = uniform(0, [0, 1], (network.draws, *COARSE.shape))
+    images = FORMAT.to_images(Latent(network, FORMAT).decode(z, noise), COARSE)
+    again = FORMAT.to_images(Latent(network, FORMAT).decode(z[1:], noise[1:]), COARSE)
+    assert np.allclose(images[1].range, again[0].range, rtol=1e-4)
+    for image in images:
+        assert image.label is not None and set(np.unique(image.label)) <= {*range(19), 255}
+        assert ((image.range == 0) | ((image.range >= 1.45) & (image.range <= 80))).all()
+    assert torch.equal(*(Latent(network, FORMAT).decode(z) for _ in range(2)))  # the most likely image
+
+
+def test_training_lowers_the_likelihood_of_a_street() -> None:
+    scan = Town(seed=3, sensor=COARSE, scans=1)[0]
+    x = FORMAT.from_images([project(scan, COARSE, ["reflectance", "label"])])
+    network = small()
+    trained = Autoencoding(network, FORMAT, COARSE, Losses(noise=0.03, rare=0.5), METRICS["l1"], {"range": 0.5})
+    optimizer = torch.optim.Adam(network.parameters(), 5e-3)
+    losses = []
+    for _ in range(30):
+        loss = trained(x, torch.zeros_like(x))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0] - 1
+    assert network.scale.ne(1).all()  # the statistics of the latents are followed
+    with torch.no_grad():
+        z = network.eval().encode(x)
+    assert z.shape == (1, *network.latent_shape) and z.abs().max() < 10
+
+
+def test_bfloat16_gives_the_same_latents() -> None:
+    """oneDNN's bfloat16 convolution with the stem's kernel and stride does not."""
+    network = SurfaceAutoencoder((64, 2048)).eval()
+    x = 2 * torch.rand(1, 7, 64, 2048, generator=torch.Generator().manual_seed(0)) - 1
+    with torch.no_grad():
+        exact = network.squeeze(x)
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded = network.squeeze(x)
+    assert (rounded - exact).norm() < 0.03 * exact.norm()
+
+
+@pytest.mark.parametrize(
+    "changes", [{"resolution": (16, 250)}, {"bits": 4}, {"normalisation": "other"}, {"channels": 6}]
+)
+def test_arguments_that_do_not_fit_are_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        SurfaceAutoencoder(**{"resolution": COARSE.shape} | changes)  # type: ignore[arg-type]
+
+
+def test_latents_and_images_of_another_shape_are_refused() -> None:
+    network = small()
+    with pytest.raises(DataError, match="a latent"):
+        network.decode(torch.zeros(1, 8, 4, 17))
+    with pytest.raises(DataError, match="an image"):
+        network.squeeze(torch.zeros(1, 7, 16, 128))
