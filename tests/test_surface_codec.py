@@ -15,7 +15,15 @@ from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models.surface_codec.autoencoder import PATCH, SurfaceAutoencoder
 from lidar_synth.models.surface_codec.blocks import from_patches, split, to_patches
-from lidar_synth.models.surface_codec.surfaces import DRAWS, NUMBERS, PER_CELL, Surfaces, surfaces_of
+from lidar_synth.models.surface_codec.measure_noise import measure_noise
+from lidar_synth.models.surface_codec.surfaces import (
+    DRAWS,
+    NUMBERS,
+    PER_CELL,
+    Noise,
+    Surfaces,
+    surfaces_of,
+)
 from lidar_synth.models.town_codec.reflectance import ZeroInflatedLogistic
 from lidar_synth.noise import uniform
 from lidar_synth.town import Town
@@ -86,7 +94,8 @@ def test_samples_have_the_predicted_frequencies() -> None:
         *(_repeat(part, 4000) for part in surfaces.reflectance)), *(_repeat(part, 4000) for part in surfaces[4:]),
     )  # fmt: skip
     noise = uniform(0, [0], (4000, DRAWS, CELLS))[0]
-    distance, value, code, likely = many.sample(noise, torch.zeros(CODES), SCALE).unbind(1)
+    alike = Noise(torch.zeros(CODES), torch.full((CODES,), 0.5), torch.tensor(0.5))
+    distance, value, code, likely = many.sample(noise, alike, SCALE).unbind(1)
     shares = surfaces.weights.exp()
     returned = (shares * surfaces.returned.sigmoid()).sum(1)
     assert torch.allclose((distance > -1).float().mean(0), returned[0], atol=0.03)
@@ -152,6 +161,33 @@ def test_bfloat16_gives_the_same_latents() -> None:
         with torch.autocast("cpu", torch.bfloat16):
             rounded = network.squeeze(x)
     assert (rounded - exact).norm() < 0.03 * exact.norm()
+
+
+def test_the_noise_of_scans_is_measured() -> None:
+    """Images that the codec itself sampled have the noise that it sampled with."""
+    network = small().eval()
+    with torch.no_grad():
+        numbers = network.head.bias[: K * (NUMBERS + CODES)].view(K, -1)
+        numbers[:, 0] = torch.tensor([1.0, 2.3, 3.6])  # surfaces far apart, almost without reflectances of 0
+        numbers[:, 3], numbers[:, 4], numbers[:, 7] = -4.5, 0.5, -6
+        network.roughness.fill_(0.3)
+        network.alike.fill_(0.6)
+        network.returned_alike.fill_(0.4)
+    z = torch.randn(6, *network.latent_shape, generator=torch.Generator().manual_seed(1))
+    images = []
+    for i in range(6):
+        x = network.decode(z[i : i + 1], uniform(0, [i], (network.draws, *COARSE.shape)))
+        images.append((x, _codes(x)))
+    latents = iter(network.bounded(z).split(1))
+    network.squeeze = lambda x: next(latents)  # type: ignore[method-assign]
+    measure_noise(network, images, noise=0.0)
+    assert network.roughness.mean() == pytest.approx(0.3, abs=0.06)
+    assert network.alike.mean() == pytest.approx(0.6, abs=0.12)
+    assert network.returned_alike.item() == pytest.approx(0.4, abs=0.15)
+
+
+def _codes(x: Tensor) -> Tensor:
+    return sum(((x[:, -1 - b] > 0).long() << b for b in range(5)), torch.zeros_like(x[:, 0]).long())
 
 
 @pytest.mark.parametrize(

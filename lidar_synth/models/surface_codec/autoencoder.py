@@ -18,7 +18,7 @@ from lidar_synth.models.codebook import follow
 from lidar_synth.models.convolution import check_shape, pair, reduced
 from lidar_synth.models.network import Network
 from lidar_synth.models.surface_codec.blocks import Block, cell_norm, from_patches, split, to_patches
-from lidar_synth.models.surface_codec.surfaces import DRAWS, NUMBERS, PER_CELL, Surfaces, surfaces_of
+from lidar_synth.models.surface_codec.surfaces import DRAWS, NUMBERS, PER_CELL, Noise, Surfaces, surfaces_of
 from lidar_synth.models.town_codec.autoencoder import Residual
 
 PATCH = (2, 8)
@@ -53,6 +53,8 @@ class SurfaceAutoencoder(Network):
     shift: Tensor
     scale: Tensor
     roughness: Tensor
+    alike: Tensor
+    returned_alike: Tensor
 
     def __init__(
         self,
@@ -103,7 +105,10 @@ class SurfaceAutoencoder(Network):
         # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise needs.
         self.register_buffer("shift", torch.zeros(latent_channels))
         self.register_buffer("scale", torch.ones(latent_channels))
+        # As ``measure_noise`` finds them in scans.
         self.register_buffer("roughness", torch.full((codes,), 0.1))
+        self.register_buffer("alike", torch.zeros(codes))
+        self.register_buffer("returned_alike", torch.zeros(()))
 
     def forward(self, x: Tensor, noise: Tensor) -> Surfaces:
         """Encodes images (B, C, H, W) and decodes them with ``noise`` (B, *latent_shape) added to the bounded latents;
@@ -112,6 +117,11 @@ class SurfaceAutoencoder(Network):
         if self.training:
             follow(z.detach(), self.shift, self.scale)
         return self.expand(z + noise)
+
+    @property
+    def noise(self) -> Noise:
+        """The noise of sampled cells."""
+        return Noise(self.roughness, self.alike, self.returned_alike)
 
     def encoder(self) -> list[nn.Parameter]:
         """The weights of the encoder; all others belong to the decoder."""
@@ -157,7 +167,7 @@ class SurfaceAutoencoder(Network):
         surfaces = self.expand(self.bounded(z))
         if uniform_noise is None:
             uniform_noise = torch.full((len(z), DRAWS, *self.resolution), 0.5, device=z.device)
-        cells = surfaces.sample(to_patches(uniform_noise, PATCH), self.roughness, self.normalisation)
+        cells = surfaces.sample(to_patches(uniform_noise, PATCH), self.noise, self.normalisation)
         distance, value, code, likely = from_patches(cells, PATCH, self.resolution).split(1, 1)
         bits = torch.cat([(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
         return torch.cat([distance, value, bits * (2 * torch.atanh(likely.clamp(max=0.9999)))], 1)

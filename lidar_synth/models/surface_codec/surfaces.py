@@ -34,8 +34,26 @@ median, log scale and logit of 0."""
 PER_CELL = 2
 """Values of a cell beside its choice of a surface: offsets of the logit of a return and of the reflectance."""
 
-DRAWS = 4
-"""Random numbers per cell."""
+DRAWS = 5
+"""Random numbers per cell: for the choice of a surface, the return, the range, the reflectance, and for what the cells
+of a patch have in common."""
+
+
+_SURE = 1e-6  # distance from 0 and 1 that keeps a logit finite
+
+
+class Noise(NamedTuple):
+    """The noise of cells, by class, as ``measure_noise`` finds it.
+
+    Args:
+        roughness: (C,) share of a range's scale that differs from cell to cell; the rest is doubt about the surface.
+        reflectance: (C,) correlation of the reflectances of cells that show one surface of a patch.
+        returned: () correlation of the returns of a patch.
+    """
+
+    roughness: Tensor
+    reflectance: Tensor
+    returned: Tensor
 
 
 class Surfaces(NamedTuple):
@@ -77,24 +95,33 @@ class Surfaces(NamedTuple):
         seen = F.logsigmoid(self.returned) + temper[0] * distance + temper[1] * shown + self.classes.gather(2, index)
         return torch.logsumexp(self.weights + torch.where(x > -1, seen, F.logsigmoid(-self.returned)), 1)
 
-    def sample(self, uniform_noise: Tensor, roughness: Tensor, normalisation: Normalisation) -> Tensor:
+    def sample(self, uniform_noise: Tensor, noise: Noise, normalisation: Normalisation) -> Tensor:
         """(N, 4, P) range, -1 without a return, reflectance, class and its probability, of sampled cells.
 
         Args:
-            uniform_noise: (N, DRAWS, P) numbers in (0, 1): for the surface, the return, the range and the reflectance.
-            roughness: (C,) by class, the share of ``scale`` that is noise of the surface, not doubt about its place.
+            uniform_noise: (N, DRAWS, P) numbers in (0, 1), P > K.
+            noise: of the cells.
             normalisation: of the ranges.
         """
-        which, back, near, dim = uniform_noise.unbind(1)
+        which, back, near, dim, shared = uniform_noise.unbind(1)
+        count = self.weights.shape[1]
         shares = self.weights.softmax(1).cumsum(1)
         chosen = (which[:, None] > shares[:, :-1]).sum(1, keepdim=True)
         likely, code = self.classes.exp().max(2, keepdim=True)
-        values = ZeroInflatedLogistic(*(_pick(part, chosen) for part in self.reflectance)).sample(dim)
+        alike = _pick(noise.reflectance[code], chosen), _pick(shared[:, :count, None], chosen)
+        values = ZeroInflatedLogistic(*(_pick(part, chosen) for part in self.reflectance)).sample(_mixed(dim, *alike))
         distance = normalised(_pick(self.inverse, chosen), normalisation)
-        distance = distance + _pick(roughness[code] * self.scale, chosen) * laplace_noise(near)
+        distance = distance + _pick(noise.roughness[code] * self.scale, chosen) * laplace_noise(near)
+        back = _mixed(back, noise.returned, shared[:, count : count + 1])
         returned = _pick(self.returned, chosen) + torch.logit(back) > 0
         distance = torch.where(returned, distance, -1.0)
         return torch.stack([distance, values, _pick(code, chosen).float(), _pick(likely, chosen)], 1)
+
+
+def _mixed(own: Tensor, correlation: Tensor, shared: Tensor) -> Tensor:
+    """Uniform numbers of cells, correlated by what they share (a Gaussian copula)."""
+    normal = correlation.sqrt() * torch.special.ndtri(shared) + (1 - correlation).sqrt() * torch.special.ndtri(own)
+    return torch.special.ndtr(normal).clamp(_SURE, 1 - _SURE)
 
 
 def _pick(x: Tensor, chosen: Tensor) -> Tensor:

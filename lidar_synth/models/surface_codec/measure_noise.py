@@ -1,0 +1,97 @@
+"""How the noise of a codec's cells is divided: what differs from cell to cell, and what the cells of a patch share.
+
+The decoder predicts the distribution of every cell by itself. Neighbouring cells of a wall have the same error of the
+range and similar reflectances, leaves do not. Both follow from pairs of neighbouring cells of real images that show one
+surface: of Laplace distributed errors e, mean |e1 - e2| = 1.5 b, where b is the scale of what differs; the correlation
+of reflectances is that of their normal scores.
+"""
+
+import math
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from lidar_synth.models.surface_codec.autoencoder import PATCH, SurfaceAutoencoder
+from lidar_synth.models.surface_codec.blocks import to_patches
+from lidar_synth.models.surface_codec.surfaces import Surfaces, normalised
+
+LEAST = 200
+"""Pairs of cells that a class needs; others keep the mean of all classes."""
+_LARGEST = 4.0  # error of a range in scales: beyond it, the cell shows another surface
+_SURE = 1e-4
+
+
+@torch.no_grad()
+def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Tensor]], noise: float = 0.03) -> None:
+    """Set the noise of a codec from images.
+
+    Args:
+        network: the codec; its buffers are changed.
+        images: (1, C, H, W) tensors and their codes (1, H, W), int64.
+        noise: standard deviation of the noise on latents, as in training.
+    """
+    codes = len(network.roughness)
+    sums = torch.zeros(codes, 4, dtype=torch.float64)  # pairs, |e1 - e2|, products and squares of scores
+    returns = torch.zeros(2, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    for x, code in images:
+        z = network.squeeze(x)
+        surfaces = network.expand(z + noise * torch.randn(z.shape, generator=generator))
+        distance, value = to_patches(x[:, :2], PATCH).unbind(1)
+        kinds = to_patches(code[:, None], PATCH)[:, 0]
+        error, score, surface = _scores(surfaces, distance, value, kinds, network, generator)
+        left, right = (
+            [part.view(-1, *PATCH)[..., some] for part in (error, score, surface, kinds, distance)]
+            for some in (slice(0, -1), slice(1, None))
+        )
+        same = (left[2] == right[2]) & (left[3] == right[3]) & (left[4] > -1) & (right[4] > -1)
+        terms = [torch.ones_like(left[0]), (left[0] - right[0]).abs(), left[1] * right[1], left[1] ** 2]
+        for column, term in enumerate(terms):
+            sums[:, column] += torch.bincount(left[3][same], term[same].double(), codes)
+        returns += _return_scores(surfaces, distance, generator)
+    total, known = sums.sum(0), sums[:, 0] >= LEAST
+    network.roughness.copy_(torch.where(known, sums[:, 1] / sums[:, 0], total[1] / total[0]) / 1.5)
+    network.alike.copy_(torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95))
+    # Scores that are random but for their sign have 2 / pi of the correlation of signs, which is 2 / pi asin(rho).
+    signs = (returns[0] / returns[1] * math.pi / 2).clamp(0, 0.8)
+    network.returned_alike.copy_((signs * math.pi / 2).sin())
+
+
+def _scores(
+    surfaces: Surfaces,
+    distance: Tensor,
+    value: Tensor,
+    kinds: Tensor,
+    network: SurfaceAutoencoder,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(N, P) errors of ranges in scales, normal scores of reflectances, and the surface that each cell shows."""
+    far = normalised(surfaces.inverse, network.normalisation)
+    fit = surfaces.weights - (distance[:, None] - far).abs() / surfaces.scale - surfaces.scale.log()
+    fit = fit + surfaces.classes.gather(2, kinds[:, None].expand(-1, far.shape[1], -1))
+    shown = fit.argmax(1)
+
+    def pick(part: Tensor) -> Tensor:
+        return part.expand(far.shape).gather(1, shown[:, None])[:, 0]
+
+    error = ((distance - pick(far)) / pick(surfaces.scale)).clamp(-_LARGEST, _LARGEST)
+    middle, spread, blank = (pick(part) for part in surfaces.reflectance)
+    zero = blank.sigmoid()
+    below = zero + (1 - zero) * torch.sigmoid((value - middle) / spread.exp())
+    some = torch.rand(value.shape, generator=generator)
+    return error, _normal(torch.where(value <= -1, below * some, below)), shown
+
+
+def _return_scores(surfaces: Surfaces, distance: Tensor, generator: torch.Generator) -> Tensor:
+    """(2,) sums of products of neighbours and of squares of the normal scores of returns that are in doubt."""
+    likely = (surfaces.weights.exp() * surfaces.returned.sigmoid()).sum(1)
+    some = torch.rand(likely.shape, generator=generator)
+    score = _normal(torch.where(distance > -1, likely * some, likely + (1 - likely) * some)).view(-1, *PATCH)
+    left = ((likely > 0.1) & (likely < 0.9)).view(-1, *PATCH)[..., :-1]
+    pair = score[..., :-1][left], score[..., 1:][left]
+    return torch.stack([(pair[0] * pair[1]).sum(), (pair[0] ** 2).sum()]).double()
+
+
+def _normal(share: Tensor) -> Tensor:
+    return torch.special.ndtri(share.clamp(_SURE, 1 - _SURE))
