@@ -132,6 +132,20 @@ def test_images_are_decoded_with_valid_labels_and_ranges() -> None:
     assert torch.equal(*(Latent(network, FORMAT).decode(z) for _ in range(2)))  # the most likely image
 
 
+def test_half_the_columns_show_the_same_street() -> None:
+    """A wider cell looks through the middle of two: on one plane, its inverse range is their mean."""
+    x = torch.zeros(5, K * (NUMBERS + CODES) + CELLS * (K + PER_CELL))
+    x[:, :3] = torch.randn(5, 3, generator=torch.Generator().manual_seed(0)) / 3 + torch.tensor([2.0, 0, 0])
+    fine, coarse = (surfaces_of(x, K, CODES, PATCH, merged).inverse[:, 0] for merged in (1, 2))
+    assert torch.allclose(fine.view(5, 2, 4, 2).mean(3).flatten(1), coarse, rtol=1e-5)
+    network = small().eval()
+    z = torch.randn(1, *network.latent_shape)
+    for width in network.widths:
+        assert network.decode(z, uniform(0, [0], (network.draws, 16, width))).shape == (1, 7, 16, width)
+    with pytest.raises(DataError, match="one of 256, 128"):
+        network.decode(z, torch.rand(1, network.draws, 16, 100))
+
+
 def test_training_lowers_the_likelihood_of_a_street() -> None:
     scan = Town(seed=3, sensor=COARSE, scans=1)[0]
     x = FORMAT.from_images([project(scan, COARSE, ["reflectance", "label"])])

@@ -12,7 +12,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.models.codebook import follow
 from lidar_synth.models.convolution import check_shape, pair, reduced
@@ -82,6 +82,8 @@ class SurfaceAutoencoder(Network):
         """Channels, rows and columns of a latent."""
         self.draws = DRAWS
         """Random numbers per cell that sampling an image takes."""
+        self.widths = tuple(self.resolution[1] // merged for merged in (1, 2))
+        """Columns that images can be decoded to."""
         cells, rows, (outer, inner) = PATCH[0] * PATCH[1], self.resolution[0], widths
         # Learned biases by row: on a road, a beam's elevation gives its range.
         self.place_stem = _rows(encoder_widths[0], rows // PATCH[0])
@@ -139,13 +141,14 @@ class SurfaceAutoencoder(Network):
         h = self.encode_outer(h + self.place_stem)
         return torch.tanh(self.to_latent(self.encode_inner(self.merge(h))).float())
 
-    def expand(self, z: Tensor, image: Tensor | None = None) -> Surfaces:
+    def expand(self, z: Tensor, image: Tensor | None = None, merged: int = 1) -> Surfaces:
         """Bounded latents (B, *latent_shape) to the surfaces of all patches, N = B H W / 16 row by row; they do not
-        depend on the image."""
+        depend on the image. ``merged`` columns become one."""
         z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
         h = self.decode_inner(self.from_latent(z) + self.place_latent)
         h = self.decode_outer(split(self.split(h), (2, 2)) + self.place_outer)
-        return surfaces_of(self.head(cell_norm(h).movedim(1, -1).flatten(0, 2)), self.surfaces, self.codes, PATCH)
+        numbers = self.head(cell_norm(h).movedim(1, -1).flatten(0, 2))
+        return surfaces_of(numbers, self.surfaces, self.codes, PATCH, merged)
 
     def encode(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of mean 0 and variance 1
@@ -157,18 +160,24 @@ class SurfaceAutoencoder(Network):
 
         Args:
             z: (B, *latent_shape).
-            uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample an image with; None = the most likely image.
+            uniform_noise: (B, draws, H, W') numbers in (0, 1) to sample an image with; None = the most likely image. W'
+                is one of ``widths``, and becomes the width of the image.
 
         Returns:
-            (B, C, H, W): range -1 where there is no return; bits as logits of the most likely code, whose magnitude
+            (B, C, H, W'): range -1 where there is no return; bits as logits of the most likely code, whose magnitude
             grows with its probability.
         """
         check_shape(z, self.latent_shape, "a latent")
-        surfaces = self.expand(self.bounded(z))
+        rows, columns = self.resolution if uniform_noise is None else uniform_noise.shape[-2:]
         if uniform_noise is None:
-            uniform_noise = torch.full((len(z), DRAWS, *self.resolution), 0.5, device=z.device)
-        cells = surfaces.sample(to_patches(uniform_noise, PATCH), self.noise, self.normalisation)
-        distance, value, code, likely = from_patches(cells, PATCH, self.resolution).split(1, 1)
+            uniform_noise = torch.full((len(z), DRAWS, rows, columns), 0.5, device=z.device)
+        if columns not in self.widths:
+            raise DataError(f"noise for {columns} columns", f"one of {', '.join(map(str, self.widths))}")
+        merged = self.resolution[1] // columns
+        patch = PATCH[0], PATCH[1] // merged
+        surfaces = self.expand(self.bounded(z), merged=merged)
+        cells = surfaces.sample(to_patches(uniform_noise, patch), self.noise, self.normalisation)
+        distance, value, code, likely = from_patches(cells, patch, (rows, columns)).split(1, 1)
         bits = torch.cat([(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
         return torch.cat([distance, value, bits * (2 * torch.atanh(likely.clamp(max=0.9999)))], 1)
 

@@ -138,17 +138,28 @@ def normalised(inverse: Tensor, normalisation: Normalisation) -> Tensor:
     return normalisation.encode(1 / inverse.clamp(1 / (0.999 * high), 1 / (1.001 * low)))
 
 
-def surfaces_of(x: Tensor, surfaces: int, classes: int, patch: tuple[int, int]) -> Surfaces:
-    """The surfaces that the numbers (N, K (NUMBERS + C) + P (K + PER_CELL)) of N patches describe, float32."""
-    cells = patch[0] * patch[1]
-    whole, each = x.float().split([surfaces * (NUMBERS + classes), cells * (surfaces + PER_CELL)], 1)
+def surfaces_of(x: Tensor, surfaces: int, classes: int, patch: tuple[int, int], merged: int = 1) -> Surfaces:
+    """The surfaces that the numbers (N, K (NUMBERS + C) + P (K + PER_CELL)) of N patches describe, float32.
+
+    Args:
+        x: the numbers.
+        surfaces: K.
+        classes: C.
+        patch: rows and columns of a patch, P cells.
+        merged: neighbouring columns that become one, a divisor of the patch's: P / merged cells then, each through the
+            middle of those that it takes the place of.
+    """
+    rows, columns = patch
+    whole, each = x.float().split([surfaces * (NUMBERS + classes), rows * columns * (surfaces + PER_CELL)], 1)
     numbers, kinds = whole.unflatten(1, (surfaces, -1)).split([NUMBERS, classes], 2)
-    choice, offsets = each.unflatten(1, (-1, cells)).split([surfaces, PER_CELL], 1)
+    each = each.unflatten(1, (surfaces + PER_CELL, -1, merged)).mean(3)
+    choice, offsets = each.split([surfaces, PER_CELL], 1)
     distance, down, across, spread, returned, median, dim, blank = numbers[..., None].unbind(2)
-    cell = torch.arange(cells, device=x.device)
-    i, j = cell // patch[1] - (patch[0] - 1) / 2, cell % patch[1] - (patch[1] - 1) / 2
+    cell = torch.arange(each.shape[2], device=x.device)
+    columns = columns // merged
+    i, j = cell // columns - (rows - 1) / 2, (cell % columns - (columns - 1) / 2) * merged
     slopes = 1 + SLOPES[0] * down * i + SLOPES[1] * across * j
     inverse = (-distance.clamp(-1, 5)).exp() * slopes.clamp_min(0.05)
-    reflectance = ZeroInflatedLogistic(median + offsets[:, 1:2], dim.clamp(*DIM), blank)
+    reflectance = ZeroInflatedLogistic(median + offsets[:, 1:], dim.clamp(*DIM), blank)
     scale = spread.clamp(*map(math.log, SPREADS)).exp()
     return Surfaces(inverse, scale, returned + offsets[:, :1], reflectance, kinds.log_softmax(2), choice.log_softmax(1))
