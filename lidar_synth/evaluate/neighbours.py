@@ -105,6 +105,5 @@ def nearest_training(
 
 def _by_rows(a: Tensor, b: Tensor, reduce: Callable[[Tensor], Tensor]) -> Tensor:
     """(N,) a function of the distances from each of N samples to all of another set, for bounded memory."""
-    # Differences, not products: of two equal samples exactly 0.
-    parts = (torch.cdist(part, b, compute_mode="donot_use_mm_for_euclid_dist") for part in a.split(_BLOCK))
+    parts = (torch.cdist(part, b) for part in a.split(_BLOCK))
     return torch.cat([reduce(part) for part in parts])

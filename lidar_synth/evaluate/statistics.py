@@ -17,6 +17,7 @@ from lidar_synth.evaluate.distances import checked_features, frechet_of_moments,
 Counts = NDArray[np.integer[Any]]
 
 _BLOCK = 1000  # samples compared with one another at a time: 4 MB of kernel values in float32
+_NUMBERS = 25_000_000  # numbers of the samples of a block: 100 MB in float32
 
 
 class Statistic(NamedTuple):
@@ -49,17 +50,9 @@ def sparse_histogram_distance(
     distance: Callable[[NDArray[Any], NDArray[Any]], float] = jensen_shannon_distance,
 ) -> Statistic:  # fmt: skip
     """As ``histogram_distance``, of histograms of ``size`` bins that keep only the bins that are not empty."""
-    sides = [_joined(side) for side in (real, fake)]
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
-        values = []
-        for pair in zip(a, b, strict=True):
-            sums = [
-                np.bincount(bins, np.repeat(counts, lengths) * amounts, size)
-                for (bins, amounts, lengths), counts in zip(sides, pair, strict=True)
-            ]
-            values.append(distance(*sums))
-        return np.array(values)
+        return np.array([distance(_sum(real, p, size), _sum(fake, q, size)) for p, q in zip(a, b, strict=True)])
 
     return Statistic(at, (len(real), len(fake)))
 
@@ -76,29 +69,39 @@ def _sparse(histogram: NDArray[Any]) -> Sparse:
     return Sparse(bins.astype(np.int32), histogram.ravel()[bins])
 
 
-def _joined(histograms: Sequence[Sparse]) -> tuple[NDArray[np.int32], NDArray[np.float64], list[int]]:
-    bins = np.concatenate([h.bins for h in histograms])
-    return bins, np.concatenate([h.amounts for h in histograms]).astype(np.float64), [len(h.bins) for h in histograms]
+def _sum(histograms: Sequence[Sparse], counts: NDArray[Any], size: int) -> NDArray[np.int64]:
+    total = np.zeros(size, np.int64)
+    for one, count in zip(histograms, counts, strict=True):
+        if count:
+            total[one.bins] += one.amounts * np.int64(count)  # a bin occurs once in a histogram
+    return total
 
 
 Rows = Callable[[int, int], Tensor]
 """``(first, last) -> (last - first, D)`` samples as vectors, float32 or float64."""
 
 
-def gaussian_mmd(real: Rows, fake: Rows, sizes: tuple[int, int], sigma: float = 0.5) -> Statistic:
+def gaussian_mmd(real: Rows, fake: Rows, sizes: tuple[int, int], width: int, sigma: float = 0.5) -> Statistic:
     """Squared maximum mean discrepancy, kernel exp(-|p - q|^2 / (2 sigma^2)), including pairs of a sample with itself
     (Gretton et al., JMLR 2012, the biased form).
 
     The kernel of normalised histograms is close to 1 everywhere and the ones cancel in the sum, so that float32
     suffices without them.
+
+    Args:
+        real, fake: the samples.
+        sizes: numbers of samples.
+        width: D of the samples.
+        sigma: of the kernel.
     """
+    block = max(16, min(_BLOCK, _NUMBERS // width))
 
     def less_one(p: Tensor, q: Tensor) -> Tensor:
         squared = p.square().sum(1)[:, None] + q.square().sum(1) - 2 * p @ q.T
         return torch.expm1(squared.clamp_(min=0) / (-2 * sigma**2))
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
-        mean = [_mean_kernel(less_one, *pair) for pair in (
+        mean = [_mean_kernel(less_one, *pair, block) for pair in (
             (real, a, real, a), (fake, b, fake, b), (real, a, fake, b))]  # fmt: skip
         return mean[0] + mean[1] - 2 * mean[2]
 
@@ -106,18 +109,18 @@ def gaussian_mmd(real: Rows, fake: Rows, sizes: tuple[int, int], sigma: float = 
 
 
 def _mean_kernel(
-    kernel: Callable[[Tensor, Tensor], Tensor], p: Rows, a: Counts, q: Rows, b: Counts
+    kernel: Callable[[Tensor, Tensor], Tensor], p: Rows, a: Counts, q: Rows, b: Counts, size: int
 ) -> NDArray[np.float64]:
-    """(R,) mean of the kernel over all pairs, by the counts (R, N) and (R, M)."""
+    """(R,) mean of the kernel over all pairs, by the counts (R, N) and (R, M); ``size`` samples at a time."""
     left, right = (torch.from_numpy(np.asarray(c, np.float32)) for c in (a, b))
     same = p is q and a is b
     total = torch.zeros(len(left), dtype=torch.float64)
-    for i in range(0, left.shape[1], _BLOCK):
-        x = p(i, min(i + _BLOCK, left.shape[1]))
-        for j in range(i if same else 0, right.shape[1], _BLOCK):
-            y = x if same and j == i else q(j, min(j + _BLOCK, right.shape[1]))
+    for i in range(0, left.shape[1], size):
+        x = p(i, min(i + size, left.shape[1]))
+        for j in range(i if same else 0, right.shape[1], size):
+            y = x if same and j == i else q(j, min(j + size, right.shape[1]))
             block = kernel(x, y)
-            part = ((left[:, i : i + _BLOCK].to(block) @ block) * right[:, j : j + _BLOCK].to(block)).double().sum(1)
+            part = ((left[:, i : i + size].to(block) @ block) * right[:, j : j + size].to(block)).double().sum(1)
             total += 2 * part if same and j > i else part
     pairs = left.double().sum(1) * right.double().sum(1)
     return (total / pairs).numpy()
@@ -163,11 +166,11 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
 
     def within(k: int, counts: Counts) -> NDArray[np.float64]:
         pairs, own = counts.sum(1).astype(np.float64) ** 2, (counts.astype(np.float64) ** 2)
-        total = _mean_kernel(kernel, rows[k], counts, rows[k], counts) * pairs - own @ diagonals[k]
+        total = _mean_kernel(kernel, rows[k], counts, rows[k], counts, _BLOCK) * pairs - own @ diagonals[k]
         return np.asarray(total / (pairs - own.sum(1)))
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
-        return within(0, a) + within(1, b) - 2 * _mean_kernel(kernel, rows[0], a, rows[1], b)
+        return within(0, a) + within(1, b) - 2 * _mean_kernel(kernel, rows[0], a, rows[1], b, _BLOCK)
 
     return Statistic(at, (len(x), len(y)))
 
