@@ -1,6 +1,7 @@
 """``lidar-synth evaluate`` on scans on disk."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +17,8 @@ from typer.testing import CliRunner
 
 from lidar_synth.cli import app
 from lidar_synth.datasets.recordings import NOTE, frames_of
-from lidar_synth.errors import ConfigError
-from lidar_synth.evaluate import PROTOCOLS
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.evaluate import PROTOCOLS, evaluate
 from lidar_synth.evaluate.leakage import recordings_of, seen_by, town
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.checkpoint import read_header
@@ -38,15 +39,49 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_every_figure_names_its_protocol_and_its_sets(folders: tuple[Path, Path], protocol: str) -> None:
     real, fake = map(str, folders)
-    result = CliRunner().invoke(app, ["evaluate", real, fake, "--protocol", protocol, "--json"])
+    options = ["--protocol", protocol, "--anyway"]
+    result = CliRunner().invoke(app, ["evaluate", real, fake, *options, "--json"])
     assert result.exception is None, result.output
-    apart = json.loads(result.output)
+    apart = json.loads(result.stdout)
     assert apart and all((s["protocol"], s["real"], s["generated"]) == (protocol, 3, 3) for s in apart)
-    same = json.loads(CliRunner().invoke(app, ["evaluate", real, real, "--protocol", protocol, "--json"]).output)
+    same = json.loads(CliRunner().invoke(app, ["evaluate", real, real, *options, "--json"]).stdout)
     assert [s["metric"] for s in same] == [s["metric"] for s in apart]
     assert sum(s["value"] for s in same) < sum(s["value"] for s in apart)
-    text = CliRunner().invoke(app, ["evaluate", real, fake, "--protocol", protocol]).output
+    text = CliRunner().invoke(app, ["evaluate", real, fake, *options]).output
     assert f"({protocol} protocol, 3 real, 3 generated)" in text
+
+
+@pytest.mark.parametrize("protocol", [name for name, p in PROTOCOLS.items() if p.needs.generated])
+def test_fewer_scans_than_the_papers_are_refused(folders: tuple[Path, Path], protocol: str) -> None:
+    result = CliRunner().invoke(app, ["evaluate", *map(str, folders), "--protocol", protocol])
+    assert isinstance(result.exception, DataError)
+    assert re.search(rf"3 (real|generated) scans; expected \d+000?, as the {protocol} protocol .*--anyway", str(result.exception))
+
+
+def test_the_figures_stand_beside_the_published_ones(folders: tuple[Path, Path]) -> None:
+    call = ["evaluate", *map(str, folders), "--protocol", "r2flow", "--anyway", "--beside", "--intervals", "20"]
+    result = CliRunner().invoke(app, call)
+    assert result.exception is None, result.output
+    rows = [line for line in result.stdout.splitlines() if line.startswith("|")]
+    assert "| LiDAR-Flow | 4 | 165.31 | 12.41 | 9.46 | 32.09 | 33.43 | 0.025 | 0.34 |" in rows
+    own = rows[-1].split("|")
+    jsd = re.search(r"in its tables JSD = (\S+)", result.stdout)
+    assert jsd and own[1].strip() == "**these scans**" and own[8].split()[0] == jsd[1]
+    assert own[8].strip().endswith("]") and not own[3].strip()  # an interval; no weights, no FRD
+    assert "FRD: no weights of rangenet53" in result.stderr
+    assert "drives of training among them" in result.stderr or "those of training" in result.stderr
+
+
+@pytest.mark.parametrize("protocol", ["r2flow", "town"])
+def test_another_sensor_is_refused(folders: tuple[Path, Path], tmp_path: Path, protocol: str) -> None:
+    WRITERS["npz"](tmp_path / "other").write(random_scan(presets()["hdl32e_nuscenes"], 4000), 0)
+    call = ["evaluate", str(folders[0]), str(tmp_path / "other"), "--protocol", protocol]
+    measures = {k: m for k, m in PROTOCOLS[protocol].measures.items() if m.kind != "frechet"}
+    assert measures
+    result = CliRunner().invoke(app, [*call, "--anyway"])
+    assert result.exception is None, result.output
+    with pytest.raises(DataError, match=r"scan .* of sensor hdl32e_nuscenes \(32 rows.*expected .*64 rows"):
+        evaluate(*(open_scans(p) for p in call[1:3]), protocol, progress=False)
 
 
 def test_an_unknown_protocol_is_a_wrong_call(folders: tuple[Path, Path]) -> None:

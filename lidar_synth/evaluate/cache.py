@@ -17,13 +17,27 @@ import torch
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError, FileError
-from lidar_synth.evaluate.features import checked
 from lidar_synth.files.disk import sha256, write_arrays
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.geometry.scan import POINT_FIELDS, Scan, Source
 
 VERSION = 1
 """Of the extractors' arithmetic; a change of it makes all features anew."""
+
+
+def checked(extract: Callable[..., NDArray[np.floating]], scans: Sequence[Scan], *more: bool) -> NDArray[np.floating]:
+    """Features (n, D) of n scans.
+
+    Raises:
+        DataError: where an extractor returns another shape, or features that are not finite.
+    """
+    features = np.asarray(extract(scans, *more))
+    if features.ndim != 2 or len(features) != len(scans):
+        raise DataError(f"features of shape {features.shape} of {len(scans)} scans", f"({len(scans)}, D)")
+    finite = np.isfinite(features).all(1)
+    if not finite.all():
+        raise DataError(f"scan {scans[int(finite.argmin())].id!r}: features that are not finite", "finite numbers")
+    return features
 
 
 def scan_hash(scan: Scan) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.evaluate.cache import Cached, weights_hash
 from lidar_synth.evaluate.distances import frechet_distance, squared_mmd
 from lidar_synth.evaluate.intervals import extrapolated_frechet
 from lidar_synth.evaluate.labels import class_shares
@@ -43,12 +44,13 @@ class Loaded(NamedTuple):
     missing: dict[str, str]
 
 
-def load_extractors(protocol: Protocol, weights: Path | None = None) -> Loaded:
+def load_extractors(protocol: Protocol, weights: Path | None = None, cache: Path | None = None) -> Loaded:
     """Load the extractors of a protocol whose weights are in a folder.
 
     Args:
         protocol: whose measures of features name them.
         weights: folder with the published archives; by default the one that LIDAR_SYNTH_METRICS names.
+        cache: folder for features; None = they are not kept.
 
     Raises:
         ConfigError, DataError, FileError: on weights that are there but cannot be used.
@@ -61,12 +63,13 @@ def load_extractors(protocol: Protocol, weights: Path | None = None) -> Loaded:
         if path is None:
             loaded.missing[name] = f"no weights of {measure.extractor}; lidar-synth metrics setup says where to get them"
         else:
-            loaded.extractors[name] = published(measure, path)
+            loaded.extractors[name] = published(measure, path, cache)
     return loaded
 
 
-def published(measure: Measure, path: Path) -> Paired:
-    """The extractor of a measure, with what its option ``join`` names appended to the features."""
+def published(measure: Measure, path: Path, cache: Path | None = None) -> Paired:
+    """The extractor of a measure, with what its option ``join`` names appended to the features; ``cache`` as in
+    ``load_extractors``."""
     extract = _package().load_extractor(measure.extractor, path, measure.preparation)
     join = JOINED[measure.options["join"]] if "join" in measure.options else None
 
@@ -74,7 +77,10 @@ def published(measure: Measure, path: Path) -> Paired:
         own: NDArray[np.floating] = extract(scans, generated=generated)
         return own if join is None else np.concatenate([own, np.stack([join(scan) for scan in scans])], axis=1)
 
-    return features
+    if cache is None:
+        return features
+    key = f"{measure.extractor} {measure.preparation} {sorted(measure.options.items())} {weights_hash(path)}"
+    return Cached(features, cache, key)
 
 
 def find_weights(extractor: str, folder: Path | None) -> Path | None:
@@ -98,21 +104,6 @@ def _package() -> Any:
         return importlib.import_module("lidar_synth.evaluate.extractors")
     except ModuleNotFoundError:
         return None
-
-
-def checked(extract: Callable[..., NDArray[np.floating]], scans: Sequence[Scan], *more: bool) -> NDArray[np.floating]:
-    """Features (n, D) of n scans.
-
-    Raises:
-        DataError: where an extractor returns another shape, or features that are not finite.
-    """
-    features = np.asarray(extract(scans, *more))
-    if features.ndim != 2 or len(features) != len(scans):
-        raise DataError(f"features of shape {features.shape} of {len(scans)} scans", f"({len(scans)}, D)")
-    finite = np.isfinite(features).all(1)
-    if not finite.all():
-        raise DataError(f"scan {scans[int(finite.argmin())].id!r}: features that are not finite", "finite numbers")
-    return features
 
 
 def statistic_of(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Statistic | None:

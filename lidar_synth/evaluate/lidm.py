@@ -11,12 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.sensor import Sensor
 
 HALF = 50
 """Half the side of the bird's-eye square around the sensor, metres."""
 
 FINE, COARSE = 0.05, 0.5
 """Size of cells in metres, for the Jensen-Shannon distance and for the minimum matching distance."""
+
+SENSOR = Sensor("lidm", 1024, float(np.nextafter(np.float32(1), np.float32(2))),
+                 float(np.nextafter(np.float32(56), np.float32(0))), rows=64, fov_up=3.0, fov_down=-25.0)  # fmt: skip
+"""The grid of LiDM's range images."""
 
 _BLOCK = 128  # clouds compared with one another at a time: 20 MB of 200 x 200 maps
 _MOST_CELLS = 1 << 16  # cells of a grid up to which the maps of a block are held and multiplied

@@ -16,10 +16,11 @@ import torch.distributed
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.evaluate.cache import checked
+from lidar_synth.evaluate.distances import frechet_distance
 from lidar_synth.evaluate.features import (
     Extractor,
     Figure,
-    checked,
     figures_of,
     load_extractors,
     more_figures,
@@ -27,7 +28,6 @@ from lidar_synth.evaluate.features import (
 )
 from lidar_synth.evaluate.intervals import LEVEL, bootstrap
 from lidar_synth.evaluate.measures import KINDS
-from lidar_synth.evaluate.distances import frechet_distance
 from lidar_synth.evaluate.protocols import FEATURES, Measure, Protocol, alike, find_protocol
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -107,6 +107,7 @@ class Metric:
         extended: add unbiased forms, precision, recall, density and coverage of all features.
         any_sensor: whether to compare scans of sensors that differ.
         batch: number of scans that extractors process at a time.
+        cache: folder in which features of published weights are kept, by the hash of scan and weights.
 
     Raises:
         ConfigError: on an unknown protocol.
@@ -131,10 +132,11 @@ class Metric:
         extended: bool = False,
         any_sensor: bool = False,
         batch: int = 16,
+        cache: Path | None = None,
     ) -> None:
         self.protocol = find_protocol(protocol)
         self.left_out: dict[str, str] = {}
-        self._published, missing = load_extractors(self.protocol, weights)
+        self._published, missing = load_extractors(self.protocol, weights, cache)
         self._missing = missing
         self._extractors = dict(extractors or {})
         self._replicates, self._extended, self._any_sensor, self._batch = replicates, extended, any_sensor, batch
