@@ -48,7 +48,8 @@ def beside(scores: Sequence[Score]) -> str:
     tables, sources = leaderboard()
     parts = []
     for table in (t for t in tables if scores and t.protocol == scores[0].protocol):
-        columns = list(dict.fromkeys(key for row in table.rows for key in row if key not in ("method", "steps")))
+        longest_first = sorted(table.rows, key=len, reverse=True)
+        columns = list(dict.fromkeys(key for row in longest_first for key in row if key not in ("method", "steps")))
         head = [f"| method | steps | {' | '.join(columns)} |", f"|---|---:|{'---:|' * len(columns)}"]
         rows = [
             f"| {row['method']} | {row.get('steps', '')} | {' | '.join(str(row.get(c, '')) for c in columns)} |"

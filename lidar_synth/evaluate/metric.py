@@ -171,7 +171,7 @@ class Metric:
             self._add(batch, SIDES[not real])
 
     def _add(self, scans: Sequence[Scan], side: str) -> None:
-        part, generated = _Kept(count=len(scans), sensor=(scans[0].sensor, scans[0].id)), side == "generated"
+        part, generated = _Kept(count=len(scans)), side == "generated"
         measured = [m for m in self.protocol.measures.values() if m.kind != FEATURES]
         for scan in scans:
             self._check_sensor(scan, side)
@@ -196,16 +196,16 @@ class Metric:
         return described
 
     def _check_sensor(self, scan: Scan, side: str) -> None:
+        grid, first = self.protocol.prepare.grid, self._kept["real"].sensor or self._kept[side].sensor
+        self._kept[side].sensor = self._kept[side].sensor or (scan.sensor, scan.id)
         if self._any_sensor:
             return
-        grid, first = self.protocol.prepare.grid, self._kept["real"].sensor or self._kept[side].sensor
+        given = f"{side} scan {scan.id!r} of sensor {_named(scan.sensor)}"
         if grid is not None and not alike(scan.sensor, grid):
-            raise DataError(f"{side} scan {scan.id!r} of sensor {_named(scan.sensor)}",
-                            f"{_named(grid)}, the sensor of the {self.protocol.name} protocol",
+            raise DataError(given, f"{_named(grid)}, the sensor of the {self.protocol.name} protocol",
                             "The protocol town takes any sensor.")  # fmt: skip
         if grid is None and first is not None and not alike(scan.sensor, first[0]):
-            raise DataError(f"{side} scan {scan.id!r} of sensor {_named(scan.sensor)}",
-                            f"that of scan {first[1]!r}, {_named(first[0])}",
+            raise DataError(given, f"that of scan {first[1]!r}, {_named(first[0])}",
                             "Cast one set to the other's sensor first: docs/how-to/another-sensor.md.")  # fmt: skip
 
     def merge(self, *others: "Metric") -> None:
