@@ -30,6 +30,7 @@ LIMITS = {
     "docs/how-to/any-sensor.md": 500,
     "docs/how-to/another-sensor.md": 300,
     "docs/how-to/skin.md": 330,
+    "docs/how-to/measure.md": 300,
     "docs/how-to/train-a-generator.md": 450,
     "docs/how-to/bake.md": 400,
     "docs/how-to/look.md": 150,
@@ -50,7 +51,7 @@ LIMITS = {
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 8000
+MAIN_PATH = 8300
 """Words of all pages of docs/ that are read, not looked up as the reference is."""
 
 PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if not {"research", "notebooks"} & set(p.parts)]

@@ -129,7 +129,7 @@ def test_a_sequence_that_moves_otherwise_has_an_error() -> None:
     assert registration_error(standing, 1) == pytest.approx(0.4 / 3, abs=5e-3)  # of three coordinates, one is wrong
     near, far = (chamfer_error(standing, n) for n in (1, 4))
     assert 0 < near < far
-    jumping = [scan_of(s.points + (0.3 * (i % 2), 0, 0), pose=s.pose) for i, s in enumerate(scans)]
+    jumping = [scan_of(s.points + np.float32([0.3 * (i % 2), 0, 0]), pose=s.pose) for i, s in enumerate(scans)]
     assert registration_error(jumping, 1) > 0.09 and registration_error(jumping, 2) < 0.01
 
 
@@ -186,7 +186,9 @@ def test_detections_refuse_what_they_cannot_score() -> None:
     with pytest.raises(DataError, match="without boxes"):
         detect(lambda s: (boxes(), np.zeros(0)), [scan_of([(9, 0, 0)])])
     for confidence in (np.zeros(2), np.array([1.5]), np.array([np.nan])):
-        with pytest.raises(DataError, match=r"scan 'one': 1 boxes with confidences .* one confidence in \[0, 1\] per box"):
+        with pytest.raises(
+            DataError, match=r"scan 'one': 1 boxes with confidences .* one confidence in \[0, 1\] per box"
+        ):
             detect(lambda s, c=confidence: (boxes((1, 1)), c), [scan])
     with pytest.raises(ConfigError, match="positive metres"):
         detect(lambda s: (boxes(), np.zeros(0)), [scan], distances=())

@@ -95,7 +95,7 @@ def test_processes_compute_one_value_together(tmp_path: Path) -> None:
 
 
 def test_intervals_hold_the_values_and_features_get_them_with_enough_scans() -> None:
-    many = [random_scan(SENSOR, 300, seed) for seed in range(30)], [random_scan(SENSOR, 300, seed) for seed in range(50, 80)]
+    many = [[random_scan(SENSOR, 300, first + i) for i in range(30)] for first in (0, 50)]
     scores = evaluate(*many, "town", {"moments": moments}, progress=False, replicates=40, extended=True)
     by_name = {s.metric: s for s in scores}
     assert all(s.low is not None and s.low <= s.high for s in scores if "infinitely" not in s.metric)
@@ -129,7 +129,9 @@ def test_one_scan_has_no_frechet_distance() -> None:
 
 def test_scans_of_another_sensor_are_refused() -> None:
     other = random_scan(presets()["hdl32e_nuscenes"], 1500)
-    with pytest.raises(DataError, match=r"generated scan .*hdl32e_nuscenes \(32 rows.*expected that of scan 'random-0', town"):
+    with pytest.raises(
+        DataError, match=r"generated scan .*hdl32e_nuscenes \(32 rows.*expected that of scan 'random-0', town"
+    ):
         evaluate(REAL, [other], "town", progress=False)
     with pytest.raises(DataError, match="real scan .* of sensor hdl32e_nuscenes .*"):
         evaluate([REAL[0], other], FAKE, "town", progress=False)

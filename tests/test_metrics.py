@@ -23,8 +23,8 @@ from lidar_synth.evaluate import (
     lidm,
     r2flow,
     squared_mmd,
+    statistics,
 )
-from lidar_synth.evaluate import statistics
 from lidar_synth.evaluate.measures import KINDS
 from lidar_synth.evaluate.protocols import FEATURES
 from lidar_synth.geometry.scan import Scan

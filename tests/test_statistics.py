@@ -159,7 +159,7 @@ def test_intervals_refuse_what_cannot_give_one() -> None:
 
 
 def test_precision_recall_density_and_coverage_by_hand() -> None:
-    """On a line, k = 1: the balls of 0, 1, 3, 7 have the radii 1, 1, 2, 4; those of 1.6, 1.9, 30 have 0.3, 0.3, 28.1."""
+    """On a line, k = 1: the balls of 0, 1, 3, 7 have radii 1, 1, 2, 4; those of 1.6, 1.9, 30 have 0.3, 0.3, 28.1."""
     real, fake = np.array([[0.0], [1], [3], [7]]), np.array([[1.6], [1.9], [30.0]])
     found = manifold(real, fake, k=1)
     assert found.precision.value == pytest.approx(2 / 3)  # 30 lies in no real ball

@@ -24,7 +24,7 @@ from PIL import Image
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lidar_synth.datasets.classes import IGNORE, NAMES, TRAIN_ID
+from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.errors import ConfigError
 from lidar_synth.evaluate import Score, evaluate
 from lidar_synth.evaluate.segmentation import Judge, class_ious, load_judge, mean_iou

@@ -82,7 +82,12 @@ def check_counts(protocol: Protocol, real: int, generated: int) -> None:
 
 
 def _fill(
-    protocol: Protocol, sets: tuple[Source, Source], weights: Path | None, cache: Path | None, processes: int, batch: int
+    protocol: Protocol,
+    sets: tuple[Source, Source],
+    weights: Path | None,
+    cache: Path | None,
+    processes: int,
+    batch: int,
 ) -> None:
     """Extract the features of both sets into the cache by several processes."""
     if cache is None:
@@ -97,5 +102,3 @@ def _fill(
 def _read(source: Source, indices: Sequence[int], name: str, progress: bool) -> Iterator[Scan]:
     for i in tqdm(indices, desc=f"{name} scans", disable=not progress):
         yield source[i]
-
-

@@ -98,7 +98,9 @@ def squared_mmd(
     return float(total / subsets / size)
 
 
-def checked_features(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def checked_features(
+    a: NDArray[np.floating], b: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(N, D) and (M, D) features in float64.
 
     Raises:

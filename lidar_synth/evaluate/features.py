@@ -61,7 +61,9 @@ def load_extractors(protocol: Protocol, weights: Path | None = None, cache: Path
             continue
         path = find_weights(str(measure.extractor), weights)
         if path is None:
-            loaded.missing[name] = f"no weights of {measure.extractor}; lidar-synth metrics setup says where to get them"
+            loaded.missing[name] = (
+                f"no weights of {measure.extractor}; lidar-synth metrics setup says where to get them"
+            )
         else:
             loaded.extractors[name] = published(measure, path, cache)
     return loaded
@@ -156,5 +158,3 @@ def more_figures(name: str, real: NDArray[np.floating], fake: NDArray[np.floatin
 def describe_missing(missing: Mapping[str, str], protocol: Protocol) -> str:
     """One line per measure that could not be measured, with the reason."""
     return "\n".join(f"{protocol.measures[name].table or name}: {reason}" for name, reason in missing.items())
-
-

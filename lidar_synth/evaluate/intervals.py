@@ -24,7 +24,11 @@ class Interval(NamedTuple):
 
 
 def bootstrap(
-    statistic: Statistic, replicates: int = REPLICATES, level: float = LEVEL, seed: int = 0, smallest: float | None = None
+    statistic: Statistic,
+    replicates: int = REPLICATES,
+    level: float = LEVEL,
+    seed: int = 0,
+    smallest: float | None = None,
 ) -> Interval:
     """The basic bootstrap interval (Davison and Hinkley, 1997, section 5.2.1): twice the value less the quantiles of
     its resamples. Both sets are resampled with replacement.
@@ -64,8 +68,8 @@ def extrapolated_frechet(
 ) -> float:
     """The Fréchet distance extrapolated to infinitely many samples (Chong and Forsyth, CVPR 2020).
 
-    The distance of finite sets is too large by about c / n. It is measured on parts of both sets of several sizes, and a
-    line through the values over 1 / size gives the value at 0. It can fall below 0.
+    The distance of finite sets is too large by about c / n. It is measured on parts of both sets of several sizes, and
+    a line through the values over 1 / size gives the value at 0. It can fall below 0.
 
     Args:
         real: (N, D) features.
@@ -91,5 +95,4 @@ def extrapolated_frechet(
         frechet_distance(*(s[rng.choice(len(s), round(share * len(s)), replace=False)] for s in (real, fake)))
         for share in shares
     ]
-    slope, intercept = np.polyfit(1 / shares, values, 1)
-    return float(intercept)
+    return float(np.polyfit(1 / shares, values, 1)[1])

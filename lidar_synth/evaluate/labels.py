@@ -17,9 +17,7 @@ from lidar_synth.geometry.scan import Scan
 CLASSES = len(NAMES)
 
 
-def class_histogram(
-    scan: Scan, field: float = FIELD, bins: int = BINS, near: float = NEAR, far: float = FAR
-) -> Sparse:
+def class_histogram(scan: Scan, field: float = FIELD, bins: int = BINS, near: float = NEAR, far: float = FAR) -> Sparse:
     """The bins that are not empty of (19, bins, bins): class, then x, then y. Ignored points do not count.
 
     Args:

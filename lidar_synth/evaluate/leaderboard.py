@@ -22,7 +22,7 @@ class Table(BaseModel):
         dataset: that the scans are compared with.
         source: a key of the sources.
         note: what else is known of them.
-        rows: {"method": name, "steps": network evaluations if known, name of a figure: its value as the table shows it}.
+        rows: {"method": name, "steps": network evaluations if known, name of a figure: its value in the table}.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -32,5 +32,7 @@ def bev_histogram(
     bound = field / 2
     histogram = torch.histogramdd(kept, bins, range=[-bound, bound, -bound, bound]).hist
     if not histogram.any():
-        raise DataError(f"a cloud of {len(points)} points with none from {near:g} m to {far:g} m", "a scan with returns")
+        raise DataError(
+            f"a cloud of {len(points)} points with none from {near:g} m to {far:g} m", "a scan with returns"
+        )
     return histogram.numpy().astype(np.uint32)

@@ -3,8 +3,8 @@
 LiDARCrafter (https://github.com/worldbench/lidarcrafter, ``lidargen/metrics/temporal.py``) measures both errors: it
 registers scans three and four frames apart by ICP from the identity with matches within 2 m, and compares the
 translation with that of the poses (mean of the three absolute differences, metres); and it takes the mean of both mean
-squared nearest distances of scans one to four frames apart in world coordinates. Its figures are for nuScenes, of points
-more than 0.2 m from the sensor.
+squared nearest distances of scans one to four frames apart in world coordinates. Its figures are for nuScenes, of
+points more than 0.2 m from the sensor.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ def registration_error(scans: Sequence[Scan], apart: int = 3) -> float:
 
 
 def chamfer_error(scans: Sequence[Scan], apart: int = 1) -> float:
-    """Mean over pairs of scans, in world coordinates, of the mean of both mean squared nearest distances, square metres.
+    """Mean over pairs of scans, in world coordinates, of the mean of both mean squared nearest distances, m^2.
 
     Args, Raises: as ``registration_error``.
     """

@@ -57,7 +57,8 @@ class Preparation(_Data):
         sensor = presets()[self.sensor]
         if self.before is None:
             return sensor
-        near, far = (np.nextafter(np.float32(a), np.float32(b)) for a, b in zip(self.before, self.before[::-1], strict=True))
+        low, high = np.float32(self.before[0]), np.float32(self.before[1])
+        near, far = np.nextafter(low, high), np.nextafter(high, low)
         return Sensor(
             f"{self.sensor} from {self.before[0]:g} m to {self.before[1]:g} m", sensor.columns, float(near), float(far),
             rows=sensor.rows, fov_up=sensor.fov_up, fov_down=sensor.fov_down,
