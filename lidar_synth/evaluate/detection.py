@@ -60,13 +60,13 @@ def detect(detector: Detector, scans: Iterable[Scan], distances: Sequence[float]
         if scan.boxes is None:
             raise DataError(f"scan {scan.id!r} without boxes", "scans with boxes")
         boxes, confidence = detector(scan)
-        confidence = np.asarray(confidence, np.float64)
-        if confidence.shape != (len(boxes),) or not ((confidence >= 0) & (confidence <= 1)).all():
-            raise DataError(f"scan {scan.id!r}: {len(boxes)} boxes with confidences of shape {confidence.shape}",
+        scores: NDArray[np.float64] = np.asarray(confidence, np.float64)
+        if scores.shape != (len(boxes),) or not ((scores >= 0) & (scores <= 1)).all():
+            raise DataError(f"scan {scan.id!r}: {len(boxes)} boxes with confidences of shape {scores.shape}",
                             "one confidence in [0, 1] per box")  # fmt: skip
         for name in {*boxes.names, *scan.boxes.names}:
             truth, guess = (_centres(b, name) for b in (scan.boxes, boxes))
-            sure = confidence[[n == name for n in boxes.names]]
+            sure = scores[[n == name for n in boxes.names]]
             count[name] = count.get(name, 0) + len(truth)
             hits = np.array([_matches(truth, guess, sure, d) for d in distances]).reshape(len(distances), -1)
             found.setdefault(name, []).extend((float(c), list(h)) for c, h in zip(sure, hits.T, strict=True))

@@ -96,14 +96,14 @@ def nearest_training(
         DataError: as ``frechet_distance``.
     """
     known = torch.from_numpy(checked_features(training, fake)[0])
-    distances = [
+    generated, others = (
         _by_rows(torch.from_numpy(checked_features(training, s)[1]), known, lambda d: d.min(1).values).numpy()
         for s in (fake, held_out)
-    ]
-    return Novelty(*distances, closer=float((distances[0] < np.quantile(distances[1], 0.05)).mean()))
+    )
+    return Novelty(generated, others, float((generated < np.quantile(others, 0.05)).mean()))
 
 
 def _by_rows(a: Tensor, b: Tensor, reduce: Callable[[Tensor], Tensor]) -> Tensor:
     """(N,) a function of the distances from each of N samples to all of another set, for bounded memory."""
-    parts = (torch.cdist(part, b) for part in a.split(_BLOCK))
+    parts = (torch.cdist(a[i : i + _BLOCK], b) for i in range(0, len(a), _BLOCK))
     return torch.cat([reduce(part) for part in parts])

@@ -109,7 +109,8 @@ def _pose(scan: Scan) -> NDArray[np.float64]:
 
 
 def _cloud(scan: Scan) -> NDArray[np.float64]:
-    points = scan.points[np.linalg.norm(scan.points, axis=1) > NEAR].astype(np.float64)
+    far = np.linalg.norm(scan.points, axis=1) > NEAR
+    points: NDArray[np.float64] = scan.points[far].astype(np.float64)
     if not len(points):
         raise DataError(f"scan {scan.id!r} without returns beyond {NEAR} m", "a scan with returns")
     return points
