@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch.distributed
 from conftest import random_scan
+from project import ROOT
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.evaluate import PROTOCOLS, Metric, Score, evaluate, lidm
@@ -216,6 +217,23 @@ def test_processes_extract_the_features_of_one(tmp_path: Path) -> None:
     assert np.array_equal(extract_all(lambda: unused, REAL), both)
     with pytest.raises(ConfigError, match="2 processes without a cache; expected a folder"):
         evaluate(REAL, FAKE, "town", progress=False, processes=2)
+
+
+def test_published_weights_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("lidar_synth.evaluate.extractors")
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "extractors"))
+    from random_archives import write
+
+    write("sparenet_pointnet", tmp_path / "weights")
+    options = {"weights": tmp_path / "weights", "cache": tmp_path / "cache", "progress": False}
+    left_out: dict[str, str] = {}
+    first = evaluate(REAL[:2], FAKE[:2], "r2flow", left_out=left_out, **options)
+    assert [s.table for s in first] == ["JSD", "MMD", "FPD"] and set(left_out) == {"frd", "frid", "fsvd", "fpvd"}
+    files = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").rglob("*.npz")}
+    assert len(files) == 4
+    assert evaluate(REAL[:2], FAKE[:2], "r2flow", **options) == first
+    assert files == {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").rglob("*.npz")}
+    assert first[-1].value > 0
 
 
 # --- protocols and published figures as data ----------------------------------------------------------------------

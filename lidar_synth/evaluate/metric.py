@@ -136,6 +136,7 @@ class Metric:
     ) -> None:
         self.protocol = find_protocol(protocol)
         self.left_out: dict[str, str] = {}
+        self._kept = {side: _Kept() for side in SIDES}
         self._published, missing = load_extractors(self.protocol, weights, cache)
         self._missing = missing
         self._extractors = dict(extractors or {})
@@ -149,10 +150,7 @@ class Metric:
 
     def reset(self, real: bool = True) -> None:
         """Forget the generated scans, and the real ones unless ``real`` is False."""
-        kept = None if real else self._kept["real"]
-        self._kept = {side: _Kept() for side in SIDES}
-        if kept is not None:
-            self._kept["real"] = kept
+        self._kept = {"real": _Kept() if real else self._kept["real"], "generated": _Kept()}
         self.left_out = dict(self._missing)
 
     def update(self, scans: Iterable[Scan], real: bool) -> None:
@@ -230,12 +228,13 @@ class Metric:
                 raise DataError(f"no {side} scans", "at least one")
         scores = [score for name in self.protocol.measures if (score := self._score(name, kept)) is not None]
         for name in self._extractors:
-            pair = [np.concatenate(kept[side].features[name]) for side in SIDES]
-            scores += self._of_figures(figures_of(name, *pair, self._extended), kept)
+            real, fake = (np.concatenate(kept[side].features[name]) for side in SIDES)
+            scores += self._of_figures(figures_of(name, real, fake, self._extended), kept)
         if self._extended:
             for name in self._published:
-                pair = [np.concatenate(kept[side].features[_own(name)]) for side in SIDES]
-                scores += self._of_figures(more_figures(self.protocol.measures[name].table or name, *pair), kept)
+                real, fake = (np.concatenate(kept[side].features[_own(name)]) for side in SIDES)
+                table = self.protocol.measures[name].table or name
+                scores += self._of_figures(more_figures(table, real, fake), kept)
         if not scores:
             raise DataError(f"no figure of {self.protocol.name}: {'; '.join(self.left_out.values())}", "one at least")
         return scores
@@ -264,17 +263,18 @@ class Metric:
         return Score(measure.title, value, self.protocol.name, real, fake, measure.table, measure.times, low, high)
 
     def _of_figures(self, figures: Iterable[Figure], kept: Mapping[str, _Kept]) -> list[Score]:
-        counts = [kept[side].count for side in SIDES]
-        return [
-            Score(title, value(), self.protocol.name, *counts, "", 1.0,
-                  *self._interval(statistic() if self._replicates else None, least))
-            for title, value, statistic, least in figures
-        ]  # fmt: skip
+        real, fake = (kept[side].count for side in SIDES)
+        scores = []
+        for title, value, statistic, least in figures:
+            low, high = self._interval(statistic() if self._replicates else None, least)
+            scores.append(Score(title, value(), self.protocol.name, real, fake, low=low, high=high))
+        return scores
 
     def _interval(self, statistic: Any, least: float | None) -> tuple[float | None, float | None]:
         if statistic is None or not self._replicates:
             return None, None
-        return tuple(bootstrap(statistic, self._replicates, LEVEL, smallest=least))
+        interval = bootstrap(statistic, self._replicates, LEVEL, smallest=least)
+        return interval.low, interval.high
 
     def _gathered(self) -> dict[str, _Kept]:
         """Both sets of all processes, in the order of their ranks."""
