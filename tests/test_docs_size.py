@@ -29,6 +29,7 @@ LIMITS = {
     "docs/how-to/label-kitti360.md": 150,
     "docs/how-to/another-sensor.md": 200,
     "docs/how-to/skin.md": 200,
+    "docs/how-to/measure.md": 300,
     "docs/how-to/train-a-generator.md": 450,
     "docs/how-to/bake.md": 400,
     "docs/how-to/look.md": 150,

@@ -11,7 +11,7 @@ from safetensors.numpy import load_file
 from scipy.linalg import sqrtm
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import jensenshannon
+from scipy.spatial.distance import cdist, jensenshannon
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.evaluate import (
@@ -23,8 +23,10 @@ from lidar_synth.evaluate import (
     lidm,
     r2flow,
     squared_mmd,
+    statistics,
 )
-from lidar_synth.evaluate import protocols as protocols_module
+from lidar_synth.evaluate.measures import KINDS
+from lidar_synth.evaluate.protocols import FEATURES
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, presets
 
@@ -43,13 +45,23 @@ def clouds(vectors: Vectors, name: str) -> list[np.ndarray]:
 
 
 def scans(count: int, seed: int, scale: float = 1.0) -> list[Scan]:
-    """The same street seen with a little noise, and by ``scale`` larger or smaller."""
+    """The same street, labelled, seen with a little noise, and by ``scale`` larger or smaller."""
     street = np.random.default_rng(9).normal(0, (20, 20, 0.5), (3000, 3)) * scale
+    label = np.random.default_rng(9).integers(0, 19, 3000).astype(np.uint8)
     made = []
     for i in range(count):
         points = (street + np.random.default_rng([seed, i]).normal(0, 0.02, street.shape)).astype(np.float32)
-        made.append(Scan(points, np.zeros(3000, np.float32), SENSOR, id=f"{seed}-{i}"))
+        made.append(Scan(points, np.zeros(3000, np.float32), SENSOR, label, id=f"{seed}-{i}"))
     return made
+
+
+def compared(protocol: str, name: str, real: list, fake: list) -> float:
+    """The value of a protocol's measure on clouds (N, 3)."""
+    measure = PROTOCOLS[protocol].measures[name]
+    kind = KINDS[measure.kind]
+    sides = [[kind.describe(Scan(c, np.zeros(len(c), np.float32), SENSOR), measure.options) for c in side]
+             for side in (real, fake)]  # fmt: skip
+    return kind.compare(*sides, measure.options).value
 
 
 def test_r2flow_histogram(vectors: Vectors) -> None:
@@ -60,9 +72,9 @@ def test_r2flow_histogram(vectors: Vectors) -> None:
 
 @pytest.mark.parametrize(("real", "fake", "suffix"), PAIRS)
 def test_r2flow_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> None:
-    a, b = ([r2flow.bev_histogram(c) for c in clouds(vectors, name)] for name in (real, fake))
-    assert r2flow.jsd(a, b) == pytest.approx(vectors[f"r2flow/jsd{suffix}"][0], rel=1e-6)
-    assert r2flow.maximum_mean_discrepancy(a, b) == pytest.approx(vectors[f"r2flow/mmd{suffix}"][0], abs=1e-6)
+    both = clouds(vectors, real), clouds(vectors, fake)
+    assert compared("r2flow", "jsd", *both) == pytest.approx(vectors[f"r2flow/jsd{suffix}"][0], rel=1e-6)
+    assert compared("r2flow", "mmd", *both) == pytest.approx(vectors[f"r2flow/mmd{suffix}"][0], abs=1e-6)
 
 
 def test_lidm_cells(vectors: Vectors) -> None:
@@ -75,9 +87,10 @@ def test_lidm_cells(vectors: Vectors) -> None:
 
 @pytest.mark.parametrize(("real", "fake", "suffix"), PAIRS)
 def test_lidm_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> None:
-    a, b = ([lidm.occupancy(c) for c in clouds(vectors, name)] for name in (real, fake))
-    assert lidm.jsd(a, b) == pytest.approx(vectors[f"lidm/jsd{suffix}"][0], rel=1e-5)
-    assert lidm.minimum_matching_distance(a, b) == pytest.approx(vectors[f"lidm/mmd{suffix}"][0], rel=1e-4)
+    both = clouds(vectors, real), clouds(vectors, fake)
+    assert compared("lidm", "jsd", *both) == pytest.approx(vectors[f"lidm/jsd{suffix}"][0], rel=1e-5)
+    assert compared("lidm", "mmd", *both) == pytest.approx(vectors[f"lidm/mmd{suffix}"][0], rel=1e-4)
+    assert compared("r3dpa", "jsd", *both) == compared("lidm", "jsd", *both)  # R3DPA keeps LiDM's code for it
 
 
 @pytest.mark.slow
@@ -126,34 +139,40 @@ def test_jensen_shannon_distance_is_scipys(data: st.DataObject, bins: int) -> No
     assert jensen_shannon_distance(p, 3 * p) == pytest.approx(0, abs=1e-7)
 
 
-def test_distance_maps_are_exact() -> None:
-    occupied = [lidm.occupancy(s.points) for s in scans(3, 0)]
-    occupied.append(lidm.Occupancy(occupied[0].fine, np.array([0], np.int32)))  # one corner: the longest ways
-    for ours, one in zip(lidm._distance_maps(occupied), occupied, strict=True):
-        mask = np.zeros((200, 200), bool)
-        mask.flat[one.coarse] = True
-        assert np.array_equal(ours.reshape(200, 200), np.round(distance_transform_edt(~mask) ** 2))
+@pytest.mark.parametrize("side", [40, 200])
+def test_distance_maps_are_exact(side: int) -> None:
+    rng = np.random.default_rng(0)
+    for cells in (rng.choice(side**2, 300, replace=False), np.array([0]), np.arange(side)):
+        mask = np.zeros((side, side), bool)
+        mask.flat[cells] = True
+        ours = lidm._distance_map(np.sort(cells).astype(np.int32), side)
+        assert np.array_equal(ours, np.round(distance_transform_edt(~mask) ** 2))
 
 
-def test_minimum_matching_distance_by_nearest_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("protocol", "cell"), [("lidm", 0.5), ("r3dpa", 0.05)])
+def test_minimum_matching_distance_by_nearest_neighbours(
+    protocol: str, cell: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(lidm, "_BLOCK", 2)
-    real, fake = ([lidm.occupancy(s.points) for s in scans(n, seed)] for n, seed in ((5, 1), (3, 2)))
-    grids = [[np.stack(np.divmod(o.coarse, 200), 1) / 200 for o in side] for side in (real, fake)]
+    real, fake = ([s.points for s in scans(n, seed)] for n, seed in ((5, 1), (3, 2)))
+    side = lidm.cells_along(cell)
+    grids = [[np.stack(np.divmod(lidm.occupied(p, cell), side), 1) / side for p in points] for points in (real, fake)]
 
     def chamfer(a: np.ndarray, b: np.ndarray) -> float:
         return ((cKDTree(b).query(a)[0] ** 2).mean() + (cKDTree(a).query(b)[0] ** 2).mean()) / 2
 
     expected = np.mean([min(chamfer(r, f) for f in grids[1]) for r in grids[0]])
-    assert lidm.minimum_matching_distance(real, fake) == pytest.approx(expected, rel=1e-5)
+    assert compared(protocol, "mmd", real, fake) == pytest.approx(expected, rel=1e-5)
 
 
 def test_maximum_mean_discrepancy_by_its_definition(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(r2flow, "_BLOCK", 2)
-    real, fake = ([r2flow.bev_histogram(s.points) for s in scans(n, seed)] for n, seed in ((5, 1), (3, 2)))
-    p, q = (np.array([h / h.sum() for h in side]).reshape(len(side), -1) for side in (real, fake))
-    kernel = lambda a, b: np.exp(-2 * ((a[:, None] - b) ** 2).sum(-1)).mean()  # noqa: E731
+    monkeypatch.setattr(statistics, "_NUMBERS", 0)  # blocks of 16
+    real, fake = ([s.points for s in scans(n, seed)] for n, seed in ((40, 1), (18, 2)))
+    p, q = (np.array([r2flow.bev_histogram(c).ravel() for c in side], np.float64) for side in (real, fake))
+    p, q = (h / h.sum(1, keepdims=True) for h in (p, q))
+    kernel = lambda a, b: np.exp(-2 * cdist(a, b, "sqeuclidean")).mean()  # noqa: E731
     expected = kernel(p, p) + kernel(q, q) - 2 * kernel(p, q)
-    assert r2flow.maximum_mean_discrepancy(real, fake) == pytest.approx(expected, rel=1e-4)
+    assert compared("r2flow", "mmd", real, fake) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.slow
@@ -161,8 +180,10 @@ def test_maximum_mean_discrepancy_by_its_definition(monkeypatch: pytest.MonkeyPa
 def test_each_protocol_tells_near_from_far(name: str) -> None:
     real = scans(8, 0)
     same, near, far = (evaluate(real, s, name, progress=False) for s in (real, scans(6, 1), scans(6, 2, 0.8)))
+    assert len(same) == sum(m.kind != FEATURES for m in PROTOCOLS[name].measures.values())
     for zero, small, large in zip(same, near, far, strict=True):
-        assert zero.value == pytest.approx(0, abs=1e-6) or name == "r2flow"  # whose two sets are made differently
+        apart = PROTOCOLS[name].prepare.real != PROTOCOLS[name].prepare.generated  # the two sets are made differently
+        assert zero.value == pytest.approx(0, abs=1e-6) or apart
         assert small.value < large.value
         assert (small.protocol, small.real, small.generated) == (name, 8, 6)
         assert f"({name} protocol, 8 real, 6 generated)" in str(small)
@@ -171,19 +192,22 @@ def test_each_protocol_tells_near_from_far(name: str) -> None:
 def test_the_clouds_of_the_protocols() -> None:
     scan = random_scan(SENSOR, 5000)
     own = {tuple(p) for p in scan.points}
-    real, fake = r2flow.cloud(scan, False), r2flow.cloud(scan, True)
+    real, fake = (PROTOCOLS["r2flow"].cloud(scan, generated) for generated in (False, True))
     assert len(real) == len(fake) and {tuple(p) for p in real} <= own and not {tuple(p) for p in fake} & own
     assert np.allclose(np.sort(np.linalg.norm(real, axis=1)), np.sort(np.linalg.norm(fake, axis=1)), rtol=1e-5)
     assert np.linalg.norm(real, axis=1).min() >= 1.45 and 60 < np.linalg.norm(real, axis=1).max() < 63
-    both = lidm.cloud(scan, False), lidm.cloud(scan, True)
-    assert np.array_equal(*both)
     corners = SENSOR.column_azimuths("corner")
-    for points in (fake, both[0]):  # every azimuth is that of a corner
-        azimuth = -np.arctan2(points[:, 1], points[:, 0])
-        assert np.abs(np.sin(azimuth[:, None] - corners)).min(1).max() < 1e-5
-    assert np.linalg.norm(both[0], axis=1).min() > 1 and 53 < np.linalg.norm(both[0], axis=1).max() < 56.0001
+    for name in ("lidm", "r3dpa"):
+        both = [PROTOCOLS[name].cloud(scan, generated) for generated in (False, True)]
+        assert np.array_equal(*both)
+        assert np.linalg.norm(both[0], axis=1).min() > 1 and 53 < np.linalg.norm(both[0], axis=1).max() < 56.0001
+        for points in (fake, both[0]):  # every azimuth is that of a corner
+            azimuth = -np.arctan2(points[:, 1], points[:, 0])
+            assert np.abs(np.sin(azimuth[:, None] - corners)).min(1).max() < 1e-5
     small = Sensor("small", 64, 1.0, 90.0, rows=8, fov_up=5.0, fov_down=-20.0)
     assert len(PROTOCOLS["town"].cloud(random_scan(small), False)) <= 64 * 8
+    edge = Scan(np.array([(1, 0, 0), (56, 0, 0), (2, 0, 0)], np.float32), np.zeros(3, np.float32), SENSOR)
+    assert len(PROTOCOLS["lidm"].cloud(edge, False)) == 1  # both limits are exclusive
 
 
 def test_extractors_add_frechet_distances_over_all_batches() -> None:
@@ -202,9 +226,9 @@ def test_extractors_add_frechet_distances_over_all_batches() -> None:
     assert by_name["squared maximum mean discrepancy of moments"] == squared_mmd(a, b)
 
 
-def test_r2flow_takes_a_fixed_choice_of_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    limited = PROTOCOLS["r2flow"]._replace(limit=3)
-    monkeypatch.setitem(protocols_module.PROTOCOLS, "r2flow", limited)
+def test_r2flow_takes_a_fixed_choice_of_its_limit() -> None:
+    measures = {k: m.model_copy(update={"real": 3}) for k, m in PROTOCOLS["r2flow"].measures.items()}
+    limited = PROTOCOLS["r2flow"].model_copy(update={"measures": measures})
     asked = []
 
     class Recorded(list):
@@ -212,14 +236,17 @@ def test_r2flow_takes_a_fixed_choice_of_its_limit(monkeypatch: pytest.MonkeyPatc
             asked.append(index)
             return super().__getitem__(index)
 
-    score = evaluate(Recorded(scans(6, 0)), scans(4, 1), "r2flow", progress=False)[0]
+    real, fake = scans(6, 0), scans(4, 1)
+    score = evaluate(Recorded(real), fake, limited, progress=False)[0]
     assert asked == [4, 2, 1]  # random.Random(0).shuffle of 6 numbers, the first 3
     assert (score.real, score.generated) == (3, 4)
+    everything = evaluate(real, fake, limited, {"moments": lambda some: np.ones((len(some), 2))}, progress=False)
+    assert everything[0] == score and everything[-1].real == 6  # features are of all scans, as R2Flow takes them
 
 
 def test_bad_input() -> None:
     good = scans(2, 0)
-    with pytest.raises(ConfigError, match="protocol 'jsd'; expected one of r2flow, lidm, town"):
+    with pytest.raises(ConfigError, match="protocol 'jsd'; expected one of .*lidm, r2flow, r3dpa, spiral, town"):
         evaluate(good, good, "jsd")
     with pytest.raises(DataError, match="no generated scans; expected at least one"):
         evaluate(good, [], "lidm", progress=False)

@@ -16,56 +16,26 @@ its own condition, and with another scan, half the set away:
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import REFERENCE, SEED, header, relabelled, rows, shrink, town
+from model_card import REFERENCE, SEED, header, rows, shrink, town
 from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
 from lidar_synth import Scan, load_generator, open_scans
-from lidar_synth.evaluate.segmentation import Judge, load_judge, mean_iou
+from lidar_synth.evaluate.conditions import AGREEMENTS
+from lidar_synth.evaluate.segmentation import Judge, load_judge
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.viz import picture, render
 
-FIELD, REACH = np.radians(50.0), 40
-"""The compared area: angle to either side of straight ahead (the cameras of the town and KITTI-360 see 52 degrees), and
-distance in metres."""
-SENSOR_HEIGHT, ABOVE = 1.73, 0.5
-"""Height of the LiDAR above the ground, and of the lowest returns that count above the ground; metres."""
 SHOWN = 8
 """Examples in the picture."""
-
-
-def map_agreement(scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> float:
-    """mIoU between the real scans' labels, cell by cell, and the segmenter's prediction on the generated ones."""
-    return mean_iou(judge.agreement([relabelled(a, b) for a, b in zip(scans, real, strict=True)]))
-
-
-def sight_agreement(scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> float:
-    """Mean intersection over union of the occupied cells in the camera's view."""
-    pairs = [(obstacles(a), obstacles(b)) for a, b in zip(scans, real, strict=True)]
-    return float(np.mean([(a & b).sum() / max((a | b).sum(), 1) for a, b in pairs]))
-
-
-def obstacles(scan: Scan) -> NDArray[np.bool_]:
-    """(REACH, 2 REACH) square metres ahead that have a return above the ground."""
-    x, y, z = scan.points.T
-    seen = (np.abs(np.arctan2(y, x)) < FIELD) & (np.hypot(x, y) < REACH) & (z > ABOVE - SENSOR_HEIGHT)
-    cells = np.zeros((REACH, 2 * REACH), bool)
-    cells[np.floor(x[seen]).astype(int), np.floor(y[seen]).astype(int) + REACH] = True
-    return cells
-
-
-AGREEMENTS: dict[str, tuple[str, Callable[[Sequence[Scan], Sequence[Scan], Judge], float]]] = {
-    "semantic": ("mIoU of map and segmenter", map_agreement),
-    "camera": ("bird's-eye IoU in the camera's sight", sight_agreement),
-}
 
 
 def verdict(name: str, kind: str, scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> str:
@@ -120,6 +90,7 @@ def main() -> None:
     parser.add_argument("--root", help="a dataset with labels or images [default: a town]")
     parser.add_argument("--split", help="split of ROOT")
     parser.add_argument("--count", type=int, default=64, help="scans in each row")
+    parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
     parser.add_argument("--picture", type=Path, help="PNG of the first model's scans; do not publish it for real data")
     given = parser.parse_args()
 
@@ -135,7 +106,7 @@ def main() -> None:
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
         kind, scans = generate(model, int(steps) if steps else None, real)
-        lines.append(rows(name, real, scans, judge)[0])
+        lines.append(rows(name, real, scans, judge, given.intervals)[0])
         if i == 0:
             verdicts.append(verdict("the real scans", kind, real, real, judge))
         verdicts.append(verdict(name, kind, scans, real, judge))

@@ -24,7 +24,7 @@ from PIL import Image
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lidar_synth.datasets.classes import IGNORE, NAMES, TRAIN_ID
+from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.errors import ConfigError
 from lidar_synth.evaluate import Score, evaluate
 from lidar_synth.evaluate.segmentation import Judge, class_ious, load_judge, mean_iou
@@ -94,23 +94,18 @@ def resampled(model: str, scans: Sequence[Scan]) -> list[Scan]:
     return made
 
 
-def relabelled(scan: Scan, other: Scan) -> Scan:
-    """A scan on its sensor's grid; each return gets the label of the same cell in another scan."""
-    image, labels = project(scan, scan.sensor), project(other, scan.sensor, ["label"]).channels["label"]
-    image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(np.uint8)
-    return replace(unproject(image), id=scan.id, domain=scan.domain)
-
-
 def town(seed: int, count: int) -> list[Scan]:
     """Scans of one town, each on a different street: neighbouring scans would show only three or four streets."""
     source = Town(seed, scans=count * STRETCH_FRAMES, interval=1.0)
     return [source[i * STRETCH_FRAMES] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
 
 
-def rows(name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge) -> tuple[str, str]:
-    """A line of the first table, and one of the second: IoU by class between the labels and the segmenter's prediction,
-    and the bend of walls."""
-    values = [f"{score.value:.4g}" for score in _scores(reference, scans, judge)]
+def rows(
+    name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge, replicates: int = 0
+) -> tuple[str, str]:
+    """A line of the first table, with 95 % intervals from ``replicates`` resamples, and one of the second: IoU by class
+    between the labels and the segmenter's prediction, and the bend of walls."""
+    values = [_shown(score) for score in _scores(reference, scans, judge, replicates)]
     mean, bent, ious = float("nan"), float("nan"), np.full(len(NAMES), np.nan)
     if scans[0].label is not None:
         table = judge.agreement(scans)
@@ -140,10 +135,21 @@ def header(reference: Sequence[Scan], judge: Judge) -> str:
     return f"| scans | {' | '.join(names)} | mIoU with the town segmenter, % |\n|---|{'---:|' * (len(names) + 1)}"
 
 
-def _scores(reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge, progress: bool = True) -> list[Score]:
-    """R2Flow's measures on the town's grid, distances of the segmenter's features, and LiDM's measures."""
-    own = evaluate(reference, scans, "town", {"the town segmenter": judge.features}, progress=progress)
-    return own + evaluate(reference, scans, "lidm", progress=progress)
+def _scores(
+    reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge, replicates: int = 0, progress: bool = True
+) -> list[Score]:
+    """R2Flow's measures on the town's grid, distances of the segmenter's features, LiDM's measures, and the package's
+    own of ranges and classes."""
+    features = {"the town segmenter": judge.features}
+    own = evaluate(reference, scans, "town", features, progress=progress, replicates=replicates)
+    more = [evaluate(reference, scans, p, progress=progress, replicates=replicates) for p in ("lidm", "general")]
+    # LiDM's distances of features need weights that do not belong to the card.
+    return own + [s for scores in more for s in scores if not s.metric.startswith("Frechet")]
+
+
+def _shown(score: Score) -> str:
+    """The value with its interval, where it has one."""
+    return f"{score.value:.4g}" + ("" if score.low is None else f" [{score.low:.4g}, {score.high:.4g}]")
 
 
 def picture(path: Path, scans: Sequence[Scan], title: str) -> None:
@@ -167,13 +173,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]]")
     parser.add_argument("--count", type=int, default=512, help="scans in each row")
+    parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
     parser.add_argument("--pictures", type=Path, help="folder for sheets of the first model and of the town")
     given = parser.parse_args()
 
     judge = load_judge()
     reference = town(REFERENCE, given.count)
     other = town(OTHER, given.count)
-    lines = [rows("real against real (lower bound)", reference, other, judge)]
+    lines = [rows("real against real (lower bound)", reference, other, judge, given.intervals)]
     for i, text in enumerate(given.models):
         name, spec = text.split("=", 1)
         model, steps, *guidance = spec.split(":") if ":" in spec else (spec, "")
@@ -181,7 +188,7 @@ def main() -> None:
             scans = resampled(model, other)
         else:
             scans = generate(model, int(steps) if steps else None, given.count, *guidance)
-        lines.append(rows(name, reference, scans, judge))
+        lines.append(rows(name, reference, scans, judge, given.intervals))
         if i == 0 and given.pictures:
             apart = np.linspace(0, given.count - 1, TILES).astype(int)
             picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans, not selected")

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 def evaluate(
     real: Annotated[Path, typer.Argument(metavar="REAL", help="reference scans: root of a dataset, or a folder")],
     fake: Annotated[Path, typer.Argument(metavar="FAKE", help="scans to evaluate: root of a dataset, or a folder")],
-    protocol: Annotated[str | None, typer.Option(help="definitions of the metrics: r2flow | lidm | town")] = None,
+    protocol: Annotated[
+        str | None, typer.Option(help="definitions of the metrics: r2flow | lidm | r3dpa | spiral | town | general")
+    ] = None,
     judge: Annotated[
         Path | None, typer.Option(help="archive of lidar-bonnetal: how well its network recognises both sets")
     ] = None,
@@ -23,26 +25,42 @@ def evaluate(
     split: Annotated[str | None, typer.Option(help="split of REAL, for instance r2flow/test")] = None,
     sensor: Annotated[str | None, typer.Option(help="sensor of both sets: a preset or a YAML file")] = None,
     segmenter: Annotated[bool, typer.Option(help="add metrics on features of the town's segmenter")] = False,
+    weights: Annotated[
+        Path | None, typer.Option(help="folder with published weights, for FRD, FRID, FPD, FSVD, FPVD, FLD")
+    ] = None,
+    extended: Annotated[
+        bool, typer.Option(help="of features, add unbiased forms, precision, recall, density, coverage")
+    ] = False,
+    intervals: Annotated[int, typer.Option(help="resamples for 95 % intervals, for instance 200")] = 0,
+    beside: Annotated[bool, typer.Option(help="print the published figures of the protocol, too")] = False,
+    cache: Annotated[Path | None, typer.Option(help="folder in which features are kept")] = None,
+    processes: Annotated[int, typer.Option(help="processes that extract features; needs --cache", min=1)] = 1,
     training_data: Annotated[bool, typer.Option(help="permit a reference that the model was trained on")] = False,
+    anyway: Annotated[bool, typer.Option(help="compare fewer scans than the paper's, and other sensors")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Compares two sets of scans: Jensen-Shannon distance and MMD of bird's-eye views; feature metrics on request.
+    """Compares two sets of scans: Jensen-Shannon distance and MMD of bird's-eye views; distances of features where
+    the published weights are at hand; general: ranges and classes; spiral: classes.
 
     With --judge, a segmentation network that was trained on real streets predicts the classes of both sets: accuracy,
     IoU by class, the most frequent confusions and feature distances.
 
-    Papers define metrics of the same name differently: scores of two protocols are not comparable. A reference that
-    shares frames with the model's training data is refused, because it flatters the model; the training data of its
-    teacher and autoencoder count too, and the names of the splits do not matter.
+    Papers define metrics of the same name differently: scores of two protocols are not comparable. Fewer scans than the
+    protocol's paper compares, and other sensors than its own, are refused. A reference that shares frames with the
+    model's training data is refused, because it flatters the model; the training data of its teacher and autoencoder
+    count too, and the names of the splits do not matter.
 
     \b
     Examples:
-      lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test
+      lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test --weights metrics --beside
       lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
       lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
     """
     from lidar_synth.evaluate import PROTOCOLS
     from lidar_synth.evaluate import evaluate as compare
+    from lidar_synth.evaluate.comparison import check_counts
+    from lidar_synth.evaluate.features import describe_missing
+    from lidar_synth.evaluate.leaderboard import beside as published
     from lidar_synth.evaluate.leakage import measured
     from lidar_synth.evaluate.segmentation import load_judge
     from lidar_synth.formats import layout_of, open_scans
@@ -57,9 +75,20 @@ def evaluate(
     if judge is not None:
         _recognition(judge, columns, sources, as_json)
         return
+    rules = PROTOCOLS[str(protocol)]
+    if not anyway:
+        check_counts(rules, *map(len, sources))
     extractors = {"the town segmenter": load_judge().features} if segmenter else {}
-    scores = compare(*sources, str(protocol), extractors, progress=not as_json)
+    left_out: dict[str, str] = {}
+    scores = compare(
+        *sources, rules, extractors, progress=not as_json, weights=weights, replicates=intervals, extended=extended,
+        any_sensor=anyway, cache=cache, processes=processes, left_out=left_out,
+    )  # fmt: skip
     typer.echo(json.dumps([asdict(s) for s in scores], indent=2) if as_json else "\n".join(map(str, scores)))
+    for note in filter(None, (describe_missing(left_out, rules), rules.unverified)):
+        typer.echo(note, err=True)
+    if beside and not as_json:
+        typer.echo(f"\n{published(scores)}")
 
 
 def _recognition(folder: Path, columns: int | None, sources: "tuple[Source, Source]", as_json: bool) -> None:

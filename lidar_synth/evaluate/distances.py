@@ -44,9 +44,15 @@ def frechet_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
     Raises:
         DataError: on other shapes, fewer than two samples, or features that are not finite.
     """
-    a, b = _features(a, b)
-    mean_a, mean_b = a.mean(0), b.mean(0)
-    cov_a, cov_b = np.atleast_2d(np.cov(a, rowvar=False)), np.atleast_2d(np.cov(b, rowvar=False))
+    a, b = checked_features(a, b)
+    cov_a, cov_b = (np.atleast_2d(np.cov(features, rowvar=False)) for features in (a, b))
+    return frechet_of_moments(a.mean(0), cov_a, b.mean(0), cov_b)
+
+
+def frechet_of_moments(
+    mean_a: NDArray[np.float64], cov_a: NDArray[np.float64], mean_b: NDArray[np.float64], cov_b: NDArray[np.float64]
+) -> float:
+    """As ``frechet_distance``, from means (D,) and covariances (D, D)."""
     values, vectors = np.linalg.eigh(cov_a)
     root = (vectors * np.sqrt(values.clip(0))) @ vectors.T
     cross = np.sqrt(np.linalg.eigvalsh(root @ cov_b @ root).clip(0)).sum()
@@ -79,7 +85,7 @@ def squared_mmd(
     Raises:
         DataError: as ``frechet_distance``.
     """
-    real, generated = _features(real, generated)
+    real, generated = checked_features(real, generated)
     rng = np.random.default_rng(0) if rng is None else rng
     size = min(len(real), len(generated), size)
     total = 0.0
@@ -92,7 +98,15 @@ def squared_mmd(
     return float(total / subsets / size)
 
 
-def _features(*sets: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def checked_features(
+    a: NDArray[np.floating], b: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N, D) and (M, D) features in float64.
+
+    Raises:
+        DataError: on other shapes, fewer than two samples, or features that are not finite.
+    """
+    sets = a, b
     a, b = (np.asarray(features).astype(np.float64) for features in sets)
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1] or min(len(a), len(b)) < 2:
         raise DataError(f"features of shape {a.shape} and {b.shape}", "(N, D) and (M, D), at least two samples each")

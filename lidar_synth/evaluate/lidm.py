@@ -1,20 +1,16 @@
-"""LiDM's protocol: bird's-eye occupancy, its Jensen-Shannon distance, and the minimum matching distance.
-
-https://github.com/hancyran/LiDAR-Diffusion, lidm/eval. Both sets are 64 x 1024 range images whose returns from
-1 m to 56 m (both exclusive) lie on rays through the cells' corners; x and y within +-50 m count. 2,000
-generated scans against all of the validation sequence.
+"""Bird's-eye occupancy and the minimum matching distance as LiDM reports them:
+https://github.com/hancyran/LiDAR-Diffusion, ``lidm/eval``. R3DPA computes the same on finer cells
+(https://github.com/valeoai/R3DPA, ``evaluate.py``). The counts and limits are in ``protocols/lidm.yaml`` and
+``protocols/r3dpa.yaml``.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.evaluate.distances import jensen_shannon_distance
-from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 
 HALF = 50
@@ -23,26 +19,16 @@ HALF = 50
 FINE, COARSE = 0.05, 0.5
 """Size of cells in metres, for the Jensen-Shannon distance and for the minimum matching distance."""
 
-_SENSOR = Sensor("lidm", 1024, float(np.nextafter(np.float32(1), np.float32(2))),
+SENSOR = Sensor("lidm", 1024, float(np.nextafter(np.float32(1), np.float32(2))),
                  float(np.nextafter(np.float32(56), np.float32(0))), rows=64, fov_up=3.0, fov_down=-25.0)  # fmt: skip
-_SIDE = round(2 * HALF / COARSE)
+"""The grid of LiDM's range images."""
+
 _BLOCK = 128  # clouds compared with one another at a time: 20 MB of 200 x 200 maps
-
-
-class Occupancy(NamedTuple):
-    """The cells of one cloud that hold a point, as row * cells per side + column, sorted: row along x."""
-
-    fine: NDArray[np.int32]
-    coarse: NDArray[np.int32]
-
-
-def cloud(scan: Scan, generated: bool) -> NDArray[np.float32]:
-    """(N, 3) the points of a scan that the protocol compares, metres; the same for real and generated scans."""
-    return unproject(project(scan, _SENSOR, ()), "corner").points
+_MOST_CELLS = 1 << 16  # cells of a grid up to which the maps of a block are held and multiplied
 
 
 def occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:
-    """The cells of ``size`` metres that hold a point, sorted; see ``Occupancy``.
+    """The cells of ``size`` metres that hold a point, as row * cells per side + column, sorted: row along x.
 
     Args:
         points: (N, 3) float32 metres.
@@ -62,75 +48,110 @@ def occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:
     return np.unique(cell[:, 0] * side + cell[:, 1])
 
 
-def occupancy(points: NDArray[np.float32]) -> Occupancy:
-    """The occupied cells of a cloud (N, 3), which the protocol compares."""
-    return Occupancy(occupied(points, FINE), occupied(points, COARSE))
+def cells_along(size: float) -> int:
+    """Number of cells of ``size`` metres along a side of the square."""
+    return round(2 * HALF / size)
 
 
-def jsd(real: Sequence[Occupancy], generated: Sequence[Occupancy]) -> float:
-    """Jensen-Shannon distance of how often each 5 cm cell is occupied."""
-    side = round(2 * HALF / FINE)
-    sums = [np.bincount(np.concatenate([o.fine for o in clouds]), minlength=side**2) for clouds in (real, generated)]
-    return jensen_shannon_distance(sums[0], sums[1])
+def matching_distances(
+    real: Sequence[NDArray[np.int32]], generated: Sequence[NDArray[np.int32]], size: float
+) -> NDArray[np.float32]:
+    """(N, M) Chamfer distance of every real cloud and every generated one.
 
+    The Chamfer distance of two clouds is the mean of both mean squared distances between nearest occupied cells, in
+    units of the side of the square. All clouds share one grid, so that the squared distance from every cell to a cloud
+    is one map. On a coarse grid all pairs are one matrix product; on a fine one the maps are made one after another.
 
-def minimum_matching_distance(real: Sequence[Occupancy], generated: Sequence[Occupancy]) -> float:
-    """Mean over real clouds of the smallest Chamfer distance to a generated one (Achlioptas et al., ICML 2018).
-
-    The Chamfer distance of two clouds is the mean of both mean squared distances between nearest occupied
-    cells of 0.5 m, in units of the side of the square. All clouds share one grid, so that the squared distance
-    from every cell to a cloud is one map, and all pairs are one matrix product. The paper's tables show it
-    times 10^4.
+    Args:
+        real, generated: occupied cells of each cloud.
+        size: of a cell, metres.
     """
-    maps = np.concatenate([_distance_maps(block) for block in _blocks(real)])
-    best = np.full(len(real), np.inf, np.float32)
-    for block in _blocks(generated):
-        to_generated, of_generated = _distance_maps(block), _weights(block)
-        for first in range(0, len(real), _BLOCK):
-            part = slice(first, first + _BLOCK)
-            chamfer = (_weights(real[part]) @ to_generated.T + maps[part] @ of_generated.T) / 2
-            best[part] = np.minimum(best[part], chamfer.min(1))
-    return float(best.mean(dtype=np.float64)) / _SIDE**2
+    side = cells_along(size)
+    both = (_by_product if side**2 <= _MOST_CELLS else _by_lookup)(real, generated, side)
+    return np.asarray(both / np.float32(2 * side**2), np.float32)
 
 
-def compare(real: Sequence[Occupancy], generated: Sequence[Occupancy]) -> dict[str, float]:
-    """The figures of the protocol from the occupancies of both sets."""
-    return {
-        "BEV Jensen-Shannon distance": jsd(real, generated),
-        "BEV minimum matching distance": minimum_matching_distance(real, generated),
-    }
+def _by_product(
+    real: Sequence[NDArray[np.int32]], generated: Sequence[NDArray[np.int32]], side: int
+) -> NDArray[np.float32]:
+    total = np.empty((len(real), len(generated)), np.float32)
+    maps = np.concatenate([_distance_maps(real[i : i + _BLOCK], side) for i in range(0, len(real), _BLOCK)])
+    for j in range(0, len(generated), _BLOCK):
+        block = generated[j : j + _BLOCK]
+        to_generated, of_generated = _distance_maps(block, side), _weights(block, side)
+        for i in range(0, len(real), _BLOCK):
+            pair = _weights(real[i : i + _BLOCK], side) @ to_generated.T + maps[i : i + _BLOCK] @ of_generated.T
+            total[i : i + _BLOCK, j : j + _BLOCK] = pair
+    return total
 
 
-def _blocks(clouds: Sequence[Occupancy]) -> list[Sequence[Occupancy]]:
-    return [clouds[i : i + _BLOCK] for i in range(0, len(clouds), _BLOCK)]
+def _by_lookup(
+    real: Sequence[NDArray[np.int32]], generated: Sequence[NDArray[np.int32]], side: int
+) -> NDArray[np.float32]:
+    total = np.zeros((len(real), len(generated)), np.float32)
+    for maps, others, out in ((real, generated, total), (generated, real, total.T)):
+        cells = np.concatenate(others)
+        starts = np.concatenate([[0], np.cumsum([len(o) for o in others])])
+        for cloud, row in zip(maps, out, strict=True):
+            _add_means(_distance_map(cloud, side).ravel(), cells, starts, row)
+    return total
 
 
-def _weights(clouds: Sequence[Occupancy]) -> NDArray[np.float32]:
-    """(n, 200 * 200) the share of each cell in the mean over a cloud."""
-    weights = np.zeros((len(clouds), _SIDE**2), np.float32)
-    for row, one in zip(weights, clouds, strict=True):
-        row[one.coarse] = 1 / len(one.coarse)
+@numba.njit(cache=True, nogil=True)
+def _add_means(
+    values: NDArray[np.float32], cells: NDArray[np.int32], starts: NDArray[np.int64], out: NDArray[np.float32]
+) -> None:
+    """Add to ``out`` the mean value over the cells of each cloud."""
+    for k in range(len(starts) - 1):
+        total = 0.0
+        for i in range(starts[k], starts[k + 1]):
+            total += values[cells[i]]
+        out[k] += total / (starts[k + 1] - starts[k])
+
+
+def _weights(clouds: Sequence[NDArray[np.int32]], side: int) -> NDArray[np.float32]:
+    """(n, side * side) the share of each cell in the mean over a cloud."""
+    weights = np.zeros((len(clouds), side**2), np.float32)
+    for row, cells in zip(weights, clouds, strict=True):
+        row[cells] = 1 / len(cells)
     return weights
 
 
-def _distance_maps(clouds: Sequence[Occupancy]) -> NDArray[np.float32]:
-    """(n, 200 * 200) squared distance, in cells, from every cell to the nearest that a cloud occupies."""
-    return np.stack([_distance_map(one.coarse) for one in clouds]).reshape(len(clouds), -1)
+def _distance_maps(clouds: Sequence[NDArray[np.int32]], side: int) -> NDArray[np.float32]:
+    """(n, side * side) squared distance, in cells, from every cell to the nearest that a cloud occupies."""
+    return np.stack([_distance_map(cells, side).ravel() for cells in clouds])
 
 
-def _distance_map(cells: NDArray[np.int32]) -> NDArray[np.float32]:
-    """(200, 200) exact squared distances: along one axis, then over both."""
-    mask = np.zeros((_SIDE, _SIDE), bool)
-    mask.T.flat[cells] = True
-    rows = np.arange(_SIDE, dtype=np.float32)[:, None]
-    above = np.maximum.accumulate(np.where(mask, rows, -np.inf), 0)
-    below = np.minimum.accumulate(np.where(mask, rows, np.inf)[::-1], 0)[::-1]
-    one_axis = np.ascontiguousarray(np.minimum(rows - above, below - rows).T, np.float32) ** 2
-    nearest = one_axis.copy()
-    for shift in range(1, _SIDE):
-        if shift**2 >= nearest.max():
-            break
-        shifted = one_axis + np.float32(shift**2)
-        np.minimum(nearest[shift:], shifted[:-shift], out=nearest[shift:])
-        np.minimum(nearest[:-shift], shifted[shift:], out=nearest[:-shift])
-    return nearest
+@numba.njit(cache=True, nogil=True)
+def _distance_map(cells: NDArray[np.int32], side: int) -> NDArray[np.float32]:
+    """(side, side) exact squared distances: along one axis, then the lower envelope of parabolas along the other
+    (Felzenszwalb and Huttenlocher, Theory of Computing 2012)."""
+    gaps = np.full((side, side), 4 * side, np.int32)
+    for cell in cells:
+        gaps[cell // side, cell % side] = 0
+    for i in range(1, side):
+        for j in range(side):
+            gaps[i, j] = min(gaps[i, j], gaps[i - 1, j] + 1)
+    for i in range(side - 2, -1, -1):
+        for j in range(side):
+            gaps[i, j] = min(gaps[i, j], gaps[i + 1, j] + 1)
+    result = np.empty((side, side), np.float32)
+    vertex, edge = np.empty(side, np.int64), np.empty(side + 1, np.float64)
+    for i in range(side):
+        last = -1
+        for j in range(side):
+            height, crossing = np.int64(gaps[i, j]) ** 2 + j**2, -np.inf
+            while last >= 0:
+                v = vertex[last]
+                crossing = (height - np.int64(gaps[i, v]) ** 2 - v**2) / (2 * (j - v))
+                if crossing > edge[last]:
+                    break
+                last -= 1
+            last += 1
+            vertex[last], edge[last] = j, crossing
+        k = 0
+        for j in range(side):
+            while k < last and edge[k + 1] < j:
+                k += 1
+            result[i, j] = (j - vertex[k]) ** 2 + np.int64(gaps[i, vertex[k]]) ** 2
+    return result
