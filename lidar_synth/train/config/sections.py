@@ -32,6 +32,7 @@ class Data(Section):
         town: number of scans of the procedural town, if they are the data.
         seed: seed of the town.
         interval: seconds between consecutive scans of the town.
+        motion: whether the town's vehicle moves while the sensor turns.
         path: a dataset's root, a folder or a file; environment variables are expanded.
         layout, split: as for ``open_scans``.
         on_bad: "error", or "skip" to leave out scans that cannot be read.
@@ -45,6 +46,7 @@ class Data(Section):
     town: Count | None = None
     seed: Annotated[int, Field(ge=0)] = 0
     interval: float = 1.0
+    motion: bool = True
     path: str | None = None
     layout: str | None = None
     split: str | None = None
@@ -61,7 +63,7 @@ class Data(Section):
             ConfigError: on a path with a variable that is not set, or what the source refuses.
         """
         if self.town is not None:
-            return Town(self.seed, sensor, self.town, self.interval)
+            return Town(self.seed, sensor, self.town, self.interval, motion=self.motion)
         path = os.path.expandvars(self.path or "")
         if "$" in path:
             raise ConfigError(f"data.path {self.path!r}", "variables that are set", "Or give data.path=FOLDER.")
@@ -69,7 +71,8 @@ class Data(Section):
 
     def describe(self) -> dict[str, Any]:
         """What tells these scans from others, plain values."""
-        keys = {"seed", "interval"} if self.path else {"path", "layout", "split", "on_bad"}
+        keys = {"seed", "interval", "motion"} if self.path else {"path", "layout", "split", "on_bad"}
+        keys |= {"motion"} if self.motion else set()  # caches of earlier versions do not name it
         return self.model_dump(mode="json", exclude=keys | {"cache", "flip", "roll", "latents"})
 
 
