@@ -200,6 +200,7 @@ CODECS = {
     "vqvae": {"latent_channels": 4, "codes": 16, "width": 8, "multipliers": [1, 2], "strides": [[1, 2]], "blocks": 1,
               "attention": False, "groups": 4},
     "autoencoder": {"latent_channels": 4, "widths": [8, 16], "depth": 2, "fine": 4},
+    "surfaces": {"latent_channels": 4, "encoder_widths": [8, 8], "widths": [8, 8], "reaches": [1], "depth": 1},
 }  # fmt: skip
 
 
@@ -300,3 +301,16 @@ def test_a_gpu_is_refused_if_it_is_unavailable_and_in_dataloader_workers(
         generator.scans(0, [0])
     monkeypatch.setattr(Generator, "device", torch.device("cpu"))
     assert generator.scans(0, [0])
+
+
+def test_a_dense_model_generates_half_of_its_columns(tmp_path: Path) -> None:
+    path = write_latent(tmp_path / "dense.safetensors", "surfaces")
+    full, half = load_generator(path), load_generator(path, columns=SENSOR.columns // 2)
+    assert half.sensor.columns == SENSOR.columns // 2 and full.sensor == SENSOR
+    image, coarse = full.range_images(0, [3])[0], half.range_images(0, [3])[0]
+    assert coarse.range.shape == (image.range.shape[0], image.range.shape[1] // 2)
+    assert half.scans(0, [3])[0].sensor == half.sensor
+    with pytest.raises(ConfigError, match="one of"):
+        load_generator(path, columns=10)
+    with pytest.raises(ConfigError, match="one of 1024"):
+        load_generator("town", columns=512)

@@ -205,7 +205,7 @@ def _codes(x: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"resolution": (16, 250)}, {"bits": 4}, {"normalisation": "other"}, {"channels": 6}]
+    "changes", [{"resolution": (16, 250)}, {"bits": 4}, {"normalisation": "other"}, {"channels": 6}, {"reaches": [17]}]
 )
 def test_arguments_that_do_not_fit_are_refused(changes: dict[str, object]) -> None:
     with pytest.raises(ConfigError):

@@ -18,7 +18,6 @@ import numpy as np
 from lidar_synth import Scan, Town, fit_sensor, load_sensor, open_scans
 from lidar_synth.formats.points import read_points
 from lidar_synth.geometry.fitting import SensorFit
-from lidar_synth.town.ego import optics
 
 SENSOR = load_sensor("town")
 FRAMES = (0, 20, 40, 60, 70)
@@ -101,7 +100,7 @@ def main() -> None:
     row("HDL-32E (nuScenes)", lambda: list(open_scans(real / "nuscenes")), np.linspace(10.67, -30.67, 32).tolist())
     for preset in ("town", "os1_128", "hdl32e_nuscenes"):
         sensor = load_sensor(preset)
-        elevations = np.degrees(optics(sensor)[0]).tolist()
+        elevations = np.degrees(sensor.optics()[0]).tolist()
         row(f"town, `{preset}`", lambda p=preset: [Town(0, p, motion=False)[i] for i in range(3)], elevations)  # type: ignore[misc]
 
 

@@ -85,7 +85,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     choose("dtype", job.dtype, DTYPES)
     if job.first + job.count >= 2**63:
         raise ConfigError(f"scans up to index {job.first + job.count}", "less than 2^63")
-    generator = load_generator(job.model)
+    generator = load_generator(job.model, columns=job.columns)
     conditions_for(generator, job.condition, job.condition_layout, job.condition_split)
     fields = _fields(job, generator.fields)
     software = {"lidar_synth": lidar_synth.__version__, "torch": torch.__version__, "numpy": np.__version__,
@@ -99,13 +99,15 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
             "batch": job.batch or BATCH[job.device],
         }
     )
+    # Banks of earlier versions do not name the columns.
+    elsewhere = {"model", "fields", "compression", "layout", *(["columns"] if job.columns is None else [])}
     header = generator.header
     labelled = "generated" if "label" in header.channels else "condition"
     reference = {"kind": generator.condition, "source": job.condition, "layout": job.condition_layout,
                  "split": job.condition_split}  # fmt: skip
     facts = Facts(
-        sensor=header.sensor, fields=fields, model=generator.name, checkpoint=generator.hash,
-        settings=resolved.model_dump(exclude={"model", "fields", "compression", "layout"}),
+        sensor=generator.sensor, fields=fields, model=generator.name, checkpoint=generator.hash,
+        settings=resolved.model_dump(exclude=elsewhere),
         label_policy=labelled if "label" in fields else "none", condition=reference if generator.condition else None,
         licence=str(header.provenance["licence"]), data_licence=str(header.provenance["data_licence"]),
         provenance=header.provenance, software=software, compression=job.compression, layout=job.layout,

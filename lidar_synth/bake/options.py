@@ -40,6 +40,7 @@ class BakeJob(BaseModel):
         None, description="what to store beside the range: reflectance,label,confidence [all that the model generates]"
     )
     batch: Count | None = Field(None, description="scans per batch [1 on a CPU, 16 on a GPU]")
+    columns: Count | None = Field(None, description="columns of the scans, for models that know several [the most]")
     dtype: str = Field("float32", description="data type of the network's computation: float32 | bfloat16")
     device: Literal["cpu", "cuda"] = Field("cpu", description="device of the network: cpu | cuda")
     threads: int = Field(

@@ -109,8 +109,8 @@ def torch_threads(threads: int) -> Iterator[None]:
 
 
 @lru_cache(maxsize=1)
-def _load(model: str, device: str, dtype: str, batch: int) -> Generator:
-    return load_generator(model, device=device, dtype=DTYPES[dtype], batch=batch)
+def _load(model: str, device: str, dtype: str, batch: int, columns: int | None) -> Generator:
+    return load_generator(model, device=device, dtype=DTYPES[dtype], batch=batch, columns=columns)
 
 
 def load_checked(job: BakeJob, facts: Facts) -> Generator:
@@ -120,7 +120,7 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
         ConfigError: if it is another checkpoint, or the device is not available.
         FileError, DataError: if it cannot be read.
     """
-    generator = _load(job.model, job.device, job.dtype, job.batch or BATCH[job.device])
+    generator = _load(job.model, job.device, job.dtype, job.batch or BATCH[job.device], job.columns)
     if generator.hash != facts.checkpoint:
         raise ConfigError(
             f"model {job.model!r}, checkpoint {generator.hash[:12]}",

@@ -33,6 +33,7 @@ def sample(
     device: Annotated[str, typer.Option(help="device of the network: cpu | cuda")] = "cpu",
     dtype: Annotated[str, typer.Option(help="data type of the network's computation: float32 | bfloat16")] = "float32",
     batch: Annotated[int | None, typer.Option(min=1, help="scans per batch; limits the memory")] = None,
+    columns: Annotated[int | None, typer.Option(help="columns of the scans, for models that know several")] = None,
 ) -> None:
     """Generates scans and writes them in any format. Run it again to resume an interrupted run.
 
@@ -57,12 +58,12 @@ def sample(
 
     writer = choose("format", to, WRITERS)(out)
     precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
-    generator = load_generator(model, device=device, dtype=precision, batch=batch)
+    generator = load_generator(model, device=device, dtype=precision, batch=batch, columns=columns)
     given = conditions_for(generator, condition, condition_layout, condition_split)
     settings = {
         "checkpoint": generator.hash, "seed": seed, "steps": steps, "solver": solver, "dtype": dtype, "to": to,
         "condition": condition, "condition_layout": condition_layout, "condition_split": condition_split,
-        "guidance": guidance,
+        "guidance": guidance, **({} if columns is None else {"columns": columns}),
     }  # fmt: skip
     provenance = generator.header.provenance
     trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}

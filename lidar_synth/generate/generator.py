@@ -67,6 +67,7 @@ class Generator:
         hash: the checkpoint's hash; "" for weights without a checkpoint.
         batch: number of scans computed at a time; it affects only memory and speed.
         autoencoder: the autoencoder of a latent model; None for a pixel model.
+        columns: of the scans, where the autoencoder decodes to several widths; None = the checkpoint's.
 
     Example:
         >>> from lidar_synth import Generator, load_generator
@@ -84,11 +85,19 @@ class Generator:
     hash: str = ""
     batch: int = 1
     autoencoder: nn.Module | None = None
+    columns: int | None = None
+
+    def __post_init__(self) -> None:
+        own = self.header.sensor.columns
+        widths = getattr(self.autoencoder, "widths", (own,))
+        if self.columns is not None and self.columns not in widths:
+            raise ConfigError(f"{self.columns} columns of {self.name!r}", f"one of {', '.join(map(str, widths))}")
 
     @property
     def sensor(self) -> Sensor:
         """The sensor that defines the grid of the range images."""
-        return self.header.sensor
+        held = self.header.sensor
+        return held if self.columns in (None, held.columns) else replace(held, columns=self.columns)
 
     @property
     def tensors(self) -> TensorFormat:
@@ -98,7 +107,7 @@ class Generator:
     @property
     def codec(self) -> Codec:
         """The mapping between tensors and the states of the flow."""
-        return make_codec(self.autoencoder, self.tensors, self.sensor.shape)
+        return make_codec(self.autoencoder, self.tensors, self.header.sensor.shape)
 
     @property
     def condition(self) -> str | None:
@@ -222,7 +231,7 @@ class Generator:
             raise ConfigError(f"{self.name!r} without the encoder of its condition", "a checkpoint with all its parts")
         options = self.header.conditioning[self.condition]
         shape = CONDITIONS[self.condition].shape(self.network.encoder)
-        return batch_of(self.condition, given, count, self.sensor, shape, options).to(self.device)
+        return batch_of(self.condition, given, count, self.header.sensor, shape, options).to(self.device)
 
 
 def load_generator(
@@ -232,6 +241,7 @@ def load_generator(
     dtype: torch.dtype = torch.float32,
     compile: bool = False,
     batch: int | None = None,
+    columns: int | None = None,
 ) -> Generator:
     """Load a generator from a shipped model or a checkpoint file.
 
@@ -242,9 +252,11 @@ def load_generator(
         compile: whether to compile the velocity network and the decoder of a latent model with ``torch.compile``; the
             first scan then takes long.
         batch: number of scans computed at a time; by default it depends on the device.
+        columns: of the scans; a dense model generates half of its columns at about half of the decoder's cost.
 
     Raises:
-        ConfigError: on an unknown name, an unavailable device, or CUDA in a DataLoader worker.
+        ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, or a number of columns that
+            the model cannot generate.
         FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
 
     Example:
@@ -266,7 +278,7 @@ def load_generator(
         _compile(checkpoint.networks)
     flow, autoencoder = join(checkpoint.networks), checkpoint.networks.get(CODEC)
     size = batch or BATCH.get(device.type, 1)
-    return Generator(path.stem, flow, checkpoint.header, checkpoint.hash, size, autoencoder)
+    return Generator(path.stem, flow, checkpoint.header, checkpoint.hash, size, autoencoder, columns)
 
 
 def _compile(networks: dict[str, nn.Module]) -> None:

@@ -76,6 +76,8 @@ class SurfaceAutoencoder(Network):
                 f"{channels} channels, {codes} codes in {bits} bits, normalisation {normalisation!r}",
                 f"range, reflectance and enough bits for the codes; one of {', '.join(NORMALISATIONS)}",
             )
+        if any(not 1 <= reach <= pair(resolution)[1] // DOWN[1] for reach in reaches):
+            raise ConfigError(f"reaches {list(reaches)}", f"columns of a latent, from 1 to {resolution[1] // DOWN[1]}")
         self.resolution, self.channels, self.bits, self.codes = pair(resolution), channels, bits, codes
         self.surfaces, self.normalisation = surfaces, NORMALISATIONS[normalisation]
         self.latent_shape = (latent_channels, *reduced(self.resolution, [DOWN], "an image"))
