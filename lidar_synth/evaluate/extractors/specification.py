@@ -1,0 +1,67 @@
+"""What a feature extractor is: its input, its weights and how they are loaded."""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.geometry.scan import Scan
+
+FOLDER_VARIABLE = "LIDAR_SYNTH_METRICS"
+"""Environment variable that names the folder with the weights of all extractors."""
+
+
+class Extractor(Protocol):
+    """Features of a few scans."""
+
+    def __call__(self, scans: Sequence[Scan], generated: bool = False) -> NDArray[np.floating]:
+        """n scans to (n, D) features.
+
+        Args:
+            scans: the scans; each is projected to the grid of the extractor's protocol.
+            generated: whether the points are put on the rays of the range image where the protocol does so for
+                generated scans only (R2Flow's).
+        """
+
+
+class ExtractorSpec(NamedTuple):
+    """A published feature extractor.
+
+    Args:
+        measure: the distance that papers compute on its features: FRD, FRID, FPD, FSVD, FPVD or FLD.
+        input: what its network takes.
+        width: number of features D.
+        archive: name of the published archive or file; the weights are looked for under this name.
+        files: the files in the archive (or next to each other in a folder).
+        source: the project that publishes the weights, and where its page says to fetch them.
+        licence: of the weights.
+        load: ``(path, preparation) -> extractor``; see ``load_extractor``.
+        preparation: how scans become inputs by default: a name of ``PREPARATIONS``.
+        sha256: of the published archive, by its name, where known.
+        git_blob: SHA-1 of the published file as git computes it, where the file is in a git repository.
+    """
+
+    measure: str
+    input: Literal["range image", "cloud"]
+    width: int
+    archive: str
+    files: tuple[str, ...]
+    source: str
+    licence: str
+    load: Callable[[Path, str], Extractor]
+    preparation: str
+    sha256: Mapping[str, str] = {}
+    git_blob: str | None = None
+
+    def paths(self, folder: Path) -> list[Path]:
+        """Where in a folder the weights may lie, the unpacked archive first."""
+        return [folder / f"{self.archive}{suffix}" for suffix in ("", ".tar.gz")]
+
+    def found(self, folder: Path | None = None) -> Path | None:
+        """The path of the weights in a folder, by default the one that LIDAR_SYNTH_METRICS names; None without."""
+        named = os.environ.get(FOLDER_VARIABLE)
+        folder = folder or (Path(named) if named else None)
+        return next((p for p in self.paths(folder) if p.exists()), None) if folder else None
