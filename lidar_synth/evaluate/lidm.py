@@ -23,8 +23,10 @@ HALF = 50
 FINE, COARSE = 0.05, 0.5
 """Size of cells in metres, for the Jensen-Shannon distance and for the minimum matching distance."""
 
-_SENSOR = Sensor("lidm", 1024, float(np.nextafter(np.float32(1), np.float32(2))),
+SENSOR = Sensor("lidm", 1024, float(np.nextafter(np.float32(1), np.float32(2))),
                  float(np.nextafter(np.float32(56), np.float32(0))), rows=64, fov_up=3.0, fov_down=-25.0)  # fmt: skip
+"""The grid of LiDM's range images."""
+
 _SIDE = round(2 * HALF / COARSE)
 _BLOCK = 128  # clouds compared with one another at a time: 20 MB of 200 x 200 maps
 
@@ -38,7 +40,7 @@ class Occupancy(NamedTuple):
 
 def cloud(scan: Scan, generated: bool) -> NDArray[np.float32]:
     """(N, 3) the points of a scan that the protocol compares, metres; the same for real and generated scans."""
-    return unproject(project(scan, _SENSOR, ()), "corner").points
+    return unproject(project(scan, SENSOR, ()), "corner").points
 
 
 def occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:

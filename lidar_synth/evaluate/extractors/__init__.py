@@ -3,9 +3,11 @@
 To add an extractor, write a module with a function ``load`` and add an entry to ``EXTRACTORS``.
 """
 
+from functools import partial
 from pathlib import Path
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.evaluate.extractors import bonnetal, liploc, pointnet, rangevit, voxel_networks
 from lidar_synth.evaluate.extractors.specification import FOLDER_VARIABLE, Extractor, ExtractorSpec
 
 __all__ = ["EXTRACTORS", "FOLDER_VARIABLE", "Extractor", "ExtractorSpec", "load_extractor"]
@@ -21,40 +23,49 @@ _SEGMENTER = ("arch_cfg.yaml", "data_cfg.yaml", "backbone", "segmentation_decode
 _CHECKPOINT = ("config.yaml", "model.ckpt")
 
 
-def _load(path: Path, preparation: str) -> Extractor:
-    raise ConfigError(f"{path}: this extractor cannot be loaded yet")
-
-
 EXTRACTORS: dict[str, ExtractorSpec] = {
     "rangenet53": ExtractorSpec(
-        "FRD", "range image", 4096, "darknet53-1024", _SEGMENTER, _BONNETAL, _SEMANTIC_KITTI, _load, "r2flow"
+        "FRD", "range image", 4096, ("darknet53-1024",), _SEGMENTER, _BONNETAL, _SEMANTIC_KITTI,
+        partial(bonnetal.load, pool="subsample"), "r2flow",
     ),
     "rangenet21": ExtractorSpec(
-        "FRD", "range image", 4096, "darknet21", _SEGMENTER, _BONNETAL, _SEMANTIC_KITTI, _load, "r2flow"
+        "FRD", "range image", 4096, ("darknet21",), _SEGMENTER, _BONNETAL, _SEMANTIC_KITTI,
+        partial(bonnetal.load, pool="subsample"), bonnetal.OWN_GRID,
     ),
     "squeezeseg": ExtractorSpec(
-        "FRD", "range image", 64, "squeezeseg", _SEGMENTER, _BONNETAL, _SEMANTIC_KITTI, _load, "bonnetal"
+        "FRD", "range image", 64, ("squeezeseg",), _SEGMENTER, _BONNETAL, _SEMANTIC_KITTI,
+        partial(bonnetal.load, pool="returns"), bonnetal.OWN_GRID,
     ),
     "lidm_rangenet": ExtractorSpec(
-        "FRID", "range image", 512, "rangenet", ("config.yaml", "backbone", "segmentation_decoder"), _LIDM,
-        _UNSTATED, _load, "lidm",
+        "FRID", "range image", 512, ("rangenet",), ("config.yaml", "backbone", "segmentation_decoder"), _LIDM,
+        _UNSTATED, bonnetal.load_lidm, "lidm",
     ),
     "r2flow_rangenet": ExtractorSpec(
-        "FRID", "range image", 512, "rangenet21_lidm", _SEGMENTER, _R2FLOW, _UNSTATED, _load, "r2flow"
+        "FRID", "range image", 512, ("rangenet21_lidm",), _SEGMENTER, _R2FLOW, _UNSTATED,
+        partial(bonnetal.load, pool="bands", project="R2Flow"), "r2flow",
     ),
     "r3dpa_rangevit": ExtractorSpec(
-        "FRID", "range image", 1024, "rangevit_wo_i", _CHECKPOINT, _R3DPA, _UNSTATED, _load, "r3dpa"
+        "FRID", "range image", 1024, ("rangevit_wo_i",), _CHECKPOINT, _R3DPA, _UNSTATED, rangevit.load, "r3dpa"
+    ),
+    "r3dpa_rangevit_remission": ExtractorSpec(
+        "FRD", "range image", 1024, ("rangevit_w_i",), _CHECKPOINT, _R3DPA, _UNSTATED, rangevit.load, "r3dpa"
     ),
     "sparenet_pointnet": ExtractorSpec(
-        "FPD", "cloud", 1808, "cls_model_39.pth", ("cls_model_39.pth",),
-        "https://github.com/microsoft/SpareNet, Frechet/cls_model_39.pth", "MIT (trained on ShapeNet)", _load,
+        "FPD", "cloud", 1808, ("cls_model_39.pth",), ("cls_model_39.pth",),
+        "https://github.com/microsoft/SpareNet, Frechet/cls_model_39.pth", "MIT; trained on ShapeNet", pointnet.load,
         "r2flow", git_blob="c9e80093a093d5667e9aa705d87d923df50f1c25",
     ),
     "lidm_minkowski": ExtractorSpec(
-        "FSVD", "cloud", 768, "minkowskinet", _CHECKPOINT, _LIDM, _UNSTATED, _load, "lidm"
+        "FSVD", "cloud", 768, ("minkowskinet", "minkowskinet_lidm"), _CHECKPOINT, f"{_LIDM}; or {_R2FLOW}", _UNSTATED,
+        partial(voxel_networks.load, network="minkowski"), "lidm",
     ),
-    "lidm_spvcnn": ExtractorSpec("FPVD", "cloud", 768, "spvcnn", _CHECKPOINT, _LIDM, _UNSTATED, _load, "lidm"),
-    "liploc": ExtractorSpec("FLD", "range image", 384, "liploc", _CHECKPOINT, _R3DPA, _UNSTATED, _load, "r3dpa"),
+    "lidm_spvcnn": ExtractorSpec(
+        "FPVD", "cloud", 768, ("spvcnn", "spvcnn_lidm"), _CHECKPOINT, f"{_LIDM}; or {_R2FLOW}", _UNSTATED,
+        partial(voxel_networks.load, network="spvcnn"), "lidm",
+    ),
+    "liploc": ExtractorSpec(
+        "FLD", "range image", 2048, ("liploc",), _CHECKPOINT, _R3DPA, _UNSTATED, liploc.load, "r3dpa"
+    ),
 }  # fmt: skip
 """Extractors by name."""
 
@@ -79,6 +90,10 @@ def load_extractor(name: str, path: Path | None = None, preparation: str | None 
     spec = EXTRACTORS[name]
     path = path or spec.found()
     if path is None:
-        raise ConfigError(f"no weights of {name}", f"{spec.archive} in the folder that {FOLDER_VARIABLE} names",
+        raise ConfigError(f"no weights of {name}",
+                          f"{' or '.join(spec.archives)} in the folder that {FOLDER_VARIABLE} names",
                           "lidar-synth metrics setup says where to get them.")  # fmt: skip
-    return spec.load(Path(path), preparation or spec.preparation)
+    try:
+        return spec.load(Path(path), preparation or spec.preparation)
+    except (ConfigError, DataError, FileError) as error:
+        raise type(error)(str(error), hint=f"{name} takes {spec.archives[0]} of {spec.source}.") from error

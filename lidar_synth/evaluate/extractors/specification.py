@@ -34,20 +34,20 @@ class ExtractorSpec(NamedTuple):
         measure: the distance that papers compute on its features: FRD, FRID, FPD, FSVD, FPVD or FLD.
         input: what its network takes.
         width: number of features D.
-        archive: name of the published archive or file; the weights are looked for under this name.
-        files: the files in the archive (or next to each other in a folder).
+        archives: names under which the archive, the folder or the file is published, and looked for.
+        files: the files in the archive or the folder.
         source: the project that publishes the weights, and where its page says to fetch them.
         licence: of the weights.
         load: ``(path, preparation) -> extractor``; see ``load_extractor``.
         preparation: how scans become inputs by default: a name of ``PREPARATIONS``.
-        sha256: of the published archive, by its name, where known.
+        sha256: of the published archives, by name, where their publisher or a copy at hand tells.
         git_blob: SHA-1 of the published file as git computes it, where the file is in a git repository.
     """
 
     measure: str
     input: Literal["range image", "cloud"]
     width: int
-    archive: str
+    archives: tuple[str, ...]
     files: tuple[str, ...]
     source: str
     licence: str
@@ -57,8 +57,8 @@ class ExtractorSpec(NamedTuple):
     git_blob: str | None = None
 
     def paths(self, folder: Path) -> list[Path]:
-        """Where in a folder the weights may lie, the unpacked archive first."""
-        return [folder / f"{self.archive}{suffix}" for suffix in ("", ".tar.gz")]
+        """Where in a folder the weights may lie, an unpacked archive first."""
+        return [folder / f"{archive}{suffix}" for archive in self.archives for suffix in ("", ".tar.gz")]
 
     def found(self, folder: Path | None = None) -> Path | None:
         """The path of the weights in a folder, by default the one that LIDAR_SYNTH_METRICS names; None without."""
