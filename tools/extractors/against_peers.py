@@ -1,0 +1,297 @@
+"""Every extractor beside the peers' own code, with the same random weights of the published shapes, on real scans.
+
+    python tools/extractors/against_peers.py CLONES SCANS [--only NAME ...] [--scans N] [--golden FILE]
+
+CLONES holds clones of the peers' repositories: LiDAR-Diffusion, r2flow, R3DPA, SpareNet, lidar-bonnetal. SCANS holds
+``.bin`` files of KITTI-360. Needs torchsparse 1.4.0 (a CPU build will do), timm, torchvision and einops. Prints the
+largest difference of the features relative to the largest feature, and the Fréchet distance between the two halves of
+the scans by our features and code, and by the peers'. ``--golden`` writes the peers' numbers on random points for the
+tests.
+"""
+
+import argparse
+import ast
+import sys
+import tempfile
+from argparse import Namespace
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from numpy.typing import NDArray
+from random_archives import WRITERS, write
+
+from lidar_synth.evaluate.distances import frechet_distance
+from lidar_synth.evaluate.extractors import EXTRACTORS, load_extractor
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import presets
+
+Points = NDArray[np.float32]
+Peer = Callable[[Points], NDArray[np.floating]]
+
+
+def _functions(path: Path, names: Iterable[str], env: dict[str, Any]) -> Namespace:
+    """Some functions of a file whose imports are not needed."""
+    body = [n for n in ast.parse(path.read_text()).body if isinstance(n, ast.FunctionDef) and n.name in names]
+    for function in body:
+        function.decorator_list = []
+    exec(compile(ast.Module(body, []), str(path), "exec"), env)
+    return Namespace(**{n: env[n] for n in names})
+
+
+def _namespace(values: dict[str, Any]) -> Namespace:
+    return Namespace(**{k: _namespace(v) if isinstance(v, dict) else v for k, v in values.items()})
+
+
+class R2Flow:
+    """R2Flow's preprocessing of a real scan, and its extractors."""
+
+    def __init__(self, clones: Path) -> None:
+        sys.path.insert(0, str(clones / "r2flow"))
+        loader = clones / "r2flow" / "r2flow" / "data" / "kitti_360" / "kitti_360.py"
+        self.load = _functions(loader, ("scatter", "load_points_as_images"), {"np": np}).load_points_as_images
+
+    def image(self, points: Points) -> torch.Tensor:
+        """(1, 5, 64, 1024) as its ``evaluate.py`` makes it from the dataset's images."""
+        with tempfile.NamedTemporaryFile(suffix=".bin") as file:
+            points.tofile(file.name)
+            grid = torch.from_numpy(self.load(file.name, scan_unfolding=False, H=64, W=1024)).permute(2, 0, 1)[None]
+        xyz, rflct, depth, mask = grid[:, :3], grid[:, 3:4], grid[:, 4:5], grid[:, 5:6]
+        return torch.cat([depth, xyz, rflct], 1) * mask * torch.logical_and(depth > 0.5, depth < 63.0)
+
+    def rangenet(self, archive: Path, agg_type: str, channels: int) -> Peer:
+        """RangeNet with R2Flow's loader; it reads a tar."""
+        import tarfile
+
+        from r2flow.metrics.models import rangenet
+
+        packed = archive.with_suffix(".tar.gz")
+        with tarfile.open(packed, "w:gz", compresslevel=1) as tar:
+            tar.add(archive, arcname=archive.name)
+        net, prepare = rangenet.build_rangenet(str(packed))
+        pool = rangenet.PostProcess()
+        return lambda p: pool(net(prepare(self.image(p)[:, :channels]), feature="penultimate"), agg_type)[0].numpy()
+
+    def pointnet(self, archive: Path) -> Peer:
+        """PointNet on 65,536 points, those without a return at the origin."""
+        from r2flow.metrics.models import pointnet
+
+        net = pointnet.PointNet1(k=16)
+        net.load_state_dict(torch.load(archive, weights_only=True))
+        net.eval()
+        return lambda p: net(self.image(p)[:, 1:4].flatten(2) / 80.0)[0].numpy()
+
+    def voxels(self, archive: Path, module: str, name: str) -> Peer:
+        """MinkowskiNet or SPVCNN with R2Flow's preprocessing."""
+        import importlib
+
+        from r2flow.metrics.models import utls
+
+        model = getattr(importlib.import_module(f"r2flow.metrics.models.{module}"), name)
+        net = _loaded(model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive)
+        before, after = utls.PreProcess(), utls.PostProcess()
+        return lambda p: after(net(before(self.image(p)[:, 1:4].flatten(2).mT)), "depth")[0].numpy()
+
+
+class LiDM:
+    """LiDM's evaluation of clouds that were projected back from range images."""
+
+    def __init__(self, clones: Path) -> None:
+        sys.path.insert(0, str(clones / "LiDAR-Diffusion"))
+        import lidm.eval.metric_utils as metrics
+        from lidm.utils.lidar_utils import pcd2range, range2pcd
+
+        self.metrics, self.config = metrics, metrics.DATASET_CONFIG["kitti"]
+        self.project, self.unproject = pcd2range, range2pcd
+
+    def cloud(self, points: Points) -> Points:
+        """(N, 3) the returns of the range image."""
+        image = self.project(points[:, :3], **self.config)[0]
+        return self.unproject(image, self.config["fov"], self.config["depth_range"], 1, log_scale=False)[0].astype("f4")
+
+    def rangenet(self, archive: Path) -> Peer:
+        """RangeNet-21 on the cloud, projected again."""
+        from lidm.modules.rangenet.model import Model
+
+        net = Model(yaml.safe_load((archive / "config.yaml").read_text()))
+        net.load_pretrained_weights(str(archive))
+        net.eval()
+
+        def features(points: Points) -> NDArray[np.floating]:
+            image = self.metrics.preprocess_range(self.cloud(points), **self.config)
+            return net(torch.from_numpy(image[None]).float(), return_final_logits=True, agg_type="depth")[0]
+
+        return features
+
+    def voxels(self, archive: Path, module: str) -> Peer:
+        """MinkowskiNet or SPVCNN."""
+        import importlib
+
+        model = importlib.import_module(f"lidm.modules.{module}.model").Model
+        net = _loaded(model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive)
+
+        def features(points: Points) -> NDArray[np.floating]:
+            voxels = self.metrics.pcd2voxel(self.metrics.preprocess_pcd(self.cloud(points), **self.config))
+            out = net(self.metrics.sparse_collate_fn([voxels]), return_final_logits=True)
+            return self.metrics.batch2list(out, "depth", **self.config)[0]
+
+        return features
+
+
+class R3DPA:
+    """R3DPA's range images of real scans, and its extractors of images."""
+
+    def __init__(self, clones: Path) -> None:
+        sys.path.insert(0, str(clones / "R3DPA"))
+        env = {"np": np, "torch": torch}
+        dataset = _functions(clones / "R3DPA" / "dataset_kitti.py", ("pcd2range",), env)
+        config = yaml.safe_load((clones / "R3DPA" / "configs" / "kitti.yaml").read_text())
+        self.arguments = {"size": config["size"], "fov": config["fov"], "depth_range": config["depth_range"]}
+        self.project = dataset.pcd2range
+
+    def image(self, points: Points) -> NDArray[np.float32]:
+        """(2, 64, 1024) range in metres, -1 where there is none, and intensity."""
+        depth, intensity = self.project(points[:, :3], labels=points[:, 3], **self.arguments)
+        return np.stack([np.where(depth > 0, depth, -1), intensity]).astype(np.float32)
+
+    def network(self, archive: Path, name: str) -> Peer:
+        """RangeViT or LIP-Loc."""
+        import importlib
+
+        module = importlib.import_module(f"eval.models.{name}.model")
+        settings = yaml.safe_load((archive / "config.yaml").read_text())
+        model = module.RangeViT if name == "rangevit" else module.Model
+        net = _loaded(model(_namespace(settings)), archive)
+        return lambda p: net([self.image(p)])[0].numpy()
+
+
+def _loaded(net: torch.nn.Module, archive: Path) -> torch.nn.Module:
+    """Load a checkpoint as the peers do, and make sure that it reached every weight before the classifier."""
+    state = torch.load(archive / "model.ckpt", weights_only=True)["state_dict"]
+    missing, unexpected = net.load_state_dict(state, strict=False)
+    assert not unexpected, unexpected
+    assert all(k.startswith(("rangevit.kpclassifier", "image_")) for k in missing), missing
+    return net.eval()
+
+
+def _bonnetal_squeezeseg(clones: Path, archive: Path) -> Peer:
+    """lidar-bonnetal's own network on its own projection; the pooling is this package's."""
+    train = clones / "lidar-bonnetal" / "train"
+    sys.path.insert(0, str(train))
+    from backbones.squeezeseg import Backbone
+    from common.laserscan import LaserScan
+    from tasks.semantic.decoders.squeezeseg import Decoder
+
+    settings = yaml.safe_load((archive / "arch_cfg.yaml").read_text())
+    backbone = Backbone(params=settings["backbone"] | {"OS": 16})
+    decoder = Decoder(params=settings["decoder"], OS=16, feature_depth=backbone.get_last_depth())
+    backbone.load_state_dict(torch.load(archive / "backbone", weights_only=True))
+    decoder.load_state_dict(torch.load(archive / "segmentation_decoder", weights_only=True))
+    backbone.eval(), decoder.eval()
+    sensor = settings["dataset"]["sensor"]
+    mean, std = (torch.tensor(sensor[k])[:, None, None] for k in ("img_means", "img_stds"))
+
+    def features(points: Points) -> NDArray[np.floating]:
+        scan = LaserScan(project=True, H=64, W=2048, fov_up=3, fov_down=-25)
+        scan.set_points(points[:, :3].copy(), points[:, 3].copy())
+        channels = [scan.proj_range[None], scan.proj_xyz.transpose(2, 0, 1), scan.proj_remission[None]]
+        mask = torch.from_numpy(scan.proj_mask).float()
+        image = (torch.from_numpy(np.concatenate(channels)) - mean) / std * mask
+        out = decoder(*backbone(image[None]))[0]
+        return out[:, image.abs().sum(0) > 0].mean(1).numpy()
+
+    return features
+
+
+def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
+    """The peer's code and the preparation for each comparison: {"extractor" or "extractor as preparation": ...}."""
+    r2flow, lidm, r3dpa = R2Flow(clones), LiDM(clones), R3DPA(clones)
+    return {
+        "rangenet53": (lambda a: r2flow.rangenet(a, "subsample", 5), "r2flow"),
+        "r2flow_rangenet": (lambda a: r2flow.rangenet(a, "depth", 4), "r2flow"),
+        "squeezeseg": (lambda a: _bonnetal_squeezeseg(clones, a), "bonnetal"),
+        "sparenet_pointnet": (r2flow.pointnet, "r2flow"),
+        "lidm_rangenet": (lidm.rangenet, "lidm"),
+        "lidm_minkowski": (lambda a: lidm.voxels(a, "minkowskinet"), "lidm"),
+        "lidm_spvcnn": (lambda a: lidm.voxels(a, "spvcnn"), "lidm"),
+        "lidm_minkowski as r2flow": (lambda a: r2flow.voxels(a, "minkowskinet", "MinkowskiNet"), "r2flow"),
+        "lidm_spvcnn as r2flow": (lambda a: r2flow.voxels(a, "spvcnn", "SPVCNN"), "r2flow"),
+        "r3dpa_rangevit": (lambda a: r3dpa.network(a, "rangevit"), "r3dpa"),
+        "r3dpa_rangevit_remission": (lambda a: r3dpa.network(a, "rangevit"), "r3dpa"),
+        "liploc": (lambda a: r3dpa.network(a, "liploc"), "r3dpa"),
+    }
+
+
+def random_points(count: int = 3000) -> Points:
+    """(N, 4) points all around a sensor, for the golden vectors."""
+    rng = np.random.RandomState(5)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, count), np.radians(rng.uniform(-24.5, 2.5, count))
+    directions = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    points = np.stack(directions, -1) * np.exp(rng.uniform(np.log(2), np.log(70), count))[:, None]
+    return np.column_stack([points, rng.random_sample(count)]).astype(np.float32)
+
+
+def compare(clones: Path, files: list[Path], only: list[str]) -> None:
+    """Print the table."""
+    print("| extractor | prepared as | features | largest difference | Frechet distance: ours | the peer's |")
+    print("|---|---|---:|---:|---:|---:|")
+    fid = _functions(clones / "LiDAR-Diffusion" / "lidm" / "eval" / "fid_score.py", ("calculate_frechet_distance",),
+                     {"np": np, "linalg": __import__("scipy.linalg").linalg}).calculate_frechet_distance  # fmt: skip
+    for key, (make, preparation) in peers(clones).items():
+        name = key.split(" ")[0]
+        if only and name not in only:
+            continue
+        with tempfile.TemporaryDirectory() as folder, torch.inference_mode():
+            archive = write(name, Path(folder) / EXTRACTORS[name].archives[0])
+            ours, theirs = load_extractor(name, archive, preparation), make(archive)
+            rows: list[list[NDArray[Any]]] = [[], []]
+            for file in files:
+                points = np.fromfile(file, np.float32).reshape(-1, 4)
+                scan = Scan(points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id=file.stem)
+                rows[0].append(ours([scan])[0])
+                rows[1].append(np.asarray(theirs(points)))
+        a, b = np.stack(rows[0]).astype(np.float64), np.stack(rows[1]).astype(np.float64)
+        error, half = abs(a - b).max() / abs(b).max(), len(files) // 2
+        distances = ["", ""]
+        if half > 1:
+            ends = slice(0, min(64, a.shape[1]))  # the peers' code inverts a matrix: the first 64 features
+            other = fid(b[:half, ends].mean(0), np.cov(b[:half, ends], rowvar=False), b[half:, ends].mean(0),
+                        np.cov(b[half:, ends], rowvar=False))  # fmt: skip
+            distances = [f"{frechet_distance(a[:half, ends], a[half:, ends]):.6g}", f"{other:.6g}"]
+        print(f"| {name} | {preparation} | {a.shape[1]} | {error:.1e} | {distances[0]} | {distances[1]} |", flush=True)
+
+
+def golden(clones: Path, path: Path) -> None:
+    """Write the peers' features of random points."""
+    from safetensors.numpy import save_file
+
+    points = random_points()
+    found: dict[str, Any] = {"points": points}
+    for key, (make, _) in peers(clones).items():
+        with tempfile.TemporaryDirectory() as folder, torch.inference_mode():
+            name = key.split(" ")[0]
+            archive = write(name, Path(folder) / EXTRACTORS[name].archives[0])
+            found[key] = np.ascontiguousarray(make(archive)(points), np.float32)
+    save_file(found, path)
+
+
+def main() -> None:
+    """Parse the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clones", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--only", nargs="*", default=[], choices=list(WRITERS))
+    parser.add_argument("--scans", type=int, default=4)
+    parser.add_argument("--golden", type=Path)
+    given = parser.parse_args()
+    if given.golden:
+        golden(given.clones, given.golden)
+    else:
+        compare(given.clones, sorted(given.folder.rglob("*.bin"))[: given.scans], given.only)
+
+
+if __name__ == "__main__":
+    main()
