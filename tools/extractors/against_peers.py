@@ -16,7 +16,7 @@ import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,11 +26,18 @@ from random_archives import WRITERS, write
 
 from lidar_synth.evaluate.distances import frechet_distance
 from lidar_synth.evaluate.extractors import EXTRACTORS, load_extractor
+from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import presets
 
 Points = NDArray[np.float32]
-Peer = Callable[[Points], NDArray[np.floating]]
+
+
+class Peer(NamedTuple):
+    """A peer's extractor: features of points (N, 4), and of an input of its network (1, C, H, W) if it takes images."""
+
+    features: Callable[[Points], NDArray[np.floating]]
+    of_image: Callable[[torch.Tensor], NDArray[np.floating]] | None = None
 
 
 def _functions(path: Path, names: Iterable[str], env: dict[str, Any]) -> Namespace:
@@ -73,7 +80,11 @@ class R2Flow:
             tar.add(archive, arcname=archive.name)
         net, prepare = rangenet.build_rangenet(str(packed))
         pool = rangenet.PostProcess()
-        return lambda p: pool(net(prepare(self.image(p)[:, :channels]), feature="penultimate"), agg_type)[0].numpy()
+
+        def of_image(image: torch.Tensor) -> NDArray[np.floating]:
+            return pool(net(image, feature="penultimate"), agg_type)[0].numpy()
+
+        return Peer(lambda p: of_image(prepare(self.image(p)[:, :channels])), of_image)
 
     def pointnet(self, archive: Path) -> Peer:
         """PointNet on 65,536 points, those without a return at the origin."""
@@ -82,7 +93,7 @@ class R2Flow:
         net = pointnet.PointNet1(k=16)
         net.load_state_dict(torch.load(archive, weights_only=True))
         net.eval()
-        return lambda p: net(self.image(p)[:, 1:4].flatten(2) / 80.0)[0].numpy()
+        return Peer(lambda p: net(self.image(p)[:, 1:4].flatten(2) / 80.0)[0].numpy())
 
     def voxels(self, archive: Path, module: str, name: str) -> Peer:
         """MinkowskiNet or SPVCNN with R2Flow's preprocessing."""
@@ -92,8 +103,16 @@ class R2Flow:
 
         model = getattr(importlib.import_module(f"r2flow.metrics.models.{module}"), name)
         net = _loaded(model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive)
+        utls.unique = _unique
         before, after = utls.PreProcess(), utls.PostProcess()
-        return lambda p: after(net(before(self.image(p)[:, 1:4].flatten(2).mT)), "depth")[0].numpy()
+        return Peer(lambda p: after(net(before(self.image(p)[:, 1:4].flatten(2).mT)), "depth")[0].numpy())
+
+
+def _unique(x: torch.Tensor, dim: int = 0) -> tuple[torch.Tensor, ...]:
+    """R2Flow's ``unique``, which finds the first of equal values by float32 keys that tie, with a stable sort."""
+    values, inverse, counts = torch.unique(x, dim=dim, sorted=True, return_inverse=True, return_counts=True)
+    starts = torch.cat((counts.new_zeros(1), counts.cumsum(0)))[:-1]
+    return values, inverse, counts, inverse.argsort(stable=True)[starts].sort().values
 
 
 class LiDM:
@@ -112,6 +131,10 @@ class LiDM:
         image = self.project(points[:, :3], **self.config)[0]
         return self.unproject(image, self.config["fov"], self.config["depth_range"], 1, log_scale=False)[0].astype("f4")
 
+    def image(self, points: Points) -> NDArray[np.floating]:
+        """(4, 64, 1024) the cloud, projected again."""
+        return self.metrics.preprocess_range(self.cloud(points), **self.config)
+
     def rangenet(self, archive: Path) -> Peer:
         """RangeNet-21 on the cloud, projected again."""
         from lidm.modules.rangenet.model import Model
@@ -120,11 +143,10 @@ class LiDM:
         net.load_pretrained_weights(str(archive))
         net.eval()
 
-        def features(points: Points) -> NDArray[np.floating]:
-            image = self.metrics.preprocess_range(self.cloud(points), **self.config)
-            return net(torch.from_numpy(image[None]).float(), return_final_logits=True, agg_type="depth")[0]
+        def of_image(image: torch.Tensor) -> NDArray[np.floating]:
+            return net(image, return_final_logits=True, agg_type="depth")[0]
 
-        return features
+        return Peer(lambda p: of_image(torch.from_numpy(self.image(p)[None]).float()), of_image)
 
     def voxels(self, archive: Path, module: str) -> Peer:
         """MinkowskiNet or SPVCNN."""
@@ -138,7 +160,7 @@ class LiDM:
             out = net(self.metrics.sparse_collate_fn([voxels]), return_final_logits=True)
             return self.metrics.batch2list(out, "depth", **self.config)[0]
 
-        return features
+        return Peer(features)
 
 
 class R3DPA:
@@ -165,7 +187,12 @@ class R3DPA:
         settings = yaml.safe_load((archive / "config.yaml").read_text())
         model = module.RangeViT if name == "rangevit" else module.Model
         net = _loaded(model(_namespace(settings)), archive)
-        return lambda p: net([self.image(p)])[0].numpy()
+
+        def of_image(image: torch.Tensor) -> NDArray[np.floating]:
+            inputs = ((image - net.image_mean) / net.image_std)[:, : settings["in_channels"]]
+            return net.rangevit.forward_2d_features(inputs)[0].unflatten(1, (8, -1)).mean((2, 3)).flatten().numpy()
+
+        return Peer(lambda p: net([self.image(p)])[0].numpy(), of_image if name == "rangevit" else None)
 
 
 def _loaded(net: torch.nn.Module, archive: Path) -> torch.nn.Module:
@@ -187,23 +214,25 @@ def _bonnetal_squeezeseg(clones: Path, archive: Path) -> Peer:
 
     settings = yaml.safe_load((archive / "arch_cfg.yaml").read_text())
     backbone = Backbone(params=settings["backbone"] | {"OS": 16})
-    decoder = Decoder(params=settings["decoder"], OS=16, feature_depth=backbone.get_last_depth())
+    _, skips = backbone(torch.zeros(1, 5, 64, 64))
+    decoder = Decoder(settings["decoder"], skips, OS=16, feature_depth=backbone.get_last_depth())
     backbone.load_state_dict(torch.load(archive / "backbone", weights_only=True))
     decoder.load_state_dict(torch.load(archive / "segmentation_decoder", weights_only=True))
     backbone.eval(), decoder.eval()
     sensor = settings["dataset"]["sensor"]
     mean, std = (torch.tensor(sensor[k])[:, None, None] for k in ("img_means", "img_stds"))
 
+    def of_image(image: torch.Tensor) -> NDArray[np.floating]:
+        return decoder(*backbone(image))[0][:, image[0].abs().sum(0) > 0].mean(1).numpy()
+
     def features(points: Points) -> NDArray[np.floating]:
         scan = LaserScan(project=True, H=64, W=2048, fov_up=3, fov_down=-25)
         scan.set_points(points[:, :3].copy(), points[:, 3].copy())
         channels = [scan.proj_range[None], scan.proj_xyz.transpose(2, 0, 1), scan.proj_remission[None]]
         mask = torch.from_numpy(scan.proj_mask).float()
-        image = (torch.from_numpy(np.concatenate(channels)) - mean) / std * mask
-        out = decoder(*backbone(image[None]))[0]
-        return out[:, image.abs().sum(0) > 0].mean(1).numpy()
+        return of_image(((torch.from_numpy(np.concatenate(channels)) - mean) / std * mask)[None])
 
-    return features
+    return Peer(features, of_image)
 
 
 def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
@@ -234,6 +263,22 @@ def random_points(count: int = 3000) -> Points:
     return np.column_stack([points, rng.random_sample(count)]).astype(np.float32)
 
 
+def random_image(channels: int) -> torch.Tensor:
+    """(1, C, 64, 64) normalised image with empty cells, for the golden vectors."""
+    rng = np.random.RandomState(6)
+    image = rng.uniform(-1, 1, (channels, 64, 64)) * (rng.random_sample((64, 64)) < 0.8)
+    return torch.from_numpy(image.astype(np.float32))[None]
+
+
+def read(path: Path) -> Points:
+    """(N, 4) the points of a scan, without those that lie in one cell at one range with an earlier point: which of
+    them an image shows depends on the sort in the peers' code."""
+    points = np.fromfile(path, np.float32).reshape(-1, 4)
+    cells = locate(points[:, :3].copy(), presets()["hdl64e_kitti360"])
+    _, first = np.unique(np.column_stack([cells.cell, cells.range.view(np.int32)]), axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
 def compare(clones: Path, files: list[Path], only: list[str]) -> None:
     """Print the table."""
     print("| extractor | prepared as | features | largest difference | Frechet distance: ours | the peer's |")
@@ -249,10 +294,10 @@ def compare(clones: Path, files: list[Path], only: list[str]) -> None:
             ours, theirs = load_extractor(name, archive, preparation), make(archive)
             rows: list[list[NDArray[Any]]] = [[], []]
             for file in files:
-                points = np.fromfile(file, np.float32).reshape(-1, 4)
+                points = read(file)
                 scan = Scan(points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id=file.stem)
                 rows[0].append(ours([scan])[0])
-                rows[1].append(np.asarray(theirs(points)))
+                rows[1].append(np.asarray(theirs.features(points)))
         a, b = np.stack(rows[0]).astype(np.float64), np.stack(rows[1]).astype(np.float64)
         error, half = abs(a - b).max() / abs(b).max(), len(files) // 2
         distances = ["", ""]
@@ -265,16 +310,26 @@ def compare(clones: Path, files: list[Path], only: list[str]) -> None:
 
 
 def golden(clones: Path, path: Path) -> None:
-    """Write the peers' features of random points."""
+    """Write what the peers' networks make of random images or points, and their images of the points."""
     from safetensors.numpy import save_file
 
     points = random_points()
     found: dict[str, Any] = {"points": points}
+    makers = {"r2flow": R2Flow(clones), "lidm": LiDM(clones)}
+    for name, maker in makers.items():
+        image = np.asarray(maker.image(points), np.float32).reshape(-1, 64, 1024)
+        filled = image[0] > 0
+        found[f"{name} image"] = np.ascontiguousarray(image[:, filled])
+        found[f"{name} cells"] = np.flatnonzero(filled).astype(np.int32)
     for key, (make, _) in peers(clones).items():
+        name = key.split(" ")[0]
+        if name == "liploc":
+            continue  # a network of timm, which the tests do not have
         with tempfile.TemporaryDirectory() as folder, torch.inference_mode():
-            name = key.split(" ")[0]
-            archive = write(name, Path(folder) / EXTRACTORS[name].archives[0])
-            found[key] = np.ascontiguousarray(make(archive)(points), np.float32)
+            peer = make(write(name, Path(folder) / EXTRACTORS[name].archives[0]))
+            channels = 4 if name in ("lidm_rangenet", "r2flow_rangenet") else 5
+            features = peer.of_image(random_image(channels)) if peer.of_image else peer.features(points)
+            found[key] = np.ascontiguousarray(features, np.float32)
     save_file(found, path)
 
 

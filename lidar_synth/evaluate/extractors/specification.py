@@ -1,7 +1,8 @@
 """What a feature extractor is: its input, its weights and how they are loaded."""
 
+import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
@@ -40,8 +41,8 @@ class ExtractorSpec(NamedTuple):
         licence: of the weights.
         load: ``(path, preparation) -> extractor``; see ``load_extractor``.
         preparation: how scans become inputs by default: a name of ``PREPARATIONS``.
-        sha256: of the published archives, by name, where their publisher or a copy at hand tells.
-        git_blob: SHA-1 of the published file as git computes it, where the file is in a git repository.
+        git_blob: hash of the published file, as git computes it, where the file lies in a git repository. The other
+            projects state no hash.
     """
 
     measure: str
@@ -53,7 +54,6 @@ class ExtractorSpec(NamedTuple):
     licence: str
     load: Callable[[Path, str], Extractor]
     preparation: str
-    sha256: Mapping[str, str] = {}
     git_blob: str | None = None
 
     def paths(self, folder: Path) -> list[Path]:
@@ -65,3 +65,8 @@ class ExtractorSpec(NamedTuple):
         named = os.environ.get(FOLDER_VARIABLE)
         folder = folder or (Path(named) if named else None)
         return next((p for p in self.paths(folder) if p.exists()), None) if folder else None
+
+    def is_published(self, path: Path) -> bool:
+        """Whether a file has the hash of the published one."""
+        content = path.read_bytes()
+        return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest() == self.git_blob
