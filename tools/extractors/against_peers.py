@@ -301,8 +301,8 @@ def compare(clones: Path, files: list[Path], only: list[str]) -> None:
         a, b = np.stack(rows[0]).astype(np.float64), np.stack(rows[1]).astype(np.float64)
         error, half = abs(a - b).max() / abs(b).max(), len(files) // 2
         distances = ["", ""]
-        if half > 1:
-            ends = slice(0, min(64, a.shape[1]))  # the peers' code inverts a matrix: the first 64 features
+        if half > 2:
+            ends = slice(0, half - 1)  # the peers' code needs covariances of full rank: as many features as scans allow
             other = fid(b[:half, ends].mean(0), np.cov(b[:half, ends], rowvar=False), b[half:, ends].mean(0),
                         np.cov(b[half:, ends], rowvar=False))  # fmt: skip
             distances = [f"{frechet_distance(a[:half, ends], a[half:, ends]):.6g}", f"{other:.6g}"]

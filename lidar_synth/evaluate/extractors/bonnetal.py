@@ -159,7 +159,7 @@ def load(path: Path, prepared: str, pool: str, project: str = "lidar-bonnetal") 
 
     def describe(scan: Scan, generated: bool) -> Tensor:
         image = inputs.image(scan, generated) if inputs else nearest_points(scan, segmenter.sensor)[0]
-        some(np.flatnonzero(image[0] > 0))
+        some(image[0][image[0] > 0])
         normalised = segmenter.normalise(image)
         return POOLS[pool](segmenter.decode(normalised), normalised)
 

@@ -51,7 +51,8 @@ def _r2flow_image(scan: Scan, generated: bool) -> NDArray[np.float32]:
     image, _ = nearest_points(scan, sensor)
     if generated:
         image[1:4] = image[0] * np.moveaxis(sensor.ray_directions("corner"), -1, 0)
-    return image * ((image[0] > 0.5) & (image[0] < 63))
+    image[:, ~((image[0] > 0.5) & (image[0] < 63))] = 0
+    return image
 
 
 def _r2flow_cloud(scan: Scan, generated: bool) -> NDArray[np.float32]:
@@ -64,7 +65,8 @@ def _lidm_cloud(scan: Scan, generated: bool) -> NDArray[np.float32]:
     image = project(scan, SENSOR, ())
     xyz = (_corner_rays()[image.mask] * image.range[image.mask, None]).astype(np.float32)
     distance = np.linalg.norm(xyz, axis=1)
-    return xyz[(distance > NEAREST) & (distance < FURTHEST)]
+    kept: NDArray[np.float32] = xyz[(distance > NEAREST) & (distance < FURTHEST)]
+    return kept
 
 
 def _lidm_image(scan: Scan, generated: bool) -> NDArray[np.float32]:

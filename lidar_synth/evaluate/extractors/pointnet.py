@@ -36,7 +36,7 @@ class _Points(nn.Module):
 
     def pooled(self, points: Tensor) -> Tensor:
         """(1, 3, N) to (1, widths[2]): the largest value of each feature over all points, before the last ReLU."""
-        best = [self._features(part).amax(2) for part in points.split(BLOCK, 2)]
+        best = [self._features(part).amax(2) for part in torch.split(points, BLOCK, 2)]
         return torch.stack(best).amax(0)
 
     def _features(self, x: Tensor) -> Tensor:
@@ -58,7 +58,8 @@ class _Transform(_Points):
         """(1, 3, N) to (1, 3, 3)."""
         x = F.relu(self.pooled(points))
         x = F.relu(self.bn5(self.fc2(F.relu(self.bn4(self.fc1(x))))))
-        return self.fc3(x).view(-1, 3, 3) + torch.eye(3)
+        matrix: Tensor = self.fc3(x).view(-1, 3, 3) + torch.eye(3)
+        return matrix
 
 
 class _Encoder(_Points):

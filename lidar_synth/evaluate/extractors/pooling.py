@@ -25,7 +25,7 @@ def _chosen(count: int) -> Tensor:
 
 def mean_over_bands(features: Tensor) -> Tensor:
     """(C, H, W), H a multiple of 16, to (16 C,): means over 16 bands of rows, channels first (LiDM's FRID)."""
-    return features.unflatten(1, (BANDS, -1)).mean((2, 3)).flatten()
+    return features.reshape(len(features), BANDS, -1).mean(2).flatten()
 
 
 def mean_over_rings(features: Tensor, voxels: Tensor, size: float, furthest: float) -> Tensor:

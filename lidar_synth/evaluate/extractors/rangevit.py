@@ -41,7 +41,8 @@ class _Context(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         own = F.leaky_relu(self.conv1(x))
         y = self.bn1(F.leaky_relu(self.conv2(own)))
-        return own + self.bn2(F.leaky_relu(self.conv3(y)))
+        z: Tensor = own + self.bn2(F.leaky_relu(self.conv3(y)))
+        return z
 
 
 class _Wide(nn.Module):
@@ -58,7 +59,8 @@ class _Wide(nn.Module):
         second = self.bn2(F.leaky_relu(self.conv3(first)))
         third = self.bn3(F.leaky_relu(self.conv4(second)))
         together = F.leaky_relu(self.conv5(torch.cat([first, second, third], 1)))
-        return F.leaky_relu(self.conv1(x)) + self.bn4(together)
+        y: Tensor = F.leaky_relu(self.conv1(x)) + self.bn4(together)
+        return y
 
 
 class _Stem(nn.Module):
@@ -127,7 +129,7 @@ class _Encoder(nn.Module):
     def _positions(self, grid: torch.Size) -> Tensor:
         if grid.numel() == self._grid[0] * self._grid[1]:
             return self.pos_embed
-        maps = self.pos_embed[:, 1:].transpose(1, 2).unflatten(2, self._grid)
+        maps = self.pos_embed[:, 1:].transpose(1, 2).reshape(1, -1, *self._grid)
         resized = F.interpolate(maps, size=tuple(grid), mode="bilinear").flatten(2).transpose(1, 2)
         return torch.cat([self.pos_embed[:, :1], resized], 1)
 
@@ -162,6 +164,9 @@ class RangeViT(nn.Module):
         base, hidden: channels of the convolutional stem.
         decoded: channels of the feature map.
     """
+
+    image_mean: Tensor
+    image_std: Tensor
 
     def __init__(
         self, channels: int, size: tuple[int, int], transformer: tuple[int, int, int] = (384, 12, 6), base: int = 32,

@@ -101,7 +101,7 @@ def pyramid(voxels: Tensor, depth: int) -> list[Level]:
     levels = [Level(voxels, neighbours(voxels))]
     for _ in range(depth - 1):
         fine = levels[-1].voxels
-        packed, parent = keys(fine >> 1).unique(return_inverse=True)
+        packed, parent = torch.unique(keys(fine >> 1), return_inverse=True)
         coarse = voxels_of(packed)
         x, y, z = (fine & 1).unbind(1)
         offset = 4 * x + 2 * y + z

@@ -144,7 +144,8 @@ class SPVCNN(MinkowskiNet):
                 branch = self.point_transforms[i // 2](branch) + interpolate(x, level.voxels, points, size)
                 x = mean_in(branch, _containing(levels, 4 - i), len(level.voxels))
             x = self._up(i, x, maps[3 - i], levels)
-        return x + self.point_transforms[2](branch)
+        last: Tensor = x + self.point_transforms[2](branch)
+        return last
 
 
 def _containing(levels: list[Level], depth: int) -> Tensor:
