@@ -30,7 +30,7 @@ RANGEVIT = {
 
 
 def fill(module: nn.Module, seed: int) -> dict[str, torch.Tensor]:
-    """Random weights for a module, of a size that keeps activations near 1; its state dictionary."""
+    """Random weights for a module; its state dictionary."""
     rng = np.random.RandomState(seed)
     state = module.state_dict()
     for name in sorted(state):
