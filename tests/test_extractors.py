@@ -309,6 +309,9 @@ def test_setup_says_what_to_fetch_and_what_is_there(
     assert "its hash differs" in found["sparenet_pointnet"]["state"]
     assert "is not usable" in found["rangenet53"]["state"] and "truncated" in found["rangenet53"]["state"]
     assert found["lidm_spvcnn"]["state"] == "missing"
+    (tmp_path / "hello").write_text("hello\n")  # what `git hash-object` prints
+    known = EXTRACTORS["sparenet_pointnet"]._replace(git_blob="ce013625030ba8dba906f756967f9e9ca394464a")
+    assert known.is_published(tmp_path / "hello")
     assert all("http" in one["from"] and one["licence"] for one in found.values())
     monkeypatch.delenv("LIDAR_SYNTH_METRICS")
     text = CliRunner().invoke(app, ["metrics", "setup"]).stdout
