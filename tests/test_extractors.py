@@ -23,6 +23,7 @@ from lidar_synth.evaluate.extractors.bonnetal import POOLS, load_lidm, read_segm
 from lidar_synth.evaluate.extractors.inputs import PREPARATIONS
 from lidar_synth.evaluate.extractors.liploc import picture
 from lidar_synth.evaluate.extractors.rangevit import build
+from lidar_synth.evaluate.street_judge import load_archive
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import presets
 
@@ -276,6 +277,12 @@ def test_what_cannot_be_extracted_is_refused(
         extract([])
     with pytest.raises(DataError, match="'random'.*no return in the range"):
         extract([scan[np.linalg.norm(scan.points, axis=1) > 60]])
+
+
+@pytest.mark.slow
+def test_a_network_without_remission_is_no_judge(archives: Callable[[str], Path]) -> None:
+    with pytest.raises(ConfigError, match="without remission"):
+        load_archive(archives("r2flow_rangenet"))
 
 
 def test_an_extractor_without_its_library_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -111,7 +111,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], type[LidarSynthError], str]] =
     ),
     "no sensor": (lambda a: change(a, lambda s: s["dataset"].pop("sensor")), ConfigError, "sensor"),
     "other input": (
-        lambda a: change(a, lambda s: s["backbone"]["input_depth"].update(remission=False)), ConfigError, "remission",
+        lambda a: change(a, lambda s: s["backbone"]["input_depth"].update(remission=False)), DataError, "architecture",
     ),
     "text as a mean": (
         lambda a: change(a, lambda s: s["dataset"]["sensor"].update(img_means=["x"] * 5)), ConfigError, "arch_cfg",

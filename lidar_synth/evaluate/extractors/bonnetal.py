@@ -42,6 +42,9 @@ NETWORKS: dict[str, Callable[[int, int, Mapping[str, Any]], nn.Module]] = {
 }
 """Networks by the name of backbone and decoder in ``arch_cfg.yaml``: (channels, classes, settings) -> network."""
 
+HALVINGS = {"squeezeseg": 16, "darknet": 32}
+"""By what each network divides the number of columns."""
+
 
 @dataclass(frozen=True)
 class Segmenter:
@@ -93,9 +96,9 @@ def read_segmenter(archive: Archive, columns: int | None = None) -> Segmenter:
         mean, deviation = (
             torch.tensor(sensor[key], dtype=torch.float32)[: len(channels)] for key in ("img_means", "img_stds")
         )
-        grid = _grid(sensor, columns)
         if names[0] != names[1] or names[0] not in NETWORKS or names[2] != "segmentation":
             raise ConfigError(f"backbone, decoder and head {names}", f"one of {', '.join(NETWORKS)}")
+        grid = _grid(sensor, columns, HALVINGS[names[0]])
         network = NETWORKS[names[0]](len(channels), _classes(states["segmentation_head"]), backbone)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, ConfigError):
@@ -122,12 +125,12 @@ def _classes(head: Any) -> int:
     return len(bias) if isinstance(bias, Tensor) and bias.ndim == 1 else 20
 
 
-def _grid(sensor: Mapping[str, Any], columns: int | None) -> Sensor:
+def _grid(sensor: Mapping[str, Any], columns: int | None, factor: int) -> Sensor:
     """The grid that the archive's settings describe, with another width on request."""
     size = sensor["img_prop"]
     width = columns or size["width"]
-    if width % 32:
-        raise ConfigError(f"{width} columns", "a multiple of 32")
+    if width % factor:
+        raise ConfigError(f"{width} columns", f"a multiple of {factor}")
     name, up, down = f"{sensor['name']}/{width}", float(sensor["fov_up"]), float(sensor["fov_down"])
     return Sensor(name, width, range_min=0.0, range_max=1000.0, rows=size["height"], fov_up=up, fov_down=down)
 
