@@ -130,7 +130,7 @@ def convolve(features: Tensor, kernel: Tensor, pairs: Pairs, count: int) -> Tens
         part = slice(start, start + size)
         start += size
         if size and not (own and k == _CENTRE):
-            total.index_add_(0, pairs.target[part], features[pairs.source[part]] @ kernel[k])
+            total.index_add_(0, pairs.target[part], features.index_select(0, pairs.source[part]) @ kernel[k])
     return total
 
 
