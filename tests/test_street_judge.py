@@ -16,9 +16,10 @@ from lidar_synth import open_scans
 from lidar_synth.cli import app
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
+from lidar_synth.evaluate.extractors.bonnetal import PARTS
+from lidar_synth.evaluate.extractors.squeezeseg import SqueezeSeg
 from lidar_synth.evaluate.recognition import Recognition, as_text, compare, recognise
-from lidar_synth.evaluate.squeezeseg import SqueezeSeg
-from lidar_synth.evaluate.street_judge import PARTS, StreetJudge, load_archive
+from lidar_synth.evaluate.street_judge import StreetJudge, load_archive
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import presets
 
@@ -60,8 +61,8 @@ def test_the_input_of_the_network_is_the_nearest_point_of_each_cell(archive: Pat
     judge = load_archive(archive, columns=1024)
     scan = random_scan(presets()["town"], 4000, seed=1)
     image, label = judge.image(scan)
-    expected = project(scan, judge.sensor, ["reflectance", "label"])
-    values = image * judge.deviation[:, None, None] + judge.mean[:, None, None]
+    expected = project(scan, judge.segmenter.sensor, ["reflectance", "label"])
+    values = image * judge.segmenter.deviation[:, None, None] + judge.segmenter.mean[:, None, None]
     filled = expected.mask
     assert image.shape == (5, 64, 1024) and (image[:, ~filled] == 0).all()
     np.testing.assert_allclose(values[0, filled], expected.range[filled], rtol=1e-4)
@@ -75,8 +76,10 @@ def test_predictions_are_counted_by_train_id_and_never_as_unlabelled(archive: Pa
     scan = random_scan(presets()["town"], 2000, seed=2)
     for chosen in (0, 9, 17):  # the head predicts one class everywhere: unlabelled, road, terrain
         with torch.no_grad():
-            judge.network.segmentation_head[1].weight.zero_()
-            judge.network.segmentation_head[1].bias.copy_(torch.arange(20) / 100 + 9 * (torch.arange(20) == chosen))
+            judge.segmenter.network.segmentation_head[1].weight.zero_()
+            judge.segmenter.network.segmentation_head[1].bias.copy_(
+                torch.arange(20) / 100 + 9 * (torch.arange(20) == chosen)
+            )
         table = judge.confusion([scan])
         _, label = judge.image(scan)
         column = int(SEMANTIC_KITTI.decode(np.array([RAW[chosen or 19]]))[0])
@@ -102,13 +105,13 @@ FAULTS: dict[str, tuple[Callable[[Path], object], type[LidarSynthError], str]] =
     "other weights": (
         lambda a: torch.save(torch.nn.Linear(2, 2).state_dict(), a / "segmentation_head"), DataError, "architecture",
     ),
-    "a list": (lambda a: torch.save([1], a / "segmentation_head"), DataError, "architecture"),
+    "a list": (lambda a: torch.save([1], a / "segmentation_head"), DataError, "segmentation_head: its weights"),
     "another network": (
         lambda a: change(a, lambda s: s["backbone"].update(name="darknet")), ConfigError, "darknet.*squeezeseg",
     ),
     "no sensor": (lambda a: change(a, lambda s: s["dataset"].pop("sensor")), ConfigError, "sensor"),
     "other input": (
-        lambda a: change(a, lambda s: s["backbone"]["input_depth"].update(remission=False)), ConfigError, "remission",
+        lambda a: change(a, lambda s: s["backbone"]["input_depth"].update(remission=False)), DataError, "architecture",
     ),
     "text as a mean": (
         lambda a: change(a, lambda s: s["dataset"]["sensor"].update(img_means=["x"] * 5)), ConfigError, "arch_cfg",

@@ -25,11 +25,11 @@ from lidar_synth.viz.images import picture
 
 def strips(scan: Scan, judge: StreetJudge) -> NDArray[np.uint8]:
     """(4 H, W / 2, 3) the front half of a scan: range, reflectance, labels, predicted classes."""
-    image = project(scan, judge.sensor, ("reflectance", "label"))
+    image = project(scan, judge.segmenter.sensor, ("reflectance", "label"))
     predicted = judge.predict(judge.image(scan)[0])
     found = replace(image, channels={"label": np.where(image.mask, predicted, IGNORE).astype(np.uint8)})
     parts = [picture(image, channel) for channel in ("range", "reflectance", "label")] + [picture(found, "label")]
-    quarter = judge.sensor.columns // 4
+    quarter = judge.segmenter.sensor.columns // 4
     return np.concatenate([part[:, quarter:-quarter] for part in parts])
 
 

@@ -120,7 +120,7 @@ def row(name: str, scans: list[Scan], judge: StreetJudge, real: NDArray[np.float
 def paste(into: Image, source: Image, name: str, judge: StreetJudge) -> tuple[Image, NDArray[np.bool_]]:
     """The returns of one class from ``source`` where they are nearer than those of ``into``, and these cells (H, W)."""
     (x, label), (other, labels) = into, source
-    distance = [image[0] * judge.deviation[0] + judge.mean[0] for image in (x, other)]
+    distance = [image[0] * judge.segmenter.deviation[0] + judge.segmenter.mean[0] for image in (x, other)]
     empty = (x == 0).all(0)
     taken = torch.from_numpy(labels == TRAIN_ID[name]) & (empty | (distance[1] < distance[0]))
     mask = taken.numpy()

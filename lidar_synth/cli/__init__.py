@@ -18,6 +18,7 @@ from lidar_synth.cli.doctor import doctor
 from lidar_synth.cli.evaluate import evaluate
 from lidar_synth.cli.import_ import import_
 from lidar_synth.cli.label import label
+from lidar_synth.cli.metrics import metrics
 from lidar_synth.cli.recipes import recipes
 from lidar_synth.cli.sample import sample
 from lidar_synth.cli.sensor import sensor
@@ -72,6 +73,7 @@ for _name, _command in COMMANDS.items():
 app.add_typer(bank)
 app.add_typer(sensor)
 app.add_typer(skin)
+app.add_typer(metrics)
 
 
 def main() -> None:

@@ -88,7 +88,9 @@ def command_line() -> str:
     """The help of every command, in the order of the program's own help."""
     group = get_command(app)
     assert isinstance(group, TyperGroup)
-    return "\n".join(_helps(group, Context(group, info_name="lidar-synth"), [*COMMANDS, "bank", "sensor", "skin"]))
+    return "\n".join(
+        _helps(group, Context(group, info_name="lidar-synth"), [*COMMANDS, "bank", "sensor", "skin", "metrics"])
+    )
 
 
 def _helps(group: TyperGroup, above: Context, names: list[str]) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
@@ -21,14 +21,24 @@ def load_pickle(path: Path, peer: str) -> Any:
         FileError: if the file cannot be read.
         DataError: on a truncated file, one of another format, or one that contains code.
     """
-    kind = path.suffix or "weight"
     try:
         file = path.open("rb")
     except OSError as error:
+        kind = path.suffix or "weight"
         raise FileError(f"{path} cannot be read ({error.strerror or error})", f"a {kind} file of {peer}") from error
+    with file:
+        return unpickle(file, path, peer)
+
+
+def unpickle(file: BinaryIO, path: Path, peer: str) -> Any:
+    """The content of an open file; ``path`` names it in errors. See ``load_pickle``.
+
+    Raises:
+        DataError: on a truncated file, one of another format, or one that contains code.
+    """
+    kind = path.suffix or "weight"
     try:
-        with file:
-            return torch.load(file, map_location="cpu", weights_only=True)
+        return torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle can raise anything
         if code := re.search(r"GLOBAL ([\w.]+)", str(error)):
             raise DataError(

@@ -1,0 +1,325 @@
+"""Feature extractors: the published archives with random weights, against numbers that the peers' own code gave."""
+
+import json
+import shutil
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from conftest import Golden, random_scan
+from numpy.typing import NDArray
+from safetensors.numpy import load_file
+from typer.testing import CliRunner
+
+from lidar_synth.cli import app
+from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError, LidarSynthError
+from lidar_synth.evaluate.extractors import EXTRACTORS, load_extractor
+from lidar_synth.evaluate.extractors.archive import Archive
+from lidar_synth.evaluate.extractors.bonnetal import POOLS, load_lidm, read_segmenter
+from lidar_synth.evaluate.extractors.inputs import PREPARATIONS
+from lidar_synth.evaluate.extractors.liploc import picture
+from lidar_synth.evaluate.extractors.rangevit import build
+from lidar_synth.evaluate.street_judge import load_archive
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import presets
+
+ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """An extractor's archive with random weights, written once."""
+    folder = tmp_path_factory.mktemp("weights")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "tools" / "extractors"))
+        from random_archives import write
+
+    def made(name: str) -> Path:
+        path = folder / name / EXTRACTORS[name].archives[0]
+        if name == "sparenet_pointnet":
+            return path if path.exists() else write(name, path.parent)
+        return path if path.exists() else write(name, path)
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def peer(golden: Golden) -> dict[str, NDArray[np.float32]]:
+    return load_file(golden / "extractors.safetensors")
+
+
+@pytest.fixture(scope="module")
+def scan(peer: dict[str, NDArray[np.float32]]) -> Scan:
+    points = peer["points"]
+    return Scan(points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id="random")
+
+
+def difference(ours: NDArray[np.floating], theirs: NDArray[np.floating]) -> float:
+    """Largest difference relative to the largest feature."""
+    assert ours.shape == theirs.shape
+    return float(abs(ours - theirs).max() / abs(theirs).max())
+
+
+CLOUDS = ["sparenet_pointnet", "lidm_minkowski", "lidm_spvcnn", "lidm_minkowski as r2flow", "lidm_spvcnn as r2flow"]
+
+
+@pytest.mark.parametrize("case", CLOUDS)
+def test_features_of_points_are_the_peers(
+    case: str, archives: Callable[[str], Path], peer: dict[str, NDArray[np.float32]], scan: Scan
+) -> None:
+    name, _, preparation = case.partition(" as ")
+    found = load_extractor(name, archives(name), preparation or None)([scan])
+    assert found.shape == (1, EXTRACTORS[name].width)
+    assert difference(found[0], peer[case]) < 1e-4
+
+
+def _random_image(channels: int) -> torch.Tensor:
+    rng = np.random.RandomState(6)  # as tools/extractors/against_peers.py
+    image = rng.uniform(-1, 1, (channels, 64, 64)) * (rng.random_sample((64, 64)) < 0.8)
+    return torch.from_numpy(image.astype(np.float32))
+
+
+POOLED = {"rangenet53": "subsample", "r2flow_rangenet": "bands", "squeezeseg": "returns"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*POOLED, "lidm_rangenet", "r3dpa_rangevit", "r3dpa_rangevit_remission"])
+def test_features_of_an_image_are_the_peers(
+    name: str, archives: Callable[[str], Path], peer: dict[str, NDArray[np.float32]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = archives(name)
+    with torch.inference_mode():
+        if name in POOLED:
+            segmenter = read_segmenter(Archive(path, "lidar-bonnetal"))
+            image = _random_image(len(segmenter.channels))
+            found = POOLS[POOLED[name]](segmenter.decode(image), image).numpy()
+        elif name == "lidm_rangenet":
+            changed = PREPARATIONS["lidm"]._replace(image=lambda scan, generated: _random_and_unknown())
+            monkeypatch.setitem(PREPARATIONS, "lidm", changed)
+            found = load_lidm(path, "lidm")([random_scan(presets()["town"], 10)])[0]
+        else:
+            network = build(yaml.safe_load((path / "config.yaml").read_text()))
+            network.load_state_dict(Archive(path, "R3DPA").weights("model.ckpt")["state_dict"])
+            found = network.eval()(_random_image(5)[None])[0].numpy()
+    assert difference(found, peer[name]) < 1e-4
+
+
+def _random_and_unknown() -> NDArray[np.float32]:
+    return torch.cat([_random_image(4), torch.full((1, 64, 64), -1.0)]).numpy()
+
+
+def test_the_images_of_r2flow(peer: dict[str, NDArray[np.float32]], scan: Scan) -> None:
+    image = PREPARATIONS["r2flow"].image(scan, False).reshape(5, -1)
+    assert np.array_equal(np.flatnonzero(image[0]), peer["r2flow cells"])
+    np.testing.assert_allclose(image[:, peer["r2flow cells"]], peer["r2flow image"], rtol=1e-6)
+    generated = PREPARATIONS["r2flow"].image(scan, True)
+    filled = generated[0] > 0
+    azimuth = -np.arctan2(generated[2], generated[1])[filled] / np.pi
+    column = (azimuth + 1) / 2 * 1024
+    assert abs(column - np.round(column)).max() < 1e-3  # on the left edges of the cells
+    np.testing.assert_allclose(np.linalg.norm(generated[1:4], axis=0), generated[0], atol=1e-4)
+
+
+def test_the_images_of_lidm_move_the_returns_that_lidm_moves(peer: dict[str, NDArray[np.float32]], scan: Scan) -> None:
+    """Rounding decides which cell a corner belongs to, so that another processor may differ in a few cells."""
+    image = PREPARATIONS["lidm"].image(scan, False).reshape(5, -1)
+    ours, theirs = set(np.flatnonzero(image[0] > 0)), set(peer["lidm cells"].tolist())
+    assert len(ours ^ theirs) <= 0.01 * len(theirs)
+    before = set(np.flatnonzero(PREPARATIONS["r3dpa"].image(scan, False)[0] > 0))
+    assert len(ours) < len(before) and len(ours - before) > 0.1 * len(before)  # moved to the next row or column
+    both = np.array(sorted(ours & theirs))
+    expected = peer["lidm image"][:, np.searchsorted(peer["lidm cells"], both)]
+    same = np.isclose(image[:4, both], expected, rtol=1e-5).all(0)
+    assert same.mean() > 0.99
+    assert (image[:, image[0] <= 0] == -1).all()
+
+
+def test_the_images_of_r3dpa(scan: Scan) -> None:
+    image = PREPARATIONS["r3dpa"].image(scan, False)
+    empty = image[0] == -1
+    assert (image[:4, empty] == -1).all() and (image[4, empty] == 0).all() and (image[0, ~empty] > 1).all()
+    np.testing.assert_allclose(np.linalg.norm(image[1:4, ~empty], axis=0), image[0, ~empty], rtol=1e-5)
+
+
+def test_bytes_of_ranges_overflow_as_in_liploc() -> None:
+    depth = torch.tensor([-1.0, 0.0, 10.0, 50.0, 50.2, 55.0]).repeat(64, 50)
+    grey = picture(depth)[0] * 0.229 + 0.485
+    assert grey.shape == (224, 224)
+    assert abs(grey.mean() - np.mean([251, 0, 51, 255, 0, 24]) / 255) < 0.02
+
+
+def test_the_archive_may_be_packed(archives: Callable[[str], Path], tmp_path: Path, scan: Scan) -> None:
+    path = archives("lidm_minkowski")
+    packed = tmp_path / "minkowskinet_lidm.tar.gz"
+    with tarfile.open(packed, "w:gz") as tar:
+        tar.add(path, arcname="minkowskinet_lidm")
+    expected = load_extractor("lidm_minkowski", path)([scan])
+    assert np.array_equal(load_extractor("lidm_minkowski", packed)([scan]), expected)
+    packed.write_bytes(packed.read_bytes()[:5000])
+    with pytest.raises(DataError, match="truncated.*LiDAR-Diffusion"):
+        load_extractor("lidm_minkowski", packed)
+
+
+def _edit(file: str, change: Callable[[dict], object]) -> Callable[[Path], None]:  # type: ignore[type-arg]
+    def apply(folder: Path) -> None:
+        settings = yaml.safe_load((folder / file).read_text())
+        change(settings)
+        (folder / file).write_text(yaml.safe_dump(settings))
+
+    return apply
+
+
+def _reweigh(file: str, change: Callable[[dict], object]) -> Callable[[Path], None]:  # type: ignore[type-arg]
+    def apply(folder: Path) -> None:
+        content = torch.load(folder / file, weights_only=True)
+        change(content)
+        torch.save(content, folder / file)
+
+    return apply
+
+
+def _cut(file: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / file).write_bytes((folder / file).read_bytes()[:-1000])
+
+
+FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], str]] = {
+    "code": ("lidm_spvcnn", lambda f: torch.save({"state_dict": print}, f / "model.ckpt"), DataError, "was not loaded"),
+    "truncated": ("lidm_spvcnn", _cut("model.ckpt"), DataError, "model.ckpt is truncated"),
+    "no weights": ("lidm_spvcnn", lambda f: (f / "model.ckpt").unlink(), FileError, "model.ckpt"),
+    "no state": ("lidm_minkowski", _reweigh("model.ckpt", lambda c: c.pop("state_dict")), DataError, "not tensors"),
+    "a weight is missing": (
+        "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"].pop("stem.0.kernel")), DataError,
+        "another architecture.*stem.0.kernel",
+    ),
+    "a weight of another shape": (
+        "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"].update({"stem.0.kernel": torch.ones(2)})),
+        DataError, "another architecture.*stem.0.kernel",
+    ),
+    "a weight is not a number": (
+        "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"]["stem.0.kernel"].fill_(torch.nan)),
+        DataError, "stem.0.kernel holds values that are not finite",
+    ),
+    "narrower": (
+        "lidm_minkowski", _edit("config.yaml", lambda s: s["model_params"].update(cr=0.25)), DataError, "architecture",
+    ),
+    "settings without widths": (
+        "lidm_minkowski", _edit("config.yaml", lambda s: s["model_params"].pop("layer_num")), ConfigError, "layer_num",
+    ),
+    "settings are a list": (
+        "lidm_minkowski", lambda f: (f / "config.yaml").write_text("[1]"), DataError, "holds list",
+    ),
+    "settings with code": (
+        "lidm_minkowski", lambda f: (f / "config.yaml").write_text("a: !!python/object/apply:os.getcwd []"),
+        ConfigError, "not YAML",
+    ),
+    "a U-Net's weights as PointNet": (
+        "sparenet_pointnet", lambda f: torch.save({"a.weight": torch.ones(2)}, f), DataError, "SpareNet",
+    ),
+    "PointNet truncated": (
+        "sparenet_pointnet", lambda f: f.write_bytes(f.read_bytes()[:-1000]), DataError, "truncated",
+    ),
+    "another darknet": (
+        "lidm_rangenet", _edit("config.yaml", lambda s: s["backbone"]["extra"].update(layers=22)), ConfigError,
+        "22 layers.*21 or 53",
+    ),
+    "53 layers for 21": (
+        "lidm_rangenet", _edit("config.yaml", lambda s: s["backbone"]["extra"].update(layers=53)), DataError,
+        "backbone: weights of another architecture",
+    ),
+    "means of four inputs": (
+        "squeezeseg", _edit("arch_cfg.yaml", lambda s: s["dataset"]["sensor"]["img_means"].pop()), ConfigError,
+        "a mean and a positive deviation",
+    ),
+    "a deviation of 0": (
+        "squeezeseg", _edit("arch_cfg.yaml", lambda s: s["dataset"]["sensor"].update(img_stds=[0] * 5)), ConfigError,
+        "positive deviation",
+    ),
+    "another stem": (
+        "r3dpa_rangevit", _edit("config.yaml", lambda s: s.update(conv_stem="none")), ConfigError, "ConvStem",
+    ),
+    "without a backbone": (
+        "r3dpa_rangevit", _edit("config.yaml", lambda s: s.pop("vit_backbone")), ConfigError, "vit_backbone",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_faulty_archive_is_refused_and_the_right_one_named(
+    fault: str, archives: Callable[[str], Path], tmp_path: Path
+) -> None:
+    name, damage, error, message = FAULTS[fault]
+    original = archives(name)
+    path = tmp_path / original.name
+    (shutil.copytree if original.is_dir() else shutil.copy)(original, path)
+    damage(path)
+    with pytest.raises(error, match=message) as caught:
+        load_extractor(name, path)
+    assert EXTRACTORS[name].source in str(caught.value)
+
+
+def test_what_cannot_be_extracted_is_refused(
+    archives: Callable[[str], Path], scan: Scan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("LIDAR_SYNTH_METRICS", raising=False)
+    with pytest.raises(ConfigError, match="extractor 'inception'"):
+        load_extractor("inception")
+    with pytest.raises(ConfigError, match="minkowskinet or minkowskinet_lidm in the folder that LIDAR_SYNTH_METRICS"):
+        load_extractor("lidm_minkowski")
+    with pytest.raises(ConfigError, match="preparation 'spiral'"):
+        load_extractor("lidm_minkowski", archives("lidm_minkowski"), "spiral")
+    extract = load_extractor("lidm_minkowski", archives("lidm_minkowski"))
+    with pytest.raises(DataError, match="no scans"):
+        extract([])
+    with pytest.raises(DataError, match="'random'.*no return in the range"):
+        extract([scan[np.linalg.norm(scan.points, axis=1) > 60]])
+
+
+@pytest.mark.slow
+def test_a_network_without_remission_is_no_judge(archives: Callable[[str], Path]) -> None:
+    with pytest.raises(ConfigError, match="without remission"):
+        load_archive(archives("r2flow_rangenet"))
+
+
+def test_an_extractor_without_its_library_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "timm", None)
+    with pytest.raises(LibraryError, match=r"lidar_synth\[metrics\]"):
+        load_extractor("liploc", tmp_path)
+
+
+def test_liploc_is_the_network_of_timm(archives: Callable[[str], Path], scan: Scan) -> None:
+    timm = pytest.importorskip("timm")
+    path = archives("liploc")
+    network = timm.create_model("resnet50", num_classes=0, global_pool="avg").eval()
+    state = torch.load(path / "model.ckpt", weights_only=True)["state_dict"]
+    network.load_state_dict({k.removeprefix("encoder_lidar.model."): v for k, v in state.items()})
+    image = torch.from_numpy(PREPARATIONS["r3dpa"].image(scan, False)[0])
+    with torch.inference_mode():
+        expected = network(picture(image)[None])[0].numpy()
+    assert np.allclose(load_extractor("liploc", path)([scan])[0], expected, rtol=1e-5)
+
+
+def test_setup_says_what_to_fetch_and_what_is_there(
+    archives: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LIDAR_SYNTH_METRICS", str(tmp_path))
+    shutil.copytree(archives("lidm_minkowski"), tmp_path / "minkowskinet")
+    shutil.copy(archives("sparenet_pointnet"), tmp_path)
+    (tmp_path / "darknet53-1024.tar.gz").write_bytes(b"not a tar")
+    found = json.loads(CliRunner().invoke(app, ["metrics", "setup", "--json"]).stdout)
+    assert list(found) == list(EXTRACTORS)
+    assert found["lidm_minkowski"]["state"] == f"{tmp_path / 'minkowskinet'} is readable"
+    assert "its hash differs" in found["sparenet_pointnet"]["state"]
+    assert "is not usable" in found["rangenet53"]["state"] and "truncated" in found["rangenet53"]["state"]
+    assert found["lidm_spvcnn"]["state"] == "missing"
+    (tmp_path / "hello").write_text("hello\n")  # what `git hash-object` prints
+    known = EXTRACTORS["sparenet_pointnet"]._replace(git_blob="ce013625030ba8dba906f756967f9e9ca394464a")
+    assert known.is_published(tmp_path / "hello")
+    assert all("http" in one["from"] and one["licence"] for one in found.values())
+    monkeypatch.delenv("LIDAR_SYNTH_METRICS")
+    text = CliRunner().invoke(app, ["metrics", "setup"]).stdout
+    assert "set LIDAR_SYNTH_METRICS" in text and text.count(": missing") == len(EXTRACTORS)

@@ -1,0 +1,352 @@
+"""Every extractor beside the peers' own code, with the same random weights of the published shapes, on real scans.
+
+    python tools/extractors/against_peers.py CLONES SCANS [--only NAME ...] [--scans N] [--golden FILE]
+
+CLONES holds clones of the peers' repositories: LiDAR-Diffusion, r2flow, R3DPA, SpareNet, lidar-bonnetal. SCANS holds
+``.bin`` files of KITTI-360. Needs torchsparse 1.4.0 (a CPU build will do), timm, torchvision and einops. Prints the
+largest difference of the features relative to the largest feature, and the Fréchet distance between the two halves of
+the scans by our features and code, and by the peers'. ``--golden`` writes the peers' numbers on random points for the
+tests.
+"""
+
+import argparse
+import ast
+import sys
+import tempfile
+from argparse import Namespace
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import yaml
+from numpy.typing import NDArray
+from random_archives import WRITERS, write
+
+from lidar_synth.evaluate.distances import frechet_distance
+from lidar_synth.evaluate.extractors import EXTRACTORS, load_extractor
+from lidar_synth.geometry.projection import locate
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import presets
+
+Points = NDArray[np.float32]
+
+
+class Peer(NamedTuple):
+    """A peer's extractor: features of points (N, 4), and of an input of its network (1, C, H, W) if it takes images."""
+
+    features: Callable[[Points], NDArray[np.floating]]
+    of_image: Callable[[torch.Tensor], NDArray[np.floating]] | None = None
+
+
+def _functions(path: Path, names: Iterable[str], env: dict[str, Any]) -> Namespace:
+    """Some functions of a file whose imports are not needed."""
+    body = [n for n in ast.parse(path.read_text()).body if isinstance(n, ast.FunctionDef) and n.name in names]
+    for function in body:
+        function.decorator_list = []
+    exec(compile(ast.Module(body, []), str(path), "exec"), env)
+    return Namespace(**{n: env[n] for n in names})
+
+
+def _namespace(values: dict[str, Any]) -> Namespace:
+    return Namespace(**{k: _namespace(v) if isinstance(v, dict) else v for k, v in values.items()})
+
+
+class R2Flow:
+    """R2Flow's preprocessing of a real scan, and its extractors."""
+
+    def __init__(self, clones: Path) -> None:
+        sys.path.insert(0, str(clones / "r2flow"))
+        loader = clones / "r2flow" / "r2flow" / "data" / "kitti_360" / "kitti_360.py"
+        self.load = _functions(loader, ("scatter", "load_points_as_images"), {"np": np}).load_points_as_images
+
+    def image(self, points: Points) -> torch.Tensor:
+        """(1, 5, 64, 1024) as its ``evaluate.py`` makes it from the dataset's images."""
+        with tempfile.NamedTemporaryFile(suffix=".bin") as file:
+            points.tofile(file.name)
+            grid = torch.from_numpy(self.load(file.name, scan_unfolding=False, H=64, W=1024)).permute(2, 0, 1)[None]
+        xyz, rflct, depth, mask = grid[:, :3], grid[:, 3:4], grid[:, 4:5], grid[:, 5:6]
+        return torch.cat([depth, xyz, rflct], 1) * mask * torch.logical_and(depth > 0.5, depth < 63.0)
+
+    def rangenet(self, archive: Path, agg_type: str, channels: int) -> Peer:
+        """RangeNet with R2Flow's loader; it reads a tar."""
+        import tarfile
+
+        from r2flow.metrics.models import rangenet
+
+        packed = archive.with_suffix(".tar.gz")
+        with tarfile.open(packed, "w:gz", compresslevel=1) as tar:
+            tar.add(archive, arcname=archive.name)
+        net, prepare = rangenet.build_rangenet(str(packed))
+        pool = rangenet.PostProcess()
+
+        def of_image(image: torch.Tensor) -> NDArray[np.floating]:
+            return pool(net(image, feature="penultimate"), agg_type)[0].numpy()
+
+        return Peer(lambda p: of_image(prepare(self.image(p)[:, :channels])), of_image)
+
+    def pointnet(self, archive: Path) -> Peer:
+        """PointNet on 65,536 points, those without a return at the origin."""
+        from r2flow.metrics.models import pointnet
+
+        net = pointnet.PointNet1(k=16)
+        net.load_state_dict(torch.load(archive, weights_only=True))
+        net.eval()
+        return Peer(lambda p: net(self.image(p)[:, 1:4].flatten(2) / 80.0)[0].numpy())
+
+    def voxels(self, archive: Path, module: str, name: str) -> Peer:
+        """MinkowskiNet or SPVCNN with R2Flow's preprocessing."""
+        import importlib
+
+        from r2flow.metrics.models import utls
+
+        model = getattr(importlib.import_module(f"r2flow.metrics.models.{module}"), name)
+        net = _loaded(model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive)
+        utls.unique = _unique
+        before, after = utls.PreProcess(), utls.PostProcess()
+        return Peer(lambda p: after(net(before(self.image(p)[:, 1:4].flatten(2).mT)), "depth")[0].numpy())
+
+
+def _unique(x: torch.Tensor, dim: int = 0) -> tuple[torch.Tensor, ...]:
+    """R2Flow's ``unique``, which finds the first of equal values by float32 keys that tie, with a stable sort."""
+    values, inverse, counts = torch.unique(x, dim=dim, sorted=True, return_inverse=True, return_counts=True)
+    starts = torch.cat((counts.new_zeros(1), counts.cumsum(0)))[:-1]
+    return values, inverse, counts, inverse.argsort(stable=True)[starts].sort().values
+
+
+class LiDM:
+    """LiDM's evaluation of clouds that were projected back from range images."""
+
+    def __init__(self, clones: Path) -> None:
+        sys.path.insert(0, str(clones / "LiDAR-Diffusion"))
+        import lidm.eval.metric_utils as metrics
+        from lidm.utils.lidar_utils import pcd2range, range2pcd
+
+        self.metrics, self.config = metrics, metrics.DATASET_CONFIG["kitti"]
+        self.project, self.unproject = pcd2range, range2pcd
+
+    def cloud(self, points: Points) -> Points:
+        """(N, 3) the returns of the range image."""
+        image = self.project(points[:, :3], **self.config)[0]
+        return self.unproject(image, self.config["fov"], self.config["depth_range"], 1, log_scale=False)[0].astype("f4")
+
+    def image(self, points: Points) -> NDArray[np.floating]:
+        """(4, 64, 1024) the cloud, projected again."""
+        return self.metrics.preprocess_range(self.cloud(points), **self.config)
+
+    def rangenet(self, archive: Path) -> Peer:
+        """RangeNet-21 on the cloud, projected again."""
+        from lidm.modules.rangenet.model import Model
+
+        net = Model(yaml.safe_load((archive / "config.yaml").read_text()))
+        net.load_pretrained_weights(str(archive))
+        net.eval()
+
+        def of_image(image: torch.Tensor) -> NDArray[np.floating]:
+            return net(image, return_final_logits=True, agg_type="depth")[0]
+
+        return Peer(lambda p: of_image(torch.from_numpy(self.image(p)[None]).float()), of_image)
+
+    def voxels(self, archive: Path, module: str) -> Peer:
+        """MinkowskiNet or SPVCNN."""
+        import importlib
+
+        model = importlib.import_module(f"lidm.modules.{module}.model").Model
+        net = _loaded(model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive)
+
+        def features(points: Points) -> NDArray[np.floating]:
+            voxels = self.metrics.pcd2voxel(self.metrics.preprocess_pcd(self.cloud(points), **self.config))
+            out = net(self.metrics.sparse_collate_fn([voxels]), return_final_logits=True)
+            return self.metrics.batch2list(out, "depth", **self.config)[0]
+
+        return Peer(features)
+
+
+class R3DPA:
+    """R3DPA's range images of real scans, and its extractors of images."""
+
+    def __init__(self, clones: Path) -> None:
+        sys.path.insert(0, str(clones / "R3DPA"))
+        env = {"np": np, "torch": torch}
+        dataset = _functions(clones / "R3DPA" / "dataset_kitti.py", ("pcd2range",), env)
+        config = yaml.safe_load((clones / "R3DPA" / "configs" / "kitti.yaml").read_text())
+        self.arguments = {"size": config["size"], "fov": config["fov"], "depth_range": config["depth_range"]}
+        self.project = dataset.pcd2range
+
+    def image(self, points: Points) -> NDArray[np.float32]:
+        """(2, 64, 1024) range in metres, -1 where there is none, and intensity."""
+        depth, intensity = self.project(points[:, :3], labels=points[:, 3], **self.arguments)
+        return np.stack([np.where(depth > 0, depth, -1), intensity]).astype(np.float32)
+
+    def network(self, archive: Path, name: str) -> Peer:
+        """RangeViT or LIP-Loc."""
+        import importlib
+
+        module = importlib.import_module(f"eval.models.{name}.model")
+        settings = yaml.safe_load((archive / "config.yaml").read_text())
+        model = module.RangeViT if name == "rangevit" else module.Model
+        net = _loaded(model(_namespace(settings)), archive)
+
+        def of_image(image: torch.Tensor) -> NDArray[np.floating]:
+            inputs = ((image - net.image_mean) / net.image_std)[:, : settings["in_channels"]]
+            return net.rangevit.forward_2d_features(inputs)[0].unflatten(1, (8, -1)).mean((2, 3)).flatten().numpy()
+
+        return Peer(lambda p: net([self.image(p)])[0].numpy(), of_image if name == "rangevit" else None)
+
+
+def _loaded(net: torch.nn.Module, archive: Path) -> torch.nn.Module:
+    """Load a checkpoint as the peers do, and make sure that it reached every weight before the classifier."""
+    state = torch.load(archive / "model.ckpt", weights_only=True)["state_dict"]
+    missing, unexpected = net.load_state_dict(state, strict=False)
+    assert not unexpected, unexpected
+    assert all(k.startswith(("rangevit.kpclassifier", "image_")) for k in missing), missing
+    return net.eval()
+
+
+def _bonnetal_squeezeseg(clones: Path, archive: Path) -> Peer:
+    """lidar-bonnetal's own network on its own projection; the pooling is this package's."""
+    train = clones / "lidar-bonnetal" / "train"
+    sys.path.insert(0, str(train))
+    from backbones.squeezeseg import Backbone
+    from common.laserscan import LaserScan
+    from tasks.semantic.decoders.squeezeseg import Decoder
+
+    settings = yaml.safe_load((archive / "arch_cfg.yaml").read_text())
+    backbone = Backbone(params=settings["backbone"] | {"OS": 16})
+    _, skips = backbone(torch.zeros(1, 5, 64, 64))
+    decoder = Decoder(settings["decoder"], skips, OS=16, feature_depth=backbone.get_last_depth())
+    backbone.load_state_dict(torch.load(archive / "backbone", weights_only=True))
+    decoder.load_state_dict(torch.load(archive / "segmentation_decoder", weights_only=True))
+    backbone.eval(), decoder.eval()
+    sensor = settings["dataset"]["sensor"]
+    mean, std = (torch.tensor(sensor[k])[:, None, None] for k in ("img_means", "img_stds"))
+
+    def of_image(image: torch.Tensor) -> NDArray[np.floating]:
+        return decoder(*backbone(image))[0][:, image[0].abs().sum(0) > 0].mean(1).numpy()
+
+    def features(points: Points) -> NDArray[np.floating]:
+        scan = LaserScan(project=True, H=64, W=2048, fov_up=3, fov_down=-25)
+        scan.set_points(points[:, :3].copy(), points[:, 3].copy())
+        channels = [scan.proj_range[None], scan.proj_xyz.transpose(2, 0, 1), scan.proj_remission[None]]
+        mask = torch.from_numpy(scan.proj_mask).float()
+        return of_image(((torch.from_numpy(np.concatenate(channels)) - mean) / std * mask)[None])
+
+    return Peer(features, of_image)
+
+
+def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
+    """The peer's code and the preparation for each comparison: {"extractor" or "extractor as preparation": ...}."""
+    r2flow, lidm, r3dpa = R2Flow(clones), LiDM(clones), R3DPA(clones)
+    return {
+        "rangenet53": (lambda a: r2flow.rangenet(a, "subsample", 5), "r2flow"),
+        "r2flow_rangenet": (lambda a: r2flow.rangenet(a, "depth", 4), "r2flow"),
+        "squeezeseg": (lambda a: _bonnetal_squeezeseg(clones, a), "bonnetal"),
+        "sparenet_pointnet": (r2flow.pointnet, "r2flow"),
+        "lidm_rangenet": (lidm.rangenet, "lidm"),
+        "lidm_minkowski": (lambda a: lidm.voxels(a, "minkowskinet"), "lidm"),
+        "lidm_spvcnn": (lambda a: lidm.voxels(a, "spvcnn"), "lidm"),
+        "lidm_minkowski as r2flow": (lambda a: r2flow.voxels(a, "minkowskinet", "MinkowskiNet"), "r2flow"),
+        "lidm_spvcnn as r2flow": (lambda a: r2flow.voxels(a, "spvcnn", "SPVCNN"), "r2flow"),
+        "r3dpa_rangevit": (lambda a: r3dpa.network(a, "rangevit"), "r3dpa"),
+        "r3dpa_rangevit_remission": (lambda a: r3dpa.network(a, "rangevit"), "r3dpa"),
+        "liploc": (lambda a: r3dpa.network(a, "liploc"), "r3dpa"),
+    }
+
+
+def random_points(count: int = 3000) -> Points:
+    """(N, 4) points all around a sensor, for the golden vectors."""
+    rng = np.random.RandomState(5)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, count), np.radians(rng.uniform(-24.5, 2.5, count))
+    directions = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    points = np.stack(directions, -1) * np.exp(rng.uniform(np.log(2), np.log(70), count))[:, None]
+    return np.column_stack([points, rng.random_sample(count)]).astype(np.float32)
+
+
+def random_image(channels: int) -> torch.Tensor:
+    """(1, C, 64, 64) normalised image with empty cells, for the golden vectors."""
+    rng = np.random.RandomState(6)
+    image = rng.uniform(-1, 1, (channels, 64, 64)) * (rng.random_sample((64, 64)) < 0.8)
+    return torch.from_numpy(image.astype(np.float32))[None]
+
+
+def read(path: Path) -> Points:
+    """(N, 4) the points of a scan, without those that lie in one cell at one range with an earlier point: which of
+    them an image shows depends on the sort in the peers' code."""
+    points = np.fromfile(path, np.float32).reshape(-1, 4)
+    cells = locate(points[:, :3].copy(), presets()["hdl64e_kitti360"])
+    _, first = np.unique(np.column_stack([cells.cell, cells.range.view(np.int32)]), axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def compare(clones: Path, files: list[Path], only: list[str]) -> None:
+    """Print the table."""
+    print("| extractor | prepared as | features | largest difference | Frechet distance: ours | the peer's |")
+    print("|---|---|---:|---:|---:|---:|")
+    fid = _functions(clones / "LiDAR-Diffusion" / "lidm" / "eval" / "fid_score.py", ("calculate_frechet_distance",),
+                     {"np": np, "linalg": __import__("scipy.linalg").linalg}).calculate_frechet_distance  # fmt: skip
+    for key, (make, preparation) in peers(clones).items():
+        name = key.split(" ")[0]
+        if only and name not in only:
+            continue
+        with tempfile.TemporaryDirectory() as folder, torch.inference_mode():
+            archive = write(name, Path(folder) / EXTRACTORS[name].archives[0])
+            ours, theirs = load_extractor(name, archive, preparation), make(archive)
+            rows: list[list[NDArray[Any]]] = [[], []]
+            for file in files:
+                points = read(file)
+                scan = Scan(points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id=file.stem)
+                rows[0].append(ours([scan])[0])
+                rows[1].append(np.asarray(theirs.features(points)))
+        a, b = np.stack(rows[0]).astype(np.float64), np.stack(rows[1]).astype(np.float64)
+        error, half = abs(a - b).max() / abs(b).max(), len(files) // 2
+        distances = ["", ""]
+        if half > 2:
+            ends = slice(0, half - 1)  # the peers' code needs covariances of full rank: as many features as scans allow
+            other = fid(b[:half, ends].mean(0), np.cov(b[:half, ends], rowvar=False), b[half:, ends].mean(0),
+                        np.cov(b[half:, ends], rowvar=False))  # fmt: skip
+            distances = [f"{frechet_distance(a[:half, ends], a[half:, ends]):.6g}", f"{other:.6g}"]
+        print(f"| {name} | {preparation} | {a.shape[1]} | {error:.1e} | {distances[0]} | {distances[1]} |", flush=True)
+
+
+def golden(clones: Path, path: Path) -> None:
+    """Write what the peers' networks make of random images or points, and their images of the points."""
+    from safetensors.numpy import save_file
+
+    points = random_points()
+    found: dict[str, Any] = {"points": points}
+    makers = {"r2flow": R2Flow(clones), "lidm": LiDM(clones)}
+    for name, maker in makers.items():
+        image = np.asarray(maker.image(points), np.float32).reshape(-1, 64, 1024)
+        filled = image[0] > 0
+        found[f"{name} image"] = np.ascontiguousarray(image[:, filled])
+        found[f"{name} cells"] = np.flatnonzero(filled).astype(np.int32)
+    for key, (make, _) in peers(clones).items():
+        name = key.split(" ")[0]
+        if name == "liploc":
+            continue  # a network of timm, which the tests do not have
+        with tempfile.TemporaryDirectory() as folder, torch.inference_mode():
+            peer = make(write(name, Path(folder) / EXTRACTORS[name].archives[0]))
+            channels = 4 if name in ("lidm_rangenet", "r2flow_rangenet") else 5
+            features = peer.of_image(random_image(channels)) if peer.of_image else peer.features(points)
+            found[key] = np.ascontiguousarray(features, np.float32)
+    save_file(found, path)
+
+
+def main() -> None:
+    """Parse the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clones", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--only", nargs="*", default=[], choices=list(WRITERS))
+    parser.add_argument("--scans", type=int, default=4)
+    parser.add_argument("--golden", type=Path)
+    given = parser.parse_args()
+    if given.golden:
+        golden(given.clones, given.golden)
+    else:
+        compare(given.clones, sorted(given.folder.rglob("*.bin"))[: given.scans], given.only)
+
+
+if __name__ == "__main__":
+    main()
