@@ -36,13 +36,17 @@ from lidar_synth.models.convolution import Norm, WrapConv
 from lidar_synth.models.lidm.vqvae import VQVAE, Encoding
 from lidar_synth.models.surface_codec.autoencoder import PATCH, SurfaceAutoencoder
 from lidar_synth.models.surface_codec.blocks import to_patches
+from lidar_synth.models.surface_codec.measure_noise import measure_noise
 from lidar_synth.models.surface_codec.surfaces import Surfaces
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
 from lidar_synth.models.town_codec.distributions import CellDistributions
-from lidar_synth.train.data import Batch
+from lidar_synth.train.data import Batch, Batches
 
 CURVE_LENGTH = 4
 """Number of neighbouring cells in a row whose points are averaged, as in LiDM."""
+
+MEASURED = 8
+"""Scans on which the noise of cells is measured."""
 
 _QUERIES = 2048  # points whose nearest neighbours are searched
 
@@ -133,6 +137,12 @@ class Autoencoding(nn.Module):
             loss = loss + self._adversarial(self.discriminator, expected(output, self.tensors), x, loss)
         loss = loss + self.losses.commitment * encoding.gap.mean()
         return loss + self.losses.codebook * encoding.code_gap.mean()
+
+    def finish(self, data: Batches) -> None:
+        """Set what is not trained but measured, on the first scans: the noise of "surfaces"."""
+        if isinstance(self.network, SurfaceAutoencoder):
+            images = (data(range(i, i + 1)).y0 for i in range(MEASURED))
+            measure_noise(self.network, ((x, _code(x[:, 2:])) for x in images), self.losses.noise)
 
     def reconstruction(self, output: Tensor, x: Tensor) -> Tensor:
         """The weighted sum over channels, a scalar."""

@@ -134,7 +134,7 @@ def _train(
         if log is not None:
             log.add(record)
             if last or record.step % config.save_every == 0:
-                _save(config, plan, training)
+                _save(config, plan, training, data)
             if config.samples.every and (last or record.step % config.samples.every == 0):
                 with accelerator.autocast():
                     log.picture(plan, training, data)
@@ -146,8 +146,10 @@ def _train(
     return checkpoint_path(config)
 
 
-def _save(config: Run, plan: TrainingPlan, training: Training) -> None:
+def _save(config: Run, plan: TrainingPlan, training: Training, data: Batches) -> None:
     training.save(config.output / "state.safetensors")
+    if isinstance(training.average, Autoencoding):
+        training.average.finish(data)
     header = replace(plan.header, provenance=plan.header.provenance | {"iterations": training.step})
     save_checkpoint(checkpoint_path(config), header, plan.parts(training.average))
 
