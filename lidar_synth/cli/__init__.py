@@ -18,6 +18,7 @@ from lidar_synth.cli.doctor import doctor
 from lidar_synth.cli.evaluate import evaluate
 from lidar_synth.cli.import_ import import_
 from lidar_synth.cli.label import label
+from lidar_synth.cli.prove import prove
 from lidar_synth.cli.recipes import recipes
 from lidar_synth.cli.sample import sample
 from lidar_synth.cli.sensor import sensor
@@ -42,6 +43,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "distill": distill,
     "evaluate": evaluate,
+    "prove": prove,
     "import": import_,
     "doctor": doctor,
 }
