@@ -67,6 +67,7 @@ RARE = {"Pedestrian": 3, "Person_sitting": 1, "Cyclist": 2, "Truck": 1, "Tram": 
 """Largest number of pasted objects in a scan by name of their boxes."""
 
 _TOWN = "labels of the town, which cost nothing"
+GENERATOR_BUDGET = "what the generator was trained on"
 _SKIN = f"{_TOWN}; scans of the training places without labels, to learn the skin"
 
 ARMS: dict[str, Arm] = {
@@ -83,7 +84,7 @@ ARMS: dict[str, Arm] = {
     ),
     "generator": Arm(
         "with generated scans", lambda ratio: (Stage(1, ratio, "generator"),), swept=True,
-        budget="what the generator was trained on",
+        budget=GENERATOR_BUDGET,
     ),
     "pretrain": Arm(
         "first the town with a skin, then real scans only",

@@ -76,18 +76,20 @@ def find_places(source: Source, by: str = "auto") -> Places:
     Args:
         source: scans; their names are its ``ids`` or those of the scans.
         by: a name of ``SPLITS``; ``"auto"`` takes drives if there are at least two, and otherwise clusters of poses.
+            ``"stretch:2"`` is the split with two stretches.
 
     Raises:
         ConfigError: on an unknown split.
         DataError: if there is only one place.
     """
-    if by != "auto" and by not in SPLITS:
-        raise ConfigError(f"places by {by!r}", f"one of auto, {', '.join(SPLITS)}")
+    by, mark, count = by.partition(":")
+    counted = by == "stretch" and count.isdigit() and int(count) > 1
+    if (by != "auto" and by not in SPLITS) or (count and not counted):
+        raise ConfigError(f"places by {by + mark + count!r}", f"one of auto, {', '.join(SPLITS)}, or stretch:2")
     names = names_of(source)
-    drives = by_drive(source, names)
     if by == "auto":
-        by = "drive" if len(drives) > 1 or not _has_pose(source) else "pose"
-    places = drives if by == "drive" else SPLITS[by](source, names)
+        by = "drive" if len(by_drive(source, names)) > 1 or not _has_pose(source) else "pose"
+    places = by_stretch(source, names, int(count)) if count else SPLITS[by](source, names)
     if len(places) < 2:
         raise DataError(
             f"{len(source)} scans of one place ({next(iter(places))})",

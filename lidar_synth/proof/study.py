@@ -14,6 +14,7 @@ import torch
 from tqdm import tqdm
 
 from lidar_synth.errors import DataError
+from lidar_synth.evaluate.leakage import seen_by
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats import open_scans
@@ -153,8 +154,10 @@ def prove(
     source = open_scans(scans) if isinstance(scans, str | Path) else scans
     jobs = jobs or os.cpu_count() or 1
     plan, loaded = make_plan(source, settings or ProofSettings(), minutes, jobs, _precision(out))
+    seen = ""
     if any("generator" in row.arm.pools() for row in plan.rows):
-        refuse_leaks(plan.settings.model, plan.recordings)
+        generator = refuse_leaks(plan.settings.model, plan.recordings)
+        seen = str(seen_by(generator.header.provenance)) or "scans that its file does not name"
     named = getattr(trainer, "command", getattr(trainer, "__name__", type(trainer).__name__))
     claim(out / STUDY, plan.identity() | {"trainer": named})
     deadline = None if minutes is None else start + 60 * minutes
@@ -164,11 +167,16 @@ def prove(
     with in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
         for _ in tqdm(done, total=len(tasks), desc="trainings", disable=not progress):
             pass
-    return report(work, named)
+    return report(work, named, seen)
 
 
-def report(work: Trainings, trainer: str) -> Proof:
+def report(work: Trainings, trainer: str, seen: str = "") -> Proof:
     """Summarise the trainings that are there, and write the page and ``results.json``.
+
+    Args:
+        work: the trainings.
+        trainer: the name of the trainer.
+        seen: what the generator was trained on.
 
     Raises:
         DataError: if no pair is complete.
@@ -182,7 +190,7 @@ def report(work: Trainings, trainer: str) -> Proof:
     if not found:
         raise DataError("no place with trainings of all arms", "at least one", "Give more --minutes.")
     costs = {row.key: _preparation(work, row) for row in plan.rows}
-    proof = summarise(plan, found, costs, trainer)
+    proof = summarise(plan, found, costs, trainer, seen)
     write_file(work.out / RESULTS, (json.dumps(proof.values, indent=1) + "\n").encode())
     write_page(work.out / PAGE, proof)
     return proof

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.proof.arms import BASE, Row
+from lidar_synth.proof.arms import BASE, GENERATOR_BUDGET, Row
 from lidar_synth.proof.machine import command_line, machine
 from lidar_synth.proof.plan import Pair, ProofPlan
 from lidar_synth.proof.scores import FEWEST_PLACES, group_ious, interval, mean_group_iou
@@ -63,7 +63,7 @@ def span(ends: Sequence[float] | None) -> str:
     return "–" if ends is None else f"[{ends[0]:+.1f}, {ends[1]:+.1f}]"
 
 
-def summarise(plan: ProofPlan, found: Results, preparation: Mapping[str, float], trainer: str) -> Proof:
+def summarise(plan: ProofPlan, found: Results, preparation: Mapping[str, float], trainer: str, seen: str = "") -> Proof:
     """The result of some complete pairs.
 
     Args:
@@ -71,12 +71,15 @@ def summarise(plan: ProofPlan, found: Results, preparation: Mapping[str, float],
         found: the outcomes.
         preparation: {key of an arm: seconds that its synthetic scans took}.
         trainer: the name of the trainer.
+        seen: what the generator was trained on.
     """
     places = sorted({place for place, _ in found})
     seeds = sorted({seed for _, seed in found})
     scores = {row: _scores(plan, found, row, places, seeds) for row in plan.rows}
     base = scores[plan.rows[0]]
     arms = [_arm(plan, found, row, scores, base, preparation.get(row.key, 0.0), places) for row in plan.rows]
+    for row in arms:
+        row["budget"] = row["budget"].replace(GENERATOR_BUDGET, f"{GENERATOR_BUDGET}: {seen}")
     sizes = {name: {"scans": len(part), "tested": len(plan.tested[name])} for name, part in plan.places.items()}
     values: dict[str, Any] = {
         "labelled": plan.budget,
@@ -151,8 +154,6 @@ def _budget(plan: ProofPlan, row: Row) -> str:
     if any(pool == "skin" for pool in row.arm.pools()):
         scans = len(plan.skin_scans(plan.pairs[0][0]))
         extra = extra.replace("scans of the training places", f"{scans} scans of the training places")
-    if row.name == "generator":
-        extra = f"{extra}: model {plan.settings.model}, see its card"
     return f"{text}; {extra}"
 
 

@@ -5,6 +5,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -29,8 +30,8 @@ from lidar_synth.train.segmentation import endless_batches, train_segmenter
 
 LOOKS = 8
 """Points of the curve of a training."""
-SETTLING = 16
-"""Batches of real scans over which the statistics of the normalisation are taken after a training."""
+SETTLING, SETTLING_LOOK = 16, 4
+"""Batches of real scans over which the statistics of the normalisation are taken, after a training and during it."""
 
 
 @dataclass(frozen=True)
@@ -147,14 +148,13 @@ def reference(job: Job) -> Outcome:
 
     def watch(step: int) -> None:
         if step in looks:
-            curve.append((step, _test(network, held_out, height, job.half)))
+            curve.append((step, _test(_settled(network, job, height, SETTLING_LOOK), held_out, height, job.half)))
 
     batches = chain.from_iterable(
         islice(endless_batches(mixed, job.batch), count) for mixed, count in job.mixtures(collate="range")
     )
     losses = train_segmenter(network, batches, height, job.iterations, progress=False, half=job.half, watch=watch)
-    _settle(network, job, height)
-    table = _test(network, held_out, height, job.half)
+    table = _test(_settled(network, job, height, SETTLING), held_out, height, job.half)
     parts = [float(np.mean(part)) for part in np.array_split(losses, 10) if len(part)]
     return Outcome(table, [*curve, (job.iterations, table)], parts)
 
@@ -175,11 +175,12 @@ def _test(network: nn.Module, held_out: Sequence[Images], height: Tensor, half: 
         return confusion(network, held_out, height)
 
 
-def _settle(network: RangeSegmenter, job: Job, height: Tensor) -> None:
-    """Take the statistics of the normalisation from the labelled real scans; the same in every arm.
+def _settled(network: RangeSegmenter, job: Job, height: Tensor, batches: int) -> RangeSegmenter:
+    """A copy whose statistics of the normalisation are those of the labelled real scans; the same in every arm.
 
     Those of the training are of real and synthetic scans together, and the test has only real ones.
     """
+    network = deepcopy(network)
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.reset_running_stats()
@@ -190,6 +191,6 @@ def _settle(network: RangeSegmenter, job: Job, height: Tensor) -> None:
         collate="range",
     )  # fmt: skip
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=job.half):
-        for batch in islice(endless_batches(mixed, job.batch), SETTLING):
+        for batch in islice(endless_batches(mixed, job.batch), batches):
             network(segmenter_input(batch["range"], batch["reflectance"], height))
-    network.eval()
+    return network.eval()
