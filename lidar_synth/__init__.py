@@ -31,7 +31,6 @@ _HOME = {
     "NuScenes": "formats",
     "ObjectBank": "labels",
     "PandaSet": "formats",
-    "Proof": "proof",
     "ProofSettings": "proof",
     "RangeImage": "geometry.scan",
     "RollingBank": "mixing.service",
@@ -97,7 +96,6 @@ if TYPE_CHECKING:
     from lidar_synth.mixing import Sources as Sources
     from lidar_synth.mixing.service import BatchMixer as BatchMixer
     from lidar_synth.mixing.service import RollingBank as RollingBank
-    from lidar_synth.proof import Proof as Proof
     from lidar_synth.proof import ProofSettings as ProofSettings
     from lidar_synth.proof import prove as prove
     from lidar_synth.town import Skin as Skin

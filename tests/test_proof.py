@@ -14,7 +14,6 @@ from proofs import Scans, drives, write_town
 from small_models import write as write_model
 from typer.testing import CliRunner
 
-import lidar_synth
 from lidar_synth import ProofSettings, prove
 from lidar_synth.cli import app
 from lidar_synth.datasets.classes import PANDASET
@@ -22,7 +21,7 @@ from lidar_synth.datasets.recordings import frames_of
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import load_checkpoint, save_checkpoint
-from lidar_synth.proof import ARMS, Job, pools
+from lidar_synth.proof import ARMS, Job, Proof, pools
 from lidar_synth.proof.pools import refuse_leaks
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -39,7 +38,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def proof(town: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, lidar_synth.Proof]:
+def proof(town: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Proof]:
     """The output folder of a comparison on the town with every arm that needs no generator, and its result."""
     out = tmp_path_factory.mktemp("proof")
     with pytest.MonkeyPatch.context() as patch:
@@ -49,7 +48,7 @@ def proof(town: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, l
         return out, prove(town, out, settings, jobs=1, progress=False)
 
 
-def test_the_town_is_proved_with_every_arm(proof: tuple[Path, lidar_synth.Proof]) -> None:
+def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
     out, result = proof
     values = result.values
     assert values["tested_places"] == ["00, place 1", "00, place 2"] and values["pairs"] == 2
@@ -65,7 +64,7 @@ def test_the_town_is_proved_with_every_arm(proof: tuple[Path, lidar_synth.Proof]
     assert json.loads((out / "results.json").read_text()) == json.loads(json.dumps(values))
 
 
-def test_the_page_is_one_file_that_says_it_all(proof: tuple[Path, lidar_synth.Proof]) -> None:
+def test_the_page_is_one_file_that_says_it_all(proof: tuple[Path, Proof]) -> None:
     out, result = proof
     text = (out / "index.html").read_text()
     assert not re.search(r"https?://|src=|@\w+@", text)
@@ -81,7 +80,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("width", [1280, 420])
-def test_the_page_shows_in_a_browser(width: int, proof: tuple[Path, lidar_synth.Proof], browser: Any) -> None:
+def test_the_page_shows_in_a_browser(width: int, proof: tuple[Path, Proof], browser: Any) -> None:
     browser.set_window_size(width, 900)
     browser.get((proof[0] / "index.html").as_uri())
     assert browser.get_log("browser") == []

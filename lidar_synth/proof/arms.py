@@ -72,14 +72,14 @@ _SKIN = f"{_TOWN}; scans of the training places without labels, to learn the ski
 
 ARMS: dict[str, Arm] = {
     "real": Arm("real scans only", lambda ratio: (Stage(),), synthetic=False),
-    "longer": Arm("real scans only, twice the iterations", lambda ratio: (Stage(),), iterations=2, synthetic=False),
+    "longer": Arm("real scans only, twice as long", lambda ratio: (Stage(),), iterations=2, synthetic=False),
     "exchange": Arm(
-        "real scans, parts exchanged as by PolarMix and LaserMix",
+        "real scans, PolarMix and LaserMix",
         lambda ratio: (Stage(1, 0.5, REAL, "mix", _EXCHANGE),), synthetic=False,
     ),
     "town": Arm("with scans of the town", lambda ratio: (Stage(1, ratio, "town"),), swept=True, budget=_TOWN),
     "skin": Arm(
-        "with scans of the town, with a skin learnt from your scans",
+        "with scans of the town in your skin",
         lambda ratio: (Stage(1, ratio, "skin"),), swept=True, budget=_SKIN,
     ),
     "generator": Arm(
@@ -87,15 +87,15 @@ ARMS: dict[str, Arm] = {
         budget=GENERATOR_BUDGET,
     ),
     "pretrain": Arm(
-        "first the town with a skin, then real scans only",
+        "town in your skin first, real last",
         lambda ratio: (Stage(0.5, 1, "skin"), Stage(0.5)), budget=_SKIN,
     ),
     "paste": Arm(
-        "real scans, rare objects of the town pasted into half of them",
+        "real scans, rare objects pasted",
         lambda ratio: (Stage(1, 0.5, REAL, "mix", _RARE),), budget=_SKIN,
     ),
     "together": Arm(
-        "first the town with a skin, then with parts of real scans exchanged, real scans last",
+        "town first, then exchanged, real last",
         lambda ratio: (
             Stage(0.4, 1, "skin"), Stage(0.3, 0.5, "skin", "mix", _EXCHANGE), Stage(0.3, 0.5, REAL, "mix", _EXCHANGE)
         ), budget=_SKIN,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-WIDTH, LEFT, RIGHT = 980, 430, 40
+WIDTH, LEFT, RIGHT = 980, 300, 40
 ROW = 30
 COLOURS = ("#7a8494", "#1f6feb", "#11733a", "#b3261e", "#8a4fd3", "#c77700", "#0b7285", "#a1286a", "#5c6f00", "#333")
 

@@ -43,6 +43,7 @@ def body(values: Values) -> str:
     return "\n".join(filter(None, parts))
 
 
+_USES = "what it uses"
 _DIFFERENCE = (
     "Percentage points. A dot is the mean over places and seeds, the bar its 95 % interval (bootstrap over places and "
     "seeds). Where the bar crosses 0, the difference may be chance."
@@ -84,7 +85,7 @@ def _sentences(text: str) -> tuple[str, str, str]:
 
 
 def _table(values: Values) -> str:
-    head = ("training", "mIoU, %", "change", "95 % interval", "better in", "iterations", "minutes", "what it uses")
+    head = ("training", "mIoU, %", "change", "95 % interval", "better in", "iterations", "minutes", _USES)
     gains = [row["difference"] for row in values["arms"] if row["difference"] is not None and row["synthetic"]]
     rows = []
     for row in values["arms"]:
@@ -119,7 +120,7 @@ def _places(values: Values) -> str:
 
 
 def _grid(head: Sequence[str], rows: Sequence[str]) -> str:
-    names = "".join(f"<th>{_text(name)}</th>" for name in head)
+    names = "".join(f"<th{' class=text' * (name == _USES)}>{_text(name)}</th>" for name in head)
     return f'<div class="scroll"><table><thead><tr>{names}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
 
 

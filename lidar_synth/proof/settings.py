@@ -33,6 +33,12 @@ class ProofSettings:
 
     Raises:
         ConfigError: on values with which nothing can be trained.
+
+    Example:
+        >>> from lidar_synth import ProofSettings
+        >>> settings = ProofSettings(labelled=24, arms=("exchange", "skin", "pretrain"), ratios=(0.25, 0.5))
+        >>> settings.iterations, settings.seeds
+        (500, 2)
     """
 
     labelled: int | None = None

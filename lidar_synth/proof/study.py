@@ -145,9 +145,11 @@ def prove(
 
     Example:
         >>> from lidar_synth import ProofSettings, prove
-        >>> settings = ProofSettings(arms=("real", "town"), labelled=8, seeds=1)
-        >>> proof = prove("SemanticKITTI", "proof", settings, minutes=60)  # doctest: +SKIP
-        >>> print(proof)  # doctest: +SKIP
+        >>> short = {"iterations": 10, "batch": 1, "seeds": 1, "columns": 64}  # to be fast; leave it out
+        >>> settings = ProofSettings(arms=("real", "exchange"), places="stretch:2", **short)
+        >>> proof = prove("demo_out/town", "proof", settings, jobs=1, progress=False)
+        >>> proof.values["tested_places"], len(proof.values["arms"])
+        (['00, stretch 1', '00, stretch 2'], 2)
     """
     start = time.time()
     out = Path(out)
