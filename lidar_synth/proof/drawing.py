@@ -22,7 +22,7 @@ def differences(arms: Sequence[Mapping[str, Any]]) -> str:
     low, high = low - margin, high + margin
 
     def x(value: float) -> float:
-        return LEFT + (WIDTH - LEFT - RIGHT) * (value - low) / (high - low)
+        return float(LEFT + (WIDTH - LEFT - RIGHT) * (value - low) / (high - low))
 
     height = ROW * len(shown) + 30
     parts = [f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="differences of the mIoU">']

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import NAMES
+from lidar_synth.errors import DataError
 from lidar_synth.evaluate.segmentation import Images, confusion
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
@@ -126,13 +127,17 @@ def turned(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def run_trainer(trainer: Trainer, job: Job) -> Outcome:
-    """Run a trainer, and take its time."""
+    """Run a trainer, and take its time.
+
+    Raises:
+        DataError: on a table of another shape than (19, 19).
+    """
     start = time.monotonic()
     result = trainer(job)
     outcome = result if isinstance(result, Outcome) else Outcome(np.asarray(result, np.int64))
     expected = (len(NAMES), len(NAMES))
     if outcome.table.shape != expected:
-        raise ValueError(f"a trainer returned a table of shape {outcome.table.shape}; expected {expected}")
+        raise DataError(f"a trainer that returns a table of shape {outcome.table.shape}", f"{expected}")
     return replace(outcome, seconds=time.monotonic() - start)
 
 
