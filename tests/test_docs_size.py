@@ -51,7 +51,7 @@ LIMITS = {
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 8000
+MAIN_PATH = 8250
 """Words of all pages of docs/ that are read, not looked up as the reference is."""
 
 PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if not {"research", "notebooks"} & set(p.parts)]

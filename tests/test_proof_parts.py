@@ -11,12 +11,15 @@ import pytest
 import torch
 import torch.nn.functional as F
 import yaml
-from proofs import Scans, drives, job
+from conftest import random_scan
+from proofs import SENSOR, Scans, drives, job
 from scipy import stats
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError, ProcessError
 from lidar_synth.evaluate.segmentation import class_ious
+from lidar_synth.geometry.projection import project
+from lidar_synth.labels.exchange import thinned
 from lidar_synth.models.segmenter import CircularConv, _Wrapped
 from lidar_synth.proof import ARMS, CommandTrainer, ProofSettings
 from lidar_synth.proof.arms import rows
@@ -90,7 +93,7 @@ def test_labelled_scans_come_from_many_places_and_not_from_the_one_left_out(coun
 
 @pytest.mark.parametrize("name", ARMS)
 def test_an_arm_trains_for_its_iterations_with_its_shares(name: str, tmp_path: Path) -> None:
-    task = job(name, tmp_path, ratio=0.5 if ARMS[name].swept else None)
+    task = job(name, tmp_path, iterations=21, ratio=0.5 if ARMS[name].swept else None)
     mixtures = list(task.mixtures(collate="range"))
     stages = task.row.stages()
     assert sum(count for _, count in mixtures) == task.iterations
@@ -98,7 +101,7 @@ def test_an_arm_trains_for_its_iterations_with_its_shares(name: str, tmp_path: P
     for stage, (mixed, count) in zip(stages, mixtures, strict=True):
         domains = [mixed.domain(i) for i in range(len(mixed))]
         assert len(domains) == count * task.batch
-        assert sum(domains) == round(stage.ratio * len(domains))
+        assert abs(sum(domains) - stage.ratio * len(domains)) < 1
     batch = mixtures[-1][0].collate([mixtures[-1][0][i] for i in range(task.batch)])
     assert (batch["label"] != 255).any()
 
@@ -114,13 +117,11 @@ def test_the_reference_trainer_learns_and_repeats_itself(name: str, tmp_path: Pa
 
 
 def test_turning_keeps_every_return_in_a_cell() -> None:
-    scan = replace(drives(1, 1)[0], boxes=None)
-    from lidar_synth.geometry.projection import project
-
+    scan = thinned(random_scan(SENSOR, 20_000), SENSOR)
+    cells = np.count_nonzero(project(scan).range)
     for seed in range(5):
-        other = turned(scan, np.random.default_rng(seed))
-        a, b = project(scan).range, project(other).range
-        assert abs(np.count_nonzero(a) - np.count_nonzero(b)) <= 0.001 * np.count_nonzero(a)
+        kept = np.count_nonzero(project(turned(scan, np.random.default_rng(seed))).range)
+        assert abs(kept - cells) <= 0.001 * cells
 
 
 @pytest.mark.parametrize("classes", GROUPS)

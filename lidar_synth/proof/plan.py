@@ -273,7 +273,8 @@ def _step(scans: list[Scan], settings: ProofSettings, half: bool | None) -> tupl
     torch.set_num_threads(1)
     work, seconds = {}, {}
     for precision in (True, False) if half is None else (half,):
-        network, times = RangeSegmenter(widths=settings.widths), []
+        network = RangeSegmenter(widths=settings.widths)
+        times: list[tuple[float, float]] = []
 
         def watch(step: int, times: list[tuple[float, float]] = times) -> None:
             times.append((time.process_time(), time.perf_counter()))
