@@ -166,7 +166,7 @@ def reference(job: Job) -> Outcome:
 
 def images(scans: Sequence[Scan], sensor: Sensor) -> list[Images]:
     """Batches of one labelled range image each."""
-    made = []
+    made: list[Images] = []
     for scan in scans:
         image = project(scan, sensor, ("reflectance", "label"))
         arrays = {"range": image.range, **{name: image.channels[name] for name in ("reflectance", "label")}}
