@@ -31,6 +31,7 @@ _HOME = {
     "NuScenes": "formats",
     "ObjectBank": "labels",
     "PandaSet": "formats",
+    "ProofSettings": "proof",
     "RangeImage": "geometry.scan",
     "RollingBank": "mixing.service",
     "Scan": "geometry.scan",
@@ -52,6 +53,7 @@ _HOME = {
     "make_policy": "labels",
     "open_scans": "formats",
     "project": "geometry.projection",
+    "prove": "proof",
     "reskew": "geometry.fitting",
     "unfold": "geometry.projection",
     "unproject": "geometry.projection",
@@ -94,6 +96,8 @@ if TYPE_CHECKING:
     from lidar_synth.mixing import Sources as Sources
     from lidar_synth.mixing.service import BatchMixer as BatchMixer
     from lidar_synth.mixing.service import RollingBank as RollingBank
+    from lidar_synth.proof import ProofSettings as ProofSettings
+    from lidar_synth.proof import prove as prove
     from lidar_synth.town import Skin as Skin
     from lidar_synth.town import Town as Town
     from lidar_synth.town import fit_skin as fit_skin

@@ -33,6 +33,7 @@ LIMITS = {
     "docs/how-to/train-a-generator.md": 450,
     "docs/how-to/bake.md": 400,
     "docs/how-to/look.md": 150,
+    "docs/how-to/prove.md": 250,
     "docs/reference/api.md": 80,
     "docs/reference/command-line.md": 60,
     "docs/reference/recipes.md": 200,

@@ -37,6 +37,7 @@ CALLS: dict[str, dict[str, Any]] = {
     "pseudo": {"teacher": teacher},
     "mix": {"count": 6, "turn": 180.0},
     "mix polar": {"kind": "polar"},
+    "mix exchange": {"kind": "exchange"},
     "mix laser": {"kind": "laser"},
 }
 
@@ -295,7 +296,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
         ("none", {"threshold": 0.5}, "labels='none'.*'threshold'; expected no options"),
         ("generated", {"treshold": 0.5}, "'treshold'; expected options"),
         ("best", {}, "labels='best'; expected one of 'none', 'ignore'"),
-        ("mix", {"kind": "cut"}, "kind='cut'; expected one of 'objects', 'polar', 'laser'"),
+        ("mix", {"kind": "cut"}, "kind='cut'; expected one of 'objects', 'polar', 'laser', 'exchange'"),
         ("mix", {}, "no box with 5 points in 0 scans"),
         ("mix", {"real": bare}, "no box with 5 points in 1 scans.*ObjectBank.from_scans"),
         ("mix", {"real": [cast([car(8, 2)])], "count": {"Tram": 1}}, "names and points"),

@@ -19,6 +19,7 @@ from lidar_synth.cli.evaluate import evaluate
 from lidar_synth.cli.import_ import import_
 from lidar_synth.cli.label import label
 from lidar_synth.cli.metrics import metrics
+from lidar_synth.cli.prove import prove
 from lidar_synth.cli.recipes import recipes
 from lidar_synth.cli.sample import sample
 from lidar_synth.cli.sensor import sensor
@@ -43,6 +44,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "distill": distill,
     "evaluate": evaluate,
+    "prove": prove,
     "import": import_,
     "doctor": doctor,
 }

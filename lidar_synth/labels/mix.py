@@ -107,6 +107,21 @@ class Laser:
         return swap_bands(self.own(scan, rng), other, int(rng.choice(self.bands)), bool(rng.integers(2)))
 
 
+@dataclass(frozen=True)
+class Exchange:
+    """PolarMix or LaserMix, each for half of the scans at random.
+
+    Args:
+        polar, laser: the two policies.
+    """
+
+    polar: Polar
+    laser: Laser
+
+    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        return (self.polar if rng.random() < 0.5 else self.laser)(scan, rng)
+
+
 def _partner(real: Source, scan: Scan, rng: np.random.Generator) -> Scan:
     """A random real scan, thinned to the grid of a synthetic one."""
     other = real[int(rng.integers(len(real)))]
@@ -187,6 +202,13 @@ def laser(
         raise ConfigError(f"bands={bands}", "numbers of bands, 2 or more each")
     real, _ = _labelled(real, "laser")
     return Laser(_own(fields, threshold), real, tuple(bands))
+
+
+def exchange(
+    real: Source | None, fields: frozenset[str], width: float = 180.0, objects: int = 10, threshold: float = 0.0
+) -> Exchange:
+    """Make the policy ``mix`` by PolarMix or LaserMix at random; the arguments and errors are those of both."""
+    return Exchange(polar(real, fields, width, objects, threshold), laser(real, fields, threshold=threshold))
 
 
 def _own(fields: frozenset[str], threshold: float) -> Own | Ignored:

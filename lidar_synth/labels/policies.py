@@ -8,14 +8,16 @@ import numpy as np
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.labels.mix import laser, objects, polar
+from lidar_synth.labels.mix import exchange, laser, objects, polar
 from lidar_synth.labels.own import condition, generated, ignored, unlabelled
 from lidar_synth.labels.pseudo import pseudo
 
 LabelPolicy = Callable[[Scan, np.random.Generator], Scan]
 """Sets the labels of a synthetic scan; it returns a new scan and never changes its input."""
 
-KINDS: dict[str, Callable[..., LabelPolicy]] = {"objects": objects, "polar": polar, "laser": laser}
+KINDS: dict[str, Callable[..., LabelPolicy]] = {
+    "objects": objects, "polar": polar, "laser": laser, "exchange": exchange,
+}  # fmt: skip
 """Builders of the kinds of ``mix``: ``(real, fields, **options) -> LabelPolicy``."""
 
 

@@ -6,6 +6,7 @@ benchmarks.
 """
 
 from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +16,22 @@ from lidar_synth.datasets.classes import NAMES
 
 ROW_BANDS = 4
 """Bands of rows over which features are averaged separately, so that high and low objects are distinguished."""
+
+
+class _Wrapped(torch.autograd.Function):
+    """Circular padding by one column on each side; a third of the time of ``F.pad(mode="circular")`` on a CPU."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return torch.cat([x[..., -1:], x, x[..., :1]], -1)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        [grad] = grads
+        inner = grad[..., 1:-1].clone(memory_format=torch.preserve_format)
+        inner[..., -1] += grad[..., 0]
+        inner[..., 0] += grad[..., -1]
+        return inner
 
 
 class CircularConv(nn.Module):
@@ -27,7 +44,8 @@ class CircularConv(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs, H, W) to (B, outputs, H / stride, W / stride)."""
-        out: Tensor = F.relu(self.norm(self.conv(F.pad(x, (1, 1, 0, 0), mode="circular"))))
+        padded: Tensor = _Wrapped.apply(x)  # type: ignore[no-untyped-call]
+        out: Tensor = F.relu(self.norm(self.conv(padded)))
         return out
 
 

@@ -4,7 +4,7 @@ All that a training with mixed data takes, in one file: ``endless_batches`` is t
 loop. ``tools/train_segmenter.py`` calls it from the command line, on the town or on your own dataset.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import count
 
 import numpy as np
@@ -51,6 +51,8 @@ def train_segmenter(
     steps: int,
     rate: float = 4e-3,
     progress: bool = True,
+    half: bool = False,
+    watch: Callable[[int], object] | None = None,
 ) -> list[float]:
     """Cross-entropy over all labelled cells, AdamW, one cycle of the learning rate.
 
@@ -61,6 +63,9 @@ def train_segmenter(
         steps: optimiser steps.
         rate: the highest learning rate.
         progress: show a bar.
+        half: compute the forward pass in bfloat16, in the channels-last memory format: three times as fast on a CPU
+            with AMX, slower on one without bfloat16.
+        watch: called with the number of steps done after each of them; it may use the network in evaluation mode.
 
     Returns:
         The loss of every step.
@@ -71,19 +76,26 @@ def train_segmenter(
     optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.01)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     network.train()
+    if half:
+        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     losses: list[float] = []
     bar = tqdm(total=steps, desc="segmenter", unit="step", disable=not progress)
     for _, batch in zip(range(steps), batches, strict=False):
         target = batch["label"].long()
         if not bool((target != IGNORE).any()):
             raise DataError("a batch without one valid label", "at least one label that is not 255 = ignore")
-        logits = network(segmenter_input(batch["range"], batch["reflectance"], height))
-        loss = F.cross_entropy(logits, target, ignore_index=IGNORE)
+        inputs = segmenter_input(batch["range"], batch["reflectance"], height)
+        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=half):
+            logits = network(inputs)
+        loss = F.cross_entropy(logits.float(), target, ignore_index=IGNORE)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         schedule.step()
         losses.append(loss.item())
+        if watch is not None:
+            watch(len(losses))
+            network.train()
         bar.update()
         bar.set_postfix(loss=f"{np.mean(losses[-20:]):.3f}", refresh=False)
     bar.close()

@@ -1,0 +1,172 @@
+"""The trainings that are compared. Each is an *arm*: one or more stages, each with a mixture of its own.
+
+All arms have the same network, batch size, augmentation, optimiser and schedule of the learning rate, and the same
+number of iterations, except where an arm's ``iterations`` says so. To add an arm, add one entry to ``ARMS``.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.labels import ObjectBank
+from lidar_synth.labels.policies import LabelPolicy, make_policy
+
+REAL = "real"
+"""The name of the labelled scans themselves, where a stage takes them in the place of synthetic ones."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a training with one mixture.
+
+    Args:
+        share: of the iterations.
+        ratio: share of synthetic samples in each batch, 0 to 1.
+        pool: of the synthetic scans: a name of ``POOLS``, or ``REAL``.
+        labels: their label policy.
+        options: of the policy. ``objects: True`` stands for the pasted objects of the pool ``skin``.
+    """
+
+    share: float = 1.0
+    ratio: float = 0.0
+    pool: str = ""
+    labels: str = "generated"
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One of the compared trainings.
+
+    Args:
+        title: its row in tables.
+        stages: from the share of synthetic samples to the stages.
+        swept: whether the share matters, so that the arm is trained once for each of the given shares.
+        iterations: factor of the number of iterations.
+        synthetic: whether it uses scans that were not recorded.
+        budget: what it uses besides the labelled scans.
+    """
+
+    title: str
+    stages: Callable[[float], tuple[Stage, ...]]
+    swept: bool = False
+    iterations: float = 1.0
+    synthetic: bool = True
+    budget: str = ""
+
+    def pools(self) -> set[str]:
+        """Names of the pools whose scans or objects it needs."""
+        found = {stage.pool for stage in self.stages(0.5)} - {"", REAL}
+        return found | ({"skin"} if any("objects" in stage.options for stage in self.stages(0.5)) else set())
+
+
+_EXCHANGE = {"kind": "exchange"}
+_RARE = {"kind": "objects", "objects": True, "turn": 180.0}
+RARE = {"Pedestrian": 3, "Person_sitting": 1, "Cyclist": 2, "Truck": 1, "Tram": 1}
+"""Largest number of pasted objects in a scan by name of their boxes."""
+
+_TOWN = "labels of the town, which cost nothing"
+GENERATOR_BUDGET = "what the generator was trained on"
+_SKIN = f"{_TOWN}; scans of the training places without labels, to learn the skin"
+
+ARMS: dict[str, Arm] = {
+    "real": Arm("real scans only", lambda ratio: (Stage(),), synthetic=False),
+    "longer": Arm("real scans only, twice as long", lambda ratio: (Stage(),), iterations=2, synthetic=False),
+    "exchange": Arm(
+        "real scans, PolarMix and LaserMix",
+        lambda ratio: (Stage(1, 0.5, REAL, "mix", _EXCHANGE),), synthetic=False,
+    ),
+    "town": Arm("with scans of the town", lambda ratio: (Stage(1, ratio, "town"),), swept=True, budget=_TOWN),
+    "skin": Arm(
+        "with scans of the town in your skin",
+        lambda ratio: (Stage(1, ratio, "skin"),), swept=True, budget=_SKIN,
+    ),
+    "generator": Arm(
+        "with generated scans", lambda ratio: (Stage(1, ratio, "generator"),), swept=True,
+        budget=GENERATOR_BUDGET,
+    ),
+    "pretrain": Arm(
+        "town in your skin first, real last",
+        lambda ratio: (Stage(0.5, 1, "skin"), Stage(0.5)), budget=_SKIN,
+    ),
+    "paste": Arm(
+        "real scans, rare objects pasted",
+        lambda ratio: (Stage(1, 0.5, REAL, "mix", _RARE),), budget=_SKIN,
+    ),
+    "together": Arm(
+        "town first, then exchanged, real last",
+        lambda ratio: (
+            Stage(0.4, 1, "skin"), Stage(0.3, 0.5, "skin", "mix", _EXCHANGE), Stage(0.3, 0.5, REAL, "mix", _EXCHANGE)
+        ), budget=_SKIN,
+    ),
+}  # fmt: skip
+"""Arms by name."""
+
+BASE = "real"
+"""The arm with which the others are compared."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """An arm with its share of synthetic samples.
+
+    Args:
+        name: of the arm.
+        ratio: the share; None where it does not matter.
+    """
+
+    name: str
+    ratio: float | None = None
+
+    @property
+    def arm(self) -> Arm:
+        """The arm."""
+        return ARMS[self.name]
+
+    @property
+    def key(self) -> str:
+        """A text that names the row, also in the names of files."""
+        return self.name if self.ratio is None else f"{self.name}-{100 * self.ratio:g}"
+
+    @property
+    def title(self) -> str:
+        """The row in tables."""
+        return self.arm.title if self.ratio is None else f"{self.arm.title}, {100 * self.ratio:g} %"
+
+    def stages(self) -> tuple[Stage, ...]:
+        """The stages of the training."""
+        return self.arm.stages(0.5 if self.ratio is None else self.ratio)
+
+
+def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
+    """The rows of a comparison; ``BASE`` is always the first.
+
+    Raises:
+        ConfigError: on an unknown arm, or a share that is not between 0 and 1.
+    """
+    if unknown := [name for name in names if name not in ARMS]:
+        raise ConfigError(f"arm {', '.join(map(repr, unknown))}", f"some of {', '.join(ARMS)}")
+    if wrong := [ratio for ratio in ratios if not 0 < ratio < 1]:
+        raise ConfigError(f"ratio {wrong[0]}", "shares of synthetic scans between 0 and 1, such as 0.5")
+    ordered = [name for name in ARMS if name in {BASE, *names}]
+    return [Row(name, r) for name in ordered for r in (sorted(set(ratios)) if ARMS[name].swept else (None,))]
+
+
+def policy_of(stage: Stage, real: Any, objects: ObjectBank | None, fields: frozenset[str]) -> LabelPolicy:
+    """The label policy of a stage.
+
+    Args:
+        stage: the stage.
+        real: the labelled scans.
+        objects: those to paste.
+        fields: the fields of the synthetic scans.
+    """
+    options = dict(stage.options)
+    if options.pop("objects", False):
+        assert objects is not None
+        there = {n for n, points in zip(objects.boxes.names, objects.counts, strict=True) if points >= 5}
+        options |= {"objects": objects, "count": {name: most for name, most in RARE.items() if name in there}}
+    elif options.get("kind") == "exchange" and real[0].instance is None:
+        options["objects"] = 0  # PolarMix turns whole objects, which needs instances
+    return make_policy(stage.labels, real=real, fields=fields, **options)

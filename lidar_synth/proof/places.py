@@ -1,0 +1,164 @@
+"""The places of a labelled dataset: groups of scans that show nothing of each other.
+
+A network that is tested on a street on which it was trained looks better than it is, and neighbouring frames show one
+street. Scans of one place are therefore all trained on or all tested on.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.scan import Source
+
+APART = 50.0
+"""Metres: scans nearer than this are of one place; a sensor sees about as far."""
+STRETCHES = 3
+LEFT_OUT = 0.25
+"""Share of the scans of a drive that are left out between its stretches."""
+MOST_POSES = 2000
+
+Places = dict[str, list[int]]
+"""{name of the place: indices of its scans in the source}."""
+
+
+def by_drive(source: Source, names: Sequence[str]) -> Places:
+    """A place for each drive (sequence): what the names of scans have before the frame."""
+    places: Places = {}
+    for index, name in enumerate(names):
+        places.setdefault(name.rpartition("/")[0] or "all scans", []).append(index)
+    return places
+
+
+def by_pose(source: Source, names: Sequence[str]) -> Places:
+    """A place for each cluster of poses; different clusters are at least ``APART`` metres from each other.
+
+    Drives are kept apart, because many datasets give the poses of each drive from its own start.
+
+    Raises:
+        DataError: on a scan without a pose.
+    """
+    places: Places = {}
+    for drive, indices in by_drive(source, names).items():
+        # Neighbouring frames are metres apart: some of them show where the drive went.
+        indices = indices[:: max(1, len(names) // MOST_POSES)]
+        positions = np.array([_position(source, i) for i in indices])
+        cluster = clusters(positions, APART)
+        for number in range(cluster.max() + 1):
+            name = f"{drive}, place {number + 1}"
+            places[name] = [i for i, c in zip(indices, cluster, strict=True) if c == number]
+    return places
+
+
+def by_stretch(source: Source, names: Sequence[str], count: int = STRETCHES) -> Places:
+    """Equal stretches of each drive in the order of its frames; a share of ``LEFT_OUT`` between them is left out."""
+    places: Places = {}
+    for drive, indices in by_drive(source, names).items():
+        gap = LEFT_OUT * len(indices) / (count - 1)
+        length = (1 - LEFT_OUT) * len(indices) / count
+        for number in range(count):
+            first = number * (length + gap)
+            if chosen := indices[round(first) : round(first + length)]:
+                places[f"{drive}, stretch {number + 1}"] = chosen
+    return places
+
+
+SPLITS: dict[str, Callable[[Source, Sequence[str]], Places]] = {
+    "drive": by_drive, "pose": by_pose, "stretch": by_stretch,
+}  # fmt: skip
+"""Ways to find places, by name."""
+
+
+def find_places(source: Source, by: str = "auto") -> Places:
+    """The places of a source.
+
+    Args:
+        source: scans; their names are its ``ids`` or those of the scans.
+        by: a name of ``SPLITS``; ``"auto"`` takes drives if there are at least two, and otherwise clusters of poses.
+            ``"stretch:2"`` is the split with two stretches.
+
+    Raises:
+        ConfigError: on an unknown split.
+        DataError: if there is only one place.
+    """
+    by, mark, count = by.partition(":")
+    counted = by == "stretch" and count.isdigit() and int(count) > 1
+    if (by != "auto" and by not in SPLITS) or (count and not counted):
+        raise ConfigError(f"places by {by + mark + count!r}", f"one of auto, {', '.join(SPLITS)}, or stretch:2")
+    names = names_of(source)
+    if by == "auto":
+        by = "drive" if len(by_drive(source, names)) > 1 or not _has_pose(source) else "pose"
+    places = by_stretch(source, names, int(count)) if count else SPLITS[by](source, names)
+    if len(places) < 2:
+        raise DataError(
+            f"{len(source)} scans of one place ({next(iter(places))})",
+            "scans of at least two places, better of five or more: networks are tested on places that they have not "
+            "seen",
+            "Add drives or sequences. If a single drive is all there is, split it: --places stretch "
+            "(places='stretch').",
+        )
+    return dict(sorted(places.items()))
+
+
+def names_of(source: Source) -> list[str]:
+    """The names of the scans of a source."""
+    names = getattr(source, "ids", None)
+    return [source[i].id for i in range(len(source))] if names is None else list(names)
+
+
+def clusters(positions: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
+    """(N,) number of the cluster of each position (N, 3); two clusters are at least ``apart`` from each other.
+
+    Positions in the same or in neighbouring squares of side ``apart`` are of one cluster.
+    """
+    squares, square = np.unique(np.floor(positions[:, :2] / apart).astype(np.int64), axis=0, return_inverse=True)
+    numbers = {tuple(s): i for i, s in enumerate(squares.tolist())}
+    cluster = np.full(len(squares), -1, np.int64)
+    count = 0
+    for start in range(len(squares)):
+        waiting = [start] if cluster[start] < 0 else []
+        count += bool(waiting)
+        while waiting:
+            here = waiting.pop()
+            cluster[here] = count - 1
+            x, y = squares[here].tolist()
+            near = (numbers.get((x + dx, y + dy)) for dx in (-1, 0, 1) for dy in (-1, 0, 1))
+            waiting += [n for n in near if n is not None and cluster[n] < 0]
+    return cluster[square.reshape(-1)]
+
+
+def _has_pose(source: Source) -> bool:
+    return source[0].pose is not None
+
+
+def _position(source: Source, index: int) -> NDArray[np.float64]:
+    scan = source[index]
+    if scan.pose is None:
+        raise DataError(
+            f"scan {scan.id!r} without a pose", "poses, to find places by", "Use --places drive or --places stretch."
+        )
+    return scan.pose[:3, 3]
+
+
+def choose(places: Places, without: str, count: int | None, rng: np.random.Generator) -> list[int]:
+    """The labelled scans to train on: at random, from as many places as possible, none from the place left out.
+
+    Args:
+        places: the places.
+        without: the place that is tested on.
+        count: number of scans; None for all.
+        rng: source of the random numbers.
+
+    Raises:
+        ConfigError: on more scans than there are.
+    """
+    piles = [rng.permutation(indices).tolist() for name, indices in places.items() if name != without]
+    there = sum(map(len, piles))
+    if count is None:
+        return sorted(i for pile in piles for i in pile)
+    if not 1 <= count <= there:
+        raise ConfigError(f"{count} labelled scans", f"1 to {there}, the scans of the places other than {without!r}")
+    order = [piles[i] for i in rng.permutation(len(piles))]
+    dealt = [pile[n] for n in range(max(map(len, order))) for pile in order if n < len(pile)]
+    return sorted(dealt[:count])

@@ -1,0 +1,70 @@
+"""What a comparison is asked to do."""
+
+from dataclasses import dataclass
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.proof.arms import ARMS
+
+MOST_LABELLED = 200
+"""Labelled scans that are trained on if no number is given."""
+
+
+@dataclass(frozen=True)
+class ProofSettings:
+    """The settings of ``prove``.
+
+    Args:
+        labelled: number of labelled scans that each training gets; by default all of the training places, at most
+            ``MOST_LABELLED``.
+        arms: names of ``ARMS``; "real" is always among them.
+        ratios: shares of synthetic scans, for the arms in which they matter.
+        iterations: of each training.
+        batch: samples of an iteration.
+        seeds: repetitions of each training, with other weights, order and labelled scans.
+        places: how places are found: "auto" or a name of ``SPLITS``.
+        tested: largest number of scans of a place that are tested on, evenly spread.
+        synthetic: scans of a pool.
+        model: of the arm "generator": a name or a path.
+        columns: of the grid that the reference network sees; None keeps scans as they are, for your own trainer.
+        widths: channels of the reference network by level.
+        classes: how classes are pooled: a name of ``GROUPS``; "auto" takes that of the dataset's layout.
+        only: names of the classes that the mean IoU is over; all that occur by default.
+        seed: of the choice of labelled scans and of the order of places.
+
+    Raises:
+        ConfigError: on values with which nothing can be trained.
+
+    Example:
+        >>> from lidar_synth import ProofSettings
+        >>> settings = ProofSettings(labelled=24, arms=("exchange", "skin", "pretrain"), ratios=(0.25, 0.5))
+        >>> settings.iterations, settings.seeds
+        (500, 2)
+    """
+
+    labelled: int | None = None
+    arms: tuple[str, ...] = tuple(ARMS)
+    ratios: tuple[float, ...] = (0.5,)
+    iterations: int = 500
+    batch: int = 4
+    seeds: int = 2
+    places: str = "auto"
+    tested: int = 20
+    synthetic: int = 150
+    model: str = "town"
+    columns: int | None = 512
+    widths: tuple[int, ...] = (16, 32, 64, 96)
+    classes: str = "auto"
+    only: tuple[str, ...] = ()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "batch", "seeds", "tested", "synthetic"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}", "1 or more")
+        if self.iterations < 10:
+            raise ConfigError(f"iterations={self.iterations}", "10 or more")
+        if self.labelled is not None and self.labelled < self.batch:
+            raise ConfigError(
+                f"{self.labelled} labelled scans for batches of {self.batch}", "at least as many scans as a batch has",
+                f"Use --batch {max(1, self.labelled)} (batch={max(1, self.labelled)}), or label more scans.",
+            )  # fmt: skip

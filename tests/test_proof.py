@@ -1,0 +1,189 @@
+"""``prove`` end to end: on the town, on real scans where they are, resumed, within its minutes, and its page."""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import browsers
+import numpy as np
+import pytest
+from proofs import drives, write_town
+from small_models import write as write_model
+from typer.testing import CliRunner
+
+from lidar_synth import ProofSettings, prove
+from lidar_synth.cli import app
+from lidar_synth.datasets.classes import PANDASET
+from lidar_synth.datasets.recordings import frames_of
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.generate.checkpoint import load_checkpoint, save_checkpoint
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.proof import ARMS, Job, Proof, pools
+from lidar_synth.proof.pools import refuse_leaks
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
+
+SMALL = ProofSettings(
+    arms=("real", "exchange"), iterations=10, batch=2, seeds=1, columns=64, widths=(4, 8), tested=2, synthetic=3
+)
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two streets of the town, five scans each, in one sequence."""
+    return write_town(tmp_path_factory.mktemp("town"), 2, (2, 6, 10, 14, 18))
+
+
+@pytest.fixture(scope="module")
+def proof(town: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Proof]:
+    """The output folder of a comparison on the town with every arm that needs no generator, and its result."""
+    out = tmp_path_factory.mktemp("proof")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pools, "SKIN_STREETS", 1)
+        arms = tuple(name for name in ARMS if "generator" not in ARMS[name].pools())
+        settings = replace(SMALL, arms=arms, columns=128)
+        return out, prove(town, out, settings, jobs=1, progress=False)
+
+
+def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
+    out, result = proof
+    values = result.values
+    assert values["tested_places"] == ["00, place 1", "00, place 2"] and values["pairs"] == 2
+    keys = [row["key"] for row in values["arms"]]
+    assert keys == ["real", "longer", "exchange", "town-50", "skin-50", "pretrain", "paste", "together"]
+    for row in values["arms"]:
+        assert 0 < row["miou"] < 100 and row["minutes"] > 0 and "5 labelled scans" in row["budget"]
+        assert row["interval"] is None  # two places
+        gain = row["miou"] - values["arms"][0]["miou"]
+        assert row["difference"] == (None if row["key"] == "real" else pytest.approx(gain))
+    assert "5 scans of the training places without labels" in values["arms"][4]["budget"]
+    assert "too few for an interval" in result.headline and result.headline in str(result)
+    assert json.loads((out / "results.json").read_text()) == json.loads(json.dumps(values))
+
+
+def test_the_page_is_one_file_that_says_it_all(proof: tuple[Path, Proof]) -> None:
+    out, result = proof
+    text = (out / "index.html").read_text()
+    assert not re.search(r"https?://|src=|@\w+@", text)
+    for words in ("What was not tested", "IoU by class", "Label budget", "Machine:", "Command:", "motorcyclist"):
+        assert words in text
+    for row in result.values["arms"]:
+        assert row["title"] in text
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    yield from browsers.running()
+
+
+@pytest.mark.parametrize("width", [1280, 420])
+def test_the_page_shows_in_a_browser(width: int, proof: tuple[Path, Proof], browser: Any) -> None:
+    browser.set_window_size(width, 900)
+    browser.get((proof[0] / "index.html").as_uri())
+    assert browser.get_log("browser") == []
+    assert browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
+    circles = browser.find_elements("css selector", "svg circle")
+    assert len(circles) >= 7 and all(c.size["width"] > 0 for c in circles)
+
+
+def test_a_comparison_resumes_and_grows(tmp_path: Path) -> None:
+    source = drives(3, 4)
+    prove(source, tmp_path, SMALL, jobs=1, progress=False)
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*.json")}
+    assert len(before) == 6
+    (lost := next(iter(before))).unlink()
+    more = replace(SMALL, arms=("real", "exchange", "longer"), seeds=2)
+    again = prove(source, tmp_path, more, jobs=1, progress=False)
+    after = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*.json")}
+    assert len(after) == 18 and [path for path in before if after[path] != before[path]] == [lost]
+    assert again.values["pairs"] == 6
+    with pytest.raises(ConfigError, match="'iterations': 10"):
+        prove(source, tmp_path, replace(SMALL, iterations=12), jobs=1, progress=False)
+
+
+def test_processes_give_the_results_of_one_process(tmp_path: Path) -> None:
+    source = drives(2, 3)
+    one = prove(source, tmp_path / "one", SMALL, jobs=1, progress=False)
+    two = prove(source, tmp_path / "two", SMALL, jobs=2, progress=False)
+    assert [row["miou"] for row in one.values["arms"]] == [row["miou"] for row in two.values["arms"]]
+
+
+def test_a_time_that_is_over_starts_no_training(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="minutes, in which 0 of at least 2 places"):
+        prove(drives(), tmp_path, replace(SMALL, iterations=10**6), minutes=1, jobs=1, progress=False)
+
+
+def perfect(job: Job) -> np.ndarray:
+    """A trainer that knows the labels where its arm exchanges parts, and takes everything for road otherwise."""
+    label = np.concatenate([scan.label for scan in job.held_out if scan.label is not None])
+    label = label[label != 255].astype(int)
+    given = label if job.row.name == "exchange" else np.full_like(label, 8)
+    return np.bincount(label * 19 + given, minlength=361).reshape(19, 19)
+
+
+def test_a_trainer_of_ones_own_is_measured(tmp_path: Path) -> None:
+    result = prove(drives(6, 2), tmp_path, SMALL, jobs=1, trainer=perfect, progress=False)
+    base, exchange = result.values["arms"]
+    assert exchange["miou"] == 100 and base["miou"] < 50 and result.values["trainer"] == "perfect"
+    low, high = exchange["interval"]
+    assert low <= exchange["difference"] <= high and low > 0
+
+
+def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(tmp_path: Path) -> None:
+    saved = load_checkpoint(write_model(tmp_path / "plain.safetensors"))
+    seen = frames_of("semantic_kitti", ["00/000000", "00/000001", "00/000002"])
+    header = replace(saved.header, provenance={**saved.header.provenance, "seen": seen.to_list()})
+    path = tmp_path / "leaks.safetensors"
+    save_checkpoint(path, header, saved.networks)
+    with pytest.raises(ConfigError, match=r"2011_10_03_drive_0027 \(frame 2\)"):
+        refuse_leaks(str(path), frames_of("semantic_kitti", ["00/000002", "01/000000"]))
+    refuse_leaks(str(path), frames_of("semantic_kitti", ["00/000003", "01/000000"]))
+
+
+def test_the_shipped_generator_is_not_measured_on_its_own_town(town: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="trained on places that are tested: town seed 0"):
+        prove(town, tmp_path, replace(SMALL, arms=("generator",)), jobs=1, progress=False)
+
+
+def test_the_command_plans_and_proves(town: Path, tmp_path: Path) -> None:
+    runner = CliRunner()
+    arms = ["--arm", "exchange", "--iterations", "10", "--batch", "2", "--seeds", "1", "--jobs", "1"]
+    planned = runner.invoke(app, ["prove", str(town), *arms, "--dry-run", "--out", str(tmp_path / "none")])
+    assert planned.exit_code == 0 and "4 trainings; about" in planned.output and not (tmp_path / "none").exists()
+    done = runner.invoke(app, ["prove", str(town), *arms, "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert "| real scans only |" in done.output and (tmp_path / "index.html").is_file()
+
+
+def test_real_scans_are_proved(labelled_scans: Path, tmp_path: Path) -> None:
+    root = labelled_scans / "semantic_kitti"
+    settings = replace(SMALL, labelled=4, batch=4)
+    values = prove(root, tmp_path, settings, jobs=1, progress=False).values
+    assert values["tested_places"] == ["00", "01", "03", "04", "06", "07", "09"]
+    low, high = values["arms"][1]["interval"]
+    assert low < values["arms"][1]["difference"] < high
+    for pair, names in values["labelled_scans"].items():
+        place = pair.split(",")[0]
+        assert len({name[:2] for name in names} - {place}) == 4
+
+
+def pandaset_frame(path: Path) -> Scan:
+    """A frame of PandaSet in the frame of its sensor, with PandaSet's own class ids as labels."""
+    with np.load(path) as file:
+        reflectance = file["reflectance"].astype(np.float32) / 255
+        return Scan(file["points"], reflectance, load_sensor("pandar64"), label=file["label"], id=f"002/{path.stem}")
+
+
+def test_labels_of_pandaset_need_its_table(labelled_scans: Path, tmp_path: Path) -> None:
+    paths = sorted((labelled_scans / "pandaset" / "sensor_frame").glob("*.npz"))[::5]
+    source = [pandaset_frame(path) for path in paths]
+    settings = replace(SMALL, places="stretch:2", arms=("real",), classes="pandaset")
+    with pytest.raises(DataError, match=r"with labels \[.*of another table"):
+        prove(source, tmp_path, settings, jobs=1, progress=False)
+    mapped = [replace(scan, label=PANDASET.decode(scan.label)) for scan in source if scan.label is not None]
+    values = prove(mapped, tmp_path, settings, jobs=1, progress=False).values
+    assert len(values["tested_places"]) == 2 and "vehicle" in values["classes"]

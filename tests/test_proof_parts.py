@@ -1,0 +1,310 @@
+"""The parts of ``prove``: places, arms, scores and intervals, the plan, a trainer as a command, the page."""
+
+import shlex
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+import yaml
+from conftest import random_scan
+from proofs import SENSOR, Scans, drives, job
+from scipy import stats
+
+from lidar_synth.datasets.classes import NAMES, TRAIN_ID
+from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError, ProcessError
+from lidar_synth.evaluate.segmentation import class_ious
+from lidar_synth.geometry.projection import project
+from lidar_synth.labels.exchange import thinned
+from lidar_synth.models.segmenter import CircularConv, _Wrapped
+from lidar_synth.proof import ARMS, CommandTrainer, ProofSettings
+from lidar_synth.proof.arms import rows
+from lidar_synth.proof.command import describe
+from lidar_synth.proof.drawing import ticks
+from lidar_synth.proof.places import APART, SPLITS, choose, clusters, find_places
+from lidar_synth.proof.plan import expected_minutes, make_plan
+from lidar_synth.proof.scores import (
+    FEWEST_PLACES,
+    GROUPS,
+    group_ious,
+    groups_of,
+    interval,
+    require_labels,
+    t_quantile,
+)
+from lidar_synth.proof.trial import reference, turned
+
+
+def test_wrapped_padding_is_circular_padding() -> None:
+    x = torch.randn(2, 3, 4, 6, dtype=torch.float64, requires_grad=True)
+    assert torch.equal(_Wrapped.apply(x), F.pad(x, (1, 1, 0, 0), mode="circular"))
+    assert torch.autograd.gradcheck(_Wrapped.apply, (x,))
+    layer = CircularConv(3, 2).double().eval()
+    assert torch.allclose(layer(x).roll(2, -1), layer(x.roll(2, -1)))
+
+
+SOURCES = {
+    "drive": drives(3, 4),
+    "pose": Scans([f"00/{i:06d}" for i in range(9)], [0, 10, 40, 500, 510, 540, 900, 950, 960]),
+    "stretch": Scans([f"00/{i:06d}" for i in range(16)]),
+}
+"""A source for every split."""
+
+
+@pytest.mark.parametrize("by", SPLITS)
+def test_a_split_has_places_without_a_scan_in_common(by: str) -> None:
+    places = find_places(SOURCES[by], by)
+    members = [i for part in places.values() for i in part]
+    assert len(places) == 3 and len(set(members)) == len(members) and set(members) <= set(range(len(SOURCES[by])))
+
+
+def test_places_by_pose_are_apart_from_each_other() -> None:
+    rng = np.random.default_rng(0)
+    positions = rng.uniform(0, 1500, (200, 3))
+    cluster = clusters(positions, APART)
+    distance = np.linalg.norm(positions[:, None, :2] - positions[None, :, :2], axis=-1)
+    assert cluster.max() > 10
+    assert distance[cluster[:, None] != cluster[None]].min() >= APART
+
+
+def test_between_stretches_scans_are_left_out() -> None:
+    places = find_places(Scans([f"002/{i:02d}" for i in range(39)]), "stretch:2")
+    assert [len(p) for p in places.values()] == [15, 15]
+    assert list(places.values()) == [list(range(15)), list(range(24, 39))]
+
+
+def test_auto_takes_drives_and_else_poses() -> None:
+    assert find_places(SOURCES["drive"]) == find_places(SOURCES["drive"], "drive")
+    assert find_places(SOURCES["pose"]) == find_places(SOURCES["pose"], "pose")
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, None])
+def test_labelled_scans_come_from_many_places_and_not_from_the_one_left_out(count: int | None) -> None:
+    places = find_places(drives(4, 5))
+    picked = choose(places, "01", count, np.random.default_rng(0))
+    per_place = Counter(next(name for name, part in places.items() if i in part) for i in picked)
+    assert "01" not in per_place and len(picked) == (count or 15)
+    assert max(per_place.values()) - (min(per_place.values()) if len(per_place) == 3 else 0) <= 1
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_an_arm_trains_for_its_iterations_with_its_shares(name: str, tmp_path: Path) -> None:
+    task = job(name, tmp_path, iterations=21, ratio=0.5 if ARMS[name].swept else None)
+    mixtures = list(task.mixtures(collate="range"))
+    stages = task.row.stages()
+    assert sum(count for _, count in mixtures) == task.iterations
+    assert sum(stage.share for stage in stages) == pytest.approx(1)
+    for stage, (mixed, count) in zip(stages, mixtures, strict=True):
+        domains = [mixed.domain(i) for i in range(len(mixed))]
+        assert len(domains) == count * task.batch
+        assert abs(sum(domains) - stage.ratio * len(domains)) < 1
+    batch = mixtures[-1][0].collate([mixtures[-1][0][i] for i in range(task.batch)])
+    assert (batch["label"] != 255).any()
+
+
+@pytest.mark.parametrize("name", ["pretrain", "paste"])
+def test_the_reference_trainer_learns_and_repeats_itself(name: str, tmp_path: Path, one_thread: None) -> None:
+    task = job(name, tmp_path, iterations=20)
+    first, second = reference(task), reference(task)
+    assert np.array_equal(first.table, second.table)
+    assert first.losses[-1] < first.losses[0]
+    steps = [step for step, _ in first.curve]
+    assert steps == sorted(set(steps)) and steps[-1] == 20 and np.array_equal(first.curve[-1][1], first.table)
+
+
+def test_turning_keeps_every_return_in_a_cell() -> None:
+    scan = thinned(random_scan(SENSOR, 20_000), SENSOR)
+    cells = np.count_nonzero(project(scan).range)
+    for seed in range(5):
+        kept = np.count_nonzero(project(turned(scan, np.random.default_rng(seed))).range)
+        assert abs(kept - cells) <= 0.001 * cells
+
+
+@pytest.mark.parametrize("classes", GROUPS)
+def test_groups_name_classes_once(classes: str) -> None:
+    members = [m for part in GROUPS[classes].values() for m in part]
+    assert len(set(members)) == len(members) and set(members) <= set(NAMES)
+
+
+def test_iou_of_single_classes_is_that_of_the_table() -> None:
+    table = np.random.default_rng(0).integers(0, 50, (19, 19))
+    table[3] = 0
+    ours, theirs = group_ious(table, GROUPS["semantic_kitti"]), class_ious(table)
+    assert np.isnan(ours[3]) and np.allclose(np.delete(ours, 3), np.delete(theirs, 3))
+
+
+def test_pooled_classes_forgive_confusions_within_a_pool_and_no_others() -> None:
+    table = np.zeros((19, 19), np.int64)
+    table[TRAIN_ID["car"], TRAIN_ID["truck"]] = 10  # within "vehicle"
+    table[TRAIN_ID["road"], TRAIN_ID["pole"]] = 5  # a prediction of no pool
+    table[TRAIN_ID["road"], TRAIN_ID["road"]] = 5
+    table[TRAIN_ID["pole"], TRAIN_ID["road"]] = 7  # a label of no pool does not count
+    ious = dict(zip(GROUPS["pandaset"], group_ious(table, GROUPS["pandaset"]), strict=True))
+    assert ious["vehicle"] == 1 and ious["road"] == 0.5 and np.isnan(ious["building"])
+
+
+@pytest.mark.parametrize("degrees", [1, 4, 6, 30])
+def test_the_quantile_of_t_is_that_of_scipy(degrees: int) -> None:
+    assert t_quantile(0.975, degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-3)
+
+
+@pytest.mark.parametrize(("places", "seeds", "between", "within"), [(6, 1, 1, 1), (7, 2, 1, 1), (7, 2, 1, 0.1)])
+def test_intervals_hold_the_truth_as_often_as_they_say(places: int, seeds: int, between: float, within: float) -> None:
+    rng, held, count = np.random.default_rng(0), 0, 400
+    for trial in range(count):
+        d = 2 + rng.normal(0, between, (places, 1)) + rng.normal(0, within, (places, seeds))
+        low, high = interval(d, seed=trial, draws=800)  # type: ignore[misc]
+        held += low <= 2 <= high
+    assert 0.91 <= held / count <= 0.99
+
+
+def test_too_few_places_have_no_interval_and_missing_seeds_do_not_count() -> None:
+    d = np.random.default_rng(0).normal(size=(FEWEST_PLACES, 2))
+    assert interval(d[1:]) is None
+    d[0, 1] = np.nan
+    low, high = interval(d)  # type: ignore[misc]
+    assert low < np.nanmean(d) < high
+
+
+def test_ticks_are_round_and_few() -> None:
+    assert ticks(-3.2, 7.9) == [-2.0, 0.0, 2.0, 4.0, 6.0] and 3 <= len(ticks(0, 533)) <= 8
+
+
+SMALL = ProofSettings(arms=("real", "town"), iterations=10, batch=2, seeds=2, columns=64, widths=(4, 8), tested=2)
+
+
+def test_a_plan_is_paired_and_tests_on_places_left_out() -> None:
+    source = drives(4, 5)
+    plan, scans = make_plan(source, SMALL, None, 1)
+    assert len(plan.pairs) == plan.wanted == 8 and [row.key for row in plan.rows] == ["real", "town-50"]
+    for (place, _), indices in plan.labelled.items():
+        assert not set(indices) & set(plan.places[place]) and {*indices, *plan.tested[place]} <= set(scans)
+        assert not set(plan.skin_scans(place)) & set(plan.places[place])
+    assert all(scan.sensor.columns == 64 for scan in scans.values())
+
+
+def test_a_plan_keeps_to_its_minutes_by_whole_pairs_and_places_come_before_seeds() -> None:
+    whole, _ = make_plan(drives(4, 5), SMALL, None, 1)
+    plan = replace(whole, step=6.0)
+    from lidar_synth.proof.plan import _within
+
+    minutes = expected_minutes(plan, plan.pairs[:3]) + 0.01
+    short = _within(plan, minutes)
+    assert short.pairs == plan.pairs[:3] and short.minutes <= minutes
+    assert {seed for _, seed in plan.pairs[:4]} == {0}
+    with pytest.raises(ConfigError, match="1 of at least 2 places can be tested; expected about"):
+        _within(plan, expected_minutes(plan, plan.pairs[:1]) + 0.01)
+
+
+def scans_with(**changes: object) -> Scans:
+    source = drives(3, 4)
+    source[5] = replace(source[5], **changes)  # type: ignore[arg-type]
+    return source
+
+
+BAD = {
+    "one place": (Scans([f"00/{i}" for i in range(6)]), {}, "6 scans of one place"),
+    "one cluster of poses": (Scans([f"00/{i}" for i in range(4)], [0, 1, 2, 3]), {}, "--places stretch"),
+    "no poses": (drives(), {"places": "pose"}, "without a pose"),
+    "an unknown split": (drives(), {"places": "street"}, "places by 'street'; expected one of auto, drive"),
+    "no number of stretches": (drives(), {"places": "drive:2"}, "places by 'drive:2'"),
+    "fewer scans than a batch": (drives(2, 3), {"batch": 4}, "3 labelled scans for batches of 4"),
+    "fewer labelled than a batch": (drives(), {"labelled": 1}, "1 labelled scans for batches of 2"),
+    "more labelled than there are": (drives(), {"labelled": 9}, "9 labelled scans; expected 1 to 8"),
+    "an unknown class": (drives(), {"only": ("tram",)}, "class 'tram' of semantic_kitti"),
+    "a class that is nowhere": (drives(), {"only": ("road", "bicyclist")}, "class bicyclist, which no label"),
+    "unknown pooled classes": (drives(), {"classes": "waymo"}, "classes 'waymo'; expected one of"),
+    "an unknown arm": (drives(), {"arms": ("real", "magic")}, "arm 'magic'; expected some of real"),
+    "a share of everything": (drives(), {"ratios": (1.0,)}, "ratio 1.0"),
+    "no labels": (scans_with(label=None, raw_label=None), {}, "without labels"),
+    "labels of another table": (
+        scans_with(label=np.full(len(drives()[5]), 41, np.uint8), raw_label=None), {}, r"with labels \[41\]",
+    ),
+}  # fmt: skip
+"""{what is wrong: source, settings, message}."""
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_refused_with_what_to_do(case: str) -> None:
+    source, options, message = BAD[case]
+    with pytest.raises(LidarSynthError, match=message):
+        make_plan(source, replace(SMALL, **options), None, 1)
+
+
+def test_groups_without_any_label_are_refused() -> None:
+    with pytest.raises(DataError, match="without a label of any scored class"):
+        require_labels(np.zeros(19, np.int64), groups_of("pandaset"), ())
+
+
+def test_rows_have_one_key_each_and_the_base_comes_first() -> None:
+    found = rows(("skin", "town"), (0.5, 0.25))
+    assert [row.key for row in found] == ["real", "town-25", "town-50", "skin-25", "skin-50"]
+
+
+TRAINER = """
+import sys, yaml, numpy as np
+from pathlib import Path
+from lidar_synth import MixedScans, SemanticKITTI
+job = yaml.safe_load(open(sys.argv[1]))
+real, seen = SemanticKITTI(job["real"]), 0
+for stage in job["stages"]:
+    synth = SemanticKITTI(stage["synthetic"]) if stage["synthetic"] else None
+    size = stage["iterations"] * job["batch"]
+    mixed = MixedScans(None if stage["ratio"] == 1 else real, synth, stage["ratio"], labels=stage["labels"],
+                       label_options=stage["label_options"], seed=job["seed"], epoch_size=size)
+    seen += sum(len(mixed[i]["points"]) > 0 for i in range(2)) > 0
+assert seen == len(job["stages"])
+held_out = SemanticKITTI(job["held_out"])
+Path(job["predictions"]).mkdir()
+for i in range(len(held_out)):
+    assert (held_out[i].label == 255).all()
+    np.full(len(held_out[i]), 40, "<u4").tofile(Path(job["predictions"]) / f"{i:06d}.label")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pretrain", "paste"])
+def test_a_command_trains_on_the_mixture_of_its_file(name: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(TRAINER)
+    task = job(name, tmp_path)
+    table = CommandTrainer(f"{sys.executable} {tmp_path / 'mine.py'} {{job}}")(task)
+    label = np.concatenate([scan.label for scan in task.held_out])
+    road = TRAIN_ID["road"]
+    assert table.sum() == (label != 255).sum() == table[:, road].sum() and table[road, road] == (label == road).sum()
+
+
+FAILING = {
+    "a failure": ("import sys; print('out of memory', file=sys.stderr); sys.exit(7)", ProcessError, "status 7: out of"),
+    "no predictions": ("", FileError, "000000.label cannot be read"),
+    "one prediction": (
+        "import sys, yaml, pathlib; p = pathlib.Path(yaml.safe_load(open(sys.argv[1]))['predictions']); p.mkdir(); "
+        "(p / '000000.label').write_bytes(bytes(4))", DataError, "with 1 predictions; expected",
+    ),
+}  # fmt: skip
+"""{what a command does: its program, the error, its message}."""
+
+
+@pytest.mark.parametrize("case", FAILING)
+def test_a_command_that_fails_is_named(case: str, tmp_path: Path) -> None:
+    program, kind, message = FAILING[case]
+    with pytest.raises(kind, match=message):
+        CommandTrainer(shlex.join([sys.executable, "-c", program, "{job}"]))(job("real", tmp_path))
+
+
+def test_a_command_names_its_job(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="a command with {job}"):
+        CommandTrainer("python mine.py")
+    with pytest.raises(ProcessError, match="does not start"):
+        CommandTrainer("no-such-program {job}")(job("real", tmp_path))
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_job_is_plain_values(name: str, tmp_path: Path) -> None:
+    task = job(name, tmp_path, ratio=0.25 if ARMS[name].swept else None)
+    values = describe(task)
+    assert yaml.safe_load(yaml.safe_dump(values)) == values
+    assert [stage["iterations"] for stage in values["stages"]] == [count for _, count in task.stages()]
