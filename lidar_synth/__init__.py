@@ -44,6 +44,7 @@ _HOME = {
     "Trajectory": "geometry.fitting",
     "assign_beams": "geometry.fitting",
     "deskew": "geometry.fitting",
+    "edit": "labels",
     "fit_sensor": "geometry.fitting",
     "fit_skin": "town",
     "load_generator": "generate.generator",
@@ -87,6 +88,7 @@ if TYPE_CHECKING:
     from lidar_synth.geometry.sensor import Sensor as Sensor
     from lidar_synth.geometry.sensor import load_sensor as load_sensor
     from lidar_synth.labels import ObjectBank as ObjectBank
+    from lidar_synth.labels import edit as edit
     from lidar_synth.labels import make_policy as make_policy
     from lidar_synth.mixing import Linear as Linear
     from lidar_synth.mixing import MixedScans as MixedScans
@@ -103,4 +105,5 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'lidar_synth' has no attribute {name!r}")
-    return getattr(import_module(f"lidar_synth.{_HOME[name]}"), name)
+    home = import_module(f"lidar_synth.{_HOME[name]}")
+    return getattr(home, name) if hasattr(home, name) else import_module(f"{home.__name__}.{name}")
