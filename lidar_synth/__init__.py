@@ -105,5 +105,4 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'lidar_synth' has no attribute {name!r}")
-    home = import_module(f"lidar_synth.{_HOME[name]}")
-    return getattr(home, name) if hasattr(home, name) else import_module(f"{home.__name__}.{name}")
+    return getattr(import_module(f"lidar_synth.{_HOME[name]}"), name)

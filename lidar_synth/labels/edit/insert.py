@@ -8,13 +8,12 @@ what is in front of it, on the rays of this very scan.
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.rays import Rays
@@ -26,6 +25,9 @@ from lidar_synth.labels.edit.remove import remove, selected
 from lidar_synth.labels.ground import ground_under
 from lidar_synth.labels.objects import Object, objects_of
 from lidar_synth.labels.pasting import occluded, still_visible
+
+if TYPE_CHECKING:
+    from lidar_synth.generate.generator import Generator
 
 TURN = 45.0
 """Largest angle, degrees, by which an object may be seen from another side than it was recorded from."""
@@ -113,7 +115,7 @@ def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5
 
 
 def move(
-    scan: Scan, box: int, pose: Pose, *, model: Generator | str | Path | None = None, seed: int = 0, least: int = 5
+    scan: Scan, box: int, pose: Pose, *, model: "Generator | str | Path | None" = None, seed: int = 0, least: int = 5
 ) -> Scan:
     """Move an object of a scan: ``remove`` it and ``insert`` it at another place.
 

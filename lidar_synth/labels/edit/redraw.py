@@ -3,20 +3,21 @@
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.generate.generator import Generator, load_generator
-from lidar_synth.generate.inpaint import START, check_grid, inpaint
 from lidar_synth.geometry.projection import carry, locate
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.labels.edit.rays import ScanRays
 from lidar_synth.labels.ground import GROUND
 from lidar_synth.labels.objects import THINGS
 
-Model = Generator | None
+if TYPE_CHECKING:  # importing it takes seconds, and most edits need no model
+    from lidar_synth.generate.generator import Generator
+
+Model: TypeAlias = "Generator | None"
 """What draws the content of a hole; None for the geometric estimate alone."""
 
 FAR = 30.0
@@ -26,20 +27,30 @@ BEND = 0.2
 """Largest relative change of distance by which a return on the ground is moved within its cell."""
 
 
-def open_model(model: Generator | str | Path | None) -> Model:
+def open_model(model: "Generator | str | Path | None") -> Model:
     """The generator that an argument names; a name or file is loaded once per process.
 
     Raises:
         ConfigError, FileError, DataError: as ``load_generator``.
     """
-    return _loaded(str(model)) if isinstance(model, str | Path) else model
+    return _load(str(model)) if isinstance(model, str | Path) else model
 
 
-_loaded = lru_cache(maxsize=2)(load_generator)
+@lru_cache(maxsize=2)
+def _load(model: str) -> "Generator":
+    from lidar_synth.generate.generator import load_generator
+
+    return load_generator(model)
 
 
 def redrawn(
-    kept: Scan, filled: Scan, rays: ScanRays, which: NDArray[np.intp], model: Generator, seed: int, start: float = START
+    kept: Scan,
+    filled: Scan,
+    rays: ScanRays,
+    which: NDArray[np.intp],
+    model: "Generator",
+    seed: int,
+    start: float | None = None,
 ) -> Scan:
     """Replace the estimated content of a hole by that of a model.
 
@@ -50,11 +61,13 @@ def redrawn(
         which: (n,) ray of each point.
         model: an unconditional generator.
         seed: of its noise.
-        start: see ``inpaint``.
+        start: see ``inpaint``; None = its default.
 
     Raises:
         DataError: on a scan of another sensor than the model's.
     """
+    from lidar_synth.generate.inpaint import START, check_grid, inpaint
+
     check_grid(kept.sensor, model.sensor)
     there = np.linalg.norm(filled.points, axis=1) > 0
     asked = np.where(there[:, None], filled.points, rays.points(which, np.full(len(which), FAR)))
@@ -67,7 +80,7 @@ def redrawn(
     hole = np.zeros(distance.shape, bool)
     hole.reshape(-1)[cell[cell >= 0]] = True
     hole &= ~known | (everything.point >= len(kept))
-    [drawn] = inpaint(model, [image], [hole], seed, [0], start)
+    [drawn] = inpaint(model, [image], [hole], seed, [0], START if start is None else start)
     inside = (cell >= 0) & hole.reshape(-1)[np.maximum(cell, 0)]
     return _on_rays(filled, rays, which, drawn, cell, inside)
 

@@ -7,14 +7,13 @@ The hole consists of the rays that the object returned or absorbed. They are con
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.edit.compose import composed
 from lidar_synth.labels.edit.fill import continued
@@ -23,6 +22,9 @@ from lidar_synth.labels.edit.redraw import Model, open_model, redrawn
 from lidar_synth.labels.ground import FLOOR, GROUND, ground_under, standing
 from lidar_synth.labels.objects import NOISE, THINGS, belonging
 
+if TYPE_CHECKING:
+    from lidar_synth.generate.generator import Generator
+
 Which = int | Sequence[int] | Boxes | NDArray[np.float32]
 """Boxes: by their numbers in the scan, or by their values."""
 
@@ -30,7 +32,7 @@ MARGIN = 0.05
 """Metres around an object within which a ray without a return is taken for one that the object absorbed."""
 
 
-def remove(scan: Scan, box: Which, *, model: Generator | str | Path | None = None, seed: int = 0) -> Scan:
+def remove(scan: Scan, box: Which, *, model: "Generator | str | Path | None" = None, seed: int = 0) -> Scan:
     """Remove objects from a scan, with their boxes, and fill the holes with what is behind them.
 
     Args:
