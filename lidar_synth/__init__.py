@@ -44,7 +44,6 @@ _HOME = {
     "Trajectory": "geometry.fitting",
     "assign_beams": "geometry.fitting",
     "deskew": "geometry.fitting",
-    "edit": "labels",
     "fit_sensor": "geometry.fitting",
     "fit_skin": "town",
     "load_generator": "generate.generator",
@@ -88,7 +87,6 @@ if TYPE_CHECKING:
     from lidar_synth.geometry.sensor import Sensor as Sensor
     from lidar_synth.geometry.sensor import load_sensor as load_sensor
     from lidar_synth.labels import ObjectBank as ObjectBank
-    from lidar_synth.labels import edit as edit
     from lidar_synth.labels import make_policy as make_policy
     from lidar_synth.mixing import Linear as Linear
     from lidar_synth.mixing import MixedScans as MixedScans

@@ -11,9 +11,9 @@ LIMITS = {
     "docs/index.md": 150,
     "docs/start/install.md": 200,
     "docs/start/tutorial.md": 550,
-    "docs/how-to/mix.md": 600,
-    "docs/how-to/trainers/index.md": 300,
-    "docs/how-to/trainers/mmdetection3d.md": 350,
+    "docs/how-to/mix.md": 640,
+    "docs/how-to/trainers/index.md": 330,
+    "docs/how-to/trainers/mmdetection3d.md": 355,
     "docs/how-to/trainers/openpcdet.md": 250,
     "docs/how-to/trainers/pointcept.md": 220,
     "docs/how-to/trainers/range-view.md": 200,
@@ -31,6 +31,7 @@ LIMITS = {
     "docs/how-to/another-sensor.md": 300,
     "docs/how-to/skin.md": 330,
     "docs/how-to/train-a-generator.md": 450,
+    "docs/how-to/edit.md": 200,
     "docs/how-to/bake.md": 400,
     "docs/how-to/look.md": 150,
     "docs/reference/api.md": 80,
@@ -50,7 +51,7 @@ LIMITS = {
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 8000
+MAIN_PATH = 8250
 """Words of all pages of docs/ that are read, not looked up as the reference is."""
 
 PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if not {"research", "notebooks"} & set(p.parts)]

@@ -11,17 +11,18 @@ from pasting import assert_nothing_shares_a_ray
 from typer.testing import CliRunner
 from worlds import CAR, WALL, car, cast, wall
 
-from lidar_synth import ObjectBank, Town, edit, load_generator, load_sensor, open_scans
+from lidar_synth import ObjectBank, Town, load_generator, load_sensor, open_scans
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS
 from lidar_synth.geometry.projection import locate, project
-from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
-from lidar_synth.labels.edit.insert import cut_out
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.labels import edit
+from lidar_synth.labels.edit.insertion import cut_out
 from lidar_synth.labels.edit.rays import rays_of_scan
-from lidar_synth.labels.edit.remove import returns_of
+from lidar_synth.labels.edit.removal import returns_of
 
-BEHIND = wall(24, 0, np.pi / 2, length=40)
+BEHIND = wall(24, 0, np.pi / 2, length=80)
 
 
 def returned(scan: Scan, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -46,9 +47,10 @@ def test_behind_a_removed_car_is_what_was_there(place: tuple[float, float, float
     hole = cells_of(full, full.instance == 1)
     expected, label = returned(empty, hole)
     got = project(result).range[hole]
-    assert (got > 0).mean() > 0.97
-    assert np.median(np.abs(got - expected)[got > 0]) < 0.06
-    assert (np.abs(got - expected) < 0.3).mean() > 0.93
+    assert ((got > 0) == (expected > 0)).mean() > 0.97
+    assert np.median(np.abs(got - expected)[got > 0]) < (0.02 if labelled else 0.12)
+    both = (got > 0) & (expected > 0)
+    assert (np.abs(got - expected) < 0.4)[both].mean() > (0.95 if labelled else 0.85)
     if labelled:
         assert (returned(result, hole)[1] == label).mean() > 0.93 and not (result.label == CAR).any()
     kept = project(full).range[~hole]
@@ -104,7 +106,8 @@ def test_a_moved_car_looks_as_the_sensor_would_see_it(old: Any, new: Any) -> Non
     assert np.allclose(box[:2], new[:2], atol=1e-3)
     truth = cast([np.r_[box[:2], car(0, 0)[2:6], box[6]].astype(np.float32)], [BEHIND])
     mine, true = cells_of(result, result.label == CAR), cells_of(truth, truth.instance == 1)
-    assert (mine & true).sum() / (mine | true).sum() > 0.8
+    assert (mine & true).sum() / (mine | true).sum() > 0.7
+    assert 0.85 < mine.sum() / true.sum() < 1.15
     both = mine & true
     assert np.median(np.abs(project(result).range - project(truth).range)[both]) < 0.05
     assert result.boxes.contain(result.points[result.label == CAR]).all()
@@ -184,10 +187,9 @@ def test_the_flow_draws_the_hole_and_nothing_else() -> None:
     assert edit.measure([scan]).objects > 0
     by_geometry, drawn, again = edit.closed(scan), edit.closed(scan, generator), edit.closed(scan, generator)
     assert np.array_equal(drawn.points, again.points)
-    images: list[RangeImage] = [project(s) for s in (scan, by_geometry, drawn)]
-    hole = images[0].range != images[1].range
-    assert np.array_equal(images[0].range[~hole], images[2].range[~hole])
-    assert 0 < (images[1].range != images[2].range).sum() <= hole.sum()
+    before, filled, new = ({tuple(p) for p in s.points.tolist()} for s in (scan, by_geometry, drawn))
+    assert before & filled == before & new and len(before & new) > 0.8 * len(before)
+    assert len(new - before) > 0.5 * len(filled - before) and not filled - before <= new
     for result in (by_geometry, drawn):
         assert edit.measure([result]).objects == 0
 

@@ -273,7 +273,7 @@ def test_objects_by_name_and_in_place_of_the_scans_own() -> None:
     scan.boxes = Boxes(scan.boxes.values, ("Car", "Van"), instance=scan.boxes.instance)
     bank = ObjectBank.from_scans([scan])
     host = replace(cast([car(20, 0)]), boxes=None)
-    mixed = make_policy("mix", fields=FIELDS, objects=bank, count={"Van": 3})(host, keyed_rng(0))
+    mixed = make_policy("mix", fields=FIELDS, objects=bank, count={"Van": 3}, clear=False)(host, keyed_rng(0))
     assert mixed.boxes is not None and mixed.boxes.names == ("Van",)
     assert (mixed.label == CAR).sum() == (host.label == CAR).sum() + bank.counts[1]
     clear = make_policy("mix", fields=FIELDS, objects=bank, clear=True)(host, keyed_rng(0))
@@ -300,7 +300,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
         ("mix", {"real": bare}, "no box with 5 points in 1 scans.*ObjectBank.from_scans"),
         ("mix", {"real": [cast([car(8, 2)])], "count": {"Tram": 1}}, "names and points"),
         ("mix", {"real": [cast([car(8, 2)])], "count": 0}, "count=0"),
-        ("mix", {"real": [cast([car(8, 2)])], "clear": True, "fields": plain}, "clear=True"),
+        ("mix", {"real": [cast([car(8, 2)])], "fields": plain}, "neither labels nor boxes.*clear=False"),
         ("mix", {"real": bare, "kind": "polar"}, "kind='polar', with scans without labels"),
         ("mix", {"real": [], "kind": "laser"}, "kind='laser', with none"),
         ("mix", {"kind": "laser"}, "kind='laser', with none"),

@@ -23,7 +23,7 @@ from lidar_synth import Boxes, Scan, Town, load_generator, open_scans
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.projection import locate, project
 from lidar_synth.labels.boxes import turned
-from lidar_synth.labels.edit.remove import returns_of, without
+from lidar_synth.labels.edit.removal import returns_of, without
 from lidar_synth.labels.ground import ground_under
 from lidar_synth.labels.objects import THINGS, instances_of
 from lidar_synth.noise import keyed_rng

@@ -1,8 +1,9 @@
 """What lies behind a removed object, estimated from the same rings beside it.
 
-A ring is continued over the hole from both sides. Its horizontal distance is interpolated, 1 / rho linearly in azimuth,
-as on a wall, if both sides are one surface; otherwise each side is continued to the middle. Deviations from it, lost
-returns, reflectance and labels are copied from the rays beside the hole, mirrored at its edge.
+A ring is continued over the hole from both sides. If both are one surface, its horizontal distance rho is interpolated:
+on the ground 1 / rho linearly in azimuth, else as on a plane wall, 1 / rho = a cos(azimuth) + b sin(azimuth). Otherwise
+each side is continued to the middle. Deviations from it, lost returns, reflectance and labels are copied from the rays
+beside the hole, mirrored at its edge.
 """
 
 import numba
@@ -49,15 +50,16 @@ def continued(
     donor, rho = np.full(len(hole), -1, np.int64), np.full(len(hole), np.inf)
     known = (rays.point >= 0) & ~hole
     for first, stop in zip(rays.start[:-1].tolist(), rays.start[1:].tolist(), strict=True):
-        if hole[first:stop].any() and not hole[first:stop].all():
-            _ring(hole[first:stop], known[first:stop], rays.rho[first:stop], near[first:stop], ground[first:stop],
-                  thing[first:stop], donor[first:stop], rho[first:stop])  # fmt: skip
-            donor[first:stop] += first * (donor[first:stop] >= 0)
+        part = slice(first, stop)
+        if hole[part].any() and not hole[part].all():
+            given = hole[part], known[part], rays.rho[part], near[part], ground[part], thing[part]
+            _ring(rays.step, *given, donor[part], rho[part])
+            donor[part] += first * (donor[part] >= 0)
     return donor, rho
 
 
 @numba.njit(cache=True)
-def _ring(hole, known, rho, near, ground, thing, donor, out):  # type: ignore[no-untyped-def]
+def _ring(step, hole, known, rho, near, ground, thing, donor, out):  # type: ignore[no-untyped-def]
     """Fill the holes of one ring, whose last ray is followed by its first."""
     count = len(hole)
     left, right = np.empty(SIDE, np.int64), np.empty(SIDE, np.int64)
@@ -71,9 +73,11 @@ def _ring(hole, known, rho, near, ground, thing, donor, out):  # type: ignore[no
         n = _side(hole, known, rho, ground, thing, i - 1, -1, limit, left)
         m = _side(hole, known, rho, ground, thing, (i + length) % count, 1, limit, right)
         a, b = _edge(known, rho, left, n), _edge(known, rho, right, m)
+        turn = (length + 1 + 2 * _SMOOTH) * step  # from the middle to the middle of the averaged rays
+        flat = ground[left[0]] and ground[right[0]] if n > 0 and m > 0 else False
         same = min(a, b) > 0 and abs(a - b) < SAME * max(a, b)
         for k in range(length):
-            share = (k + 0.5) / length
+            share = (k + 1 + _SMOOTH) * step / turn
             use_left = n > 0 and (m == 0 or share < 0.5)
             side, size, nth, edge = (left, n, k, a) if use_left else (right, m, length - 1 - k, b)
             if size == 0:
@@ -82,8 +86,15 @@ def _ring(hole, known, rho, near, ground, thing, donor, out):  # type: ignore[no
             donor[j] = source
             if not known[source]:
                 continue
-            base = 1 / ((1 - share) / a + share / b) if same else edge
-            smooth = _edge(known, rho, side[max(nth % size - _SMOOTH, 0) : nth % size + _SMOOTH + 1], -1)
+            base = edge
+            if same:
+                of_a, of_b = 1 - share, share
+                if not flat and turn < 3:
+                    of_a, of_b = np.sin((1 - share) * turn) / np.sin(turn), np.sin(share * turn) / np.sin(turn)
+                base = 1 / (of_a / a + of_b / b)
+            at = nth % size
+            around = min(at, size - 1 - at, _SMOOTH)
+            smooth = _edge(known, rho, side[at - around : at + around + 1], -1)
             jump = abs(smooth - edge) > SAME * edge  # the source is of another surface than the edge
             out[j] = rho[source] if jump else base * rho[source] / smooth
 

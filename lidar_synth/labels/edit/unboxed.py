@@ -18,7 +18,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grown
 from lidar_synth.labels.edit.redraw import Model
-from lidar_synth.labels.edit.remove import without
+from lidar_synth.labels.edit.removal import without
 from lidar_synth.labels.ground import FLOOR, GROUND, standing
 from lidar_synth.labels.objects import LABELS
 

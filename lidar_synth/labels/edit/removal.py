@@ -51,7 +51,8 @@ def remove(scan: Scan, box: Which, *, model: "Generator | str | Path | None" = N
         ConfigError: on an unknown or a conditional model.
 
     Example:
-        >>> from lidar_synth import Town, edit
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.labels import edit
         >>> scan = Town(seed=0, scans=1)[0]
         >>> number = scan.boxes.names.index("Car")
         >>> emptied = edit.remove(scan, number)

@@ -21,7 +21,7 @@ from lidar_synth.geometry.transfer.surfaces import Surfaces, estimate, rings_of
 from lidar_synth.labels.boxes import grown, joined, overlapping
 from lidar_synth.labels.edit.compose import composed, next_instance
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
-from lidar_synth.labels.edit.remove import remove, selected
+from lidar_synth.labels.edit.removal import remove, selected
 from lidar_synth.labels.ground import ground_under
 from lidar_synth.labels.objects import Object, objects_of
 from lidar_synth.labels.pasting import occluded, still_visible
@@ -142,8 +142,11 @@ def cut_out(scan: Scan, box: int) -> Object:
         DataError: if there is no such box, or no return in it.
     """
     selected(scan, box)
-    numbered = scan if scan.ring is not None else replace(scan, ring=rings_of(scan)[0].astype(np.int16))
-    found = objects_of(numbered, least=1)
+    if scan.ring is None:
+        ring, on_grid = rings_of(scan)
+        sensor = replace(scan.sensor, firings=None) if on_grid else scan.sensor  # as many as columns
+        scan = replace(scan, ring=ring.astype(np.int16), sensor=sensor)
+    found = objects_of(scan, least=1)
     if box not in found:
         raise DataError(f"box {box} of scan {scan.id!r} without a return", "a box with an object")
     return found[box]
