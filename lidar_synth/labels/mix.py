@@ -203,7 +203,7 @@ def laser(
 
 
 def _own(fields: frozenset[str], threshold: float) -> Own | Ignored:
-    return generated(None, fields, threshold) if "label" in fields else Ignored()
+    return generated(None, fields, threshold) if "label" in fields else Ignored(boxed="boxes" in fields)
 
 
 def _labelled(real: Source | None, kind: str) -> tuple[Source, Scan]:

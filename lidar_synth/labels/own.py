@@ -24,11 +24,18 @@ class Unlabelled:
 
 @dataclass(frozen=True)
 class Ignored:
-    """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan; the sample keeps its keys."""
+    """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan; the sample keeps its keys.
+
+    Args:
+        boxed: whether the scan keeps its boxes.
+    """
+
+    boxed: bool = False
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         label, confidence = np.full(len(scan), IGNORE, np.uint8), np.zeros(len(scan), np.float32)
-        return replace(scan, label=label, raw_label=None, instance=None, confidence=confidence, boxes=None)
+        return replace(scan, label=label, raw_label=None, instance=None, confidence=confidence,
+                       boxes=scan.boxes if self.boxed else None)  # fmt: skip
 
 
 @dataclass(frozen=True)
