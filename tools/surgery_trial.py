@@ -1,9 +1,10 @@
 """Can a small classifier tell where an object was removed from a scan?
 
 Cars are removed from scans of the town and, with --labelled and --boxed, from real scans of KITTI. For each there is a
-control in the unedited scan: the same box, turned about the sensor to a place with ground and without an object, so at
-the same distance and of the same size. A small convolutional network sees both places in the range image (range
-relative to the object's, reflectance, lost returns, number of points), is trained on some scans and tested on others.
+control in the unedited scan: the same box, turned about the sensor to a free place on ground, so at the same distance
+and of the same size; of the free places, the one whose surroundings have the most similar classes. A small
+convolutional network sees both places in the range image (range relative to the object's, reflectance, lost returns,
+number of points), is trained on some scans and tested on others.
 
     python tools/surgery_trial.py --town 40 --labelled $LIDAR_SYNTH_LABELLED_SCANS/semantic_kitti
 """
@@ -25,7 +26,7 @@ from lidar_synth.geometry.projection import locate, project
 from lidar_synth.labels.boxes import turned
 from lidar_synth.labels.edit.removal import returns_of, without
 from lidar_synth.labels.ground import ground_under
-from lidar_synth.labels.objects import THINGS, instances_of
+from lidar_synth.labels.objects import instances_of
 from lidar_synth.noise import keyed_rng
 
 PATCH = 24, 32
@@ -34,6 +35,8 @@ LEAST = 50
 """Minimum number of returns of a car that is removed."""
 NEAR, FAR = 4.0, 40.0
 """Distances of removed cars, metres."""
+TRIES = 80
+"""Number of places that are tried for a control."""
 MOST = 8
 """Maximum number of cars that are removed from one scan."""
 
@@ -50,9 +53,9 @@ def cars_of(scan: Scan) -> list[Boxes]:
 
 
 def control(scan: Scan, box: Boxes, rng: np.random.Generator) -> NDArray[np.float32] | None:
-    """The box at a free place at the same distance, that with the most similar ground; None if none is found."""
+    """The box at a free place at the same distance, that with the most similar surroundings, or None."""
     best, similar, here = None, -1.0, surroundings(scan, box)
-    for angle in rng.uniform(-np.pi, np.pi, 40):
+    for angle in rng.uniform(-np.pi, np.pi, TRIES):
         there = turned(box, angle)
         values = there.values[0]
         ground = ground_under(scan, values)
@@ -65,13 +68,13 @@ def control(scan: Scan, box: Boxes, rng: np.random.Generator) -> NDArray[np.floa
 
 
 def surroundings(scan: Scan, box: Boxes) -> NDArray[np.float64]:
-    """(20,) shares of the classes of the returns within 2 m of a box, without objects; alike without labels."""
+    """(20,) shares of the classes of returns within 2.5 m of a box, other objects included; alike without labels."""
     if scan.label is None:
         return np.zeros(20)
     inner, outer = (
-        Boxes(box.values + np.array([0, 0, 0, 2 * m, 2 * m, 2 * m, 0], np.float32), box.names) for m in (0, 2)
+        Boxes(box.values + np.array([0, 0, 0, 2 * m, 2 * m, 2 * m, 0], np.float32), box.names) for m in (0.1, 2.5)
     )
-    around = outer.contain(scan.points)[0] & ~inner.contain(scan.points)[0] & (scan.label >= THINGS)
+    around = outer.contain(scan.points)[0] & ~inner.contain(scan.points)[0]
     count = np.bincount(np.minimum(scan.label[around], 19), minlength=20)
     return np.asarray(count / max(count.sum(), 1))
 
@@ -100,16 +103,12 @@ def patch(scan: Scan, box: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def edits(model: Generator | None, starts: list[float]) -> dict[str, object]:
     """The compared edits: {name: (scan, parts, number) -> scan}."""
-    from lidar_synth.labels.edit import redraw
 
     def hole(scan: Scan, parts: list, number: int) -> Scan:
         return scan[~np.any([mine for mine, _ in parts], 0)]
 
     def filled(scan: Scan, parts: list, number: int, start: float | None = None) -> Scan:
-        if start is None:
-            return without(scan, parts, None, number)
-        redraw.redrawn.__defaults__ = (start,)
-        return without(scan, parts, model, number)
+        return without(scan, parts, None if start is None else model, number, start)
 
     return {"hole left open": hole, "filled by geometry": filled} | {
         f"drawn by the flow from t = {start}": partial(filled, start=start) for start in starts
@@ -156,6 +155,14 @@ def auc(edited: list, controls: list, groups: list, epochs: int, seed: int) -> f
     return float((rank[y == 1].sum() - positive * (positive + 1) / 2) / (positive * (len(y) - positive)))
 
 
+def surroundings_alone(patches: list) -> list:
+    """Patches without their middle, where the object was: what the choice of places alone gives away."""
+    masked = [patch.copy() for patch in patches]
+    for each in masked:
+        each[:, 3:-3, 4:-4] = 0
+    return masked
+
+
 def _scores(x: torch.Tensor, y: torch.Tensor, unseen: torch.Tensor, epochs: int, seed: int) -> torch.Tensor:
     """Train a network, and return the logits of unseen patches, standardised to be comparable between folds."""
     torch.manual_seed(seed)
@@ -187,6 +194,7 @@ def main() -> None:
     parser.add_argument("--model", default="town")
     parser.add_argument("--starts", type=float, nargs="*", default=[0.6])
     parser.add_argument("--epochs", type=int, default=25)
+    parser.add_argument("--save", help="beginning of the names of files for the patches")
     parser.add_argument("--seeds", type=int, default=3)
     arguments = parser.parse_args()
     ways = edits(load_generator(arguments.model), arguments.starts)
@@ -196,9 +204,15 @@ def main() -> None:
     for name, several in sources.items():
         every = (source[i] for source in several for i in tqdm(range(len(source)), name, leave=False, disable=None))
         edited, controls, groups, seconds = collect(every, ways)
+        if arguments.save:
+            np.savez(f"{arguments.save}-{name}.npz", **edited, controls=controls, groups=groups)  # type: ignore[arg-type]
         print(f"{name}: {len(controls)} cars in {max(groups) + 1} scans")
         for way, patches in edited.items():
             values = [auc(patches, controls, groups, arguments.epochs, seed) for seed in range(arguments.seeds)]
+            if way == "filled by geometry":
+                edge = surroundings_alone(patches), surroundings_alone(controls)
+                bias = [auc(*edge, groups, arguments.epochs, seed) for seed in range(arguments.seeds)]
+                print(f"  {'surroundings alone':<36} AUC {np.mean(bias):.3f} +- {np.std(bias):.3f}")
             print(f"  {way:<36} AUC {np.mean(values):.3f} +- {np.std(values):.3f}   {seconds[way]:.2f} s a scan")
 
 

@@ -79,7 +79,8 @@ def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5
             loses its box and its returns.
 
     Returns:
-        A new scan with the object's box and, if it has instances, a new instance. Its labels are those of the object
+        A new scan with the object's box (a scan without boxes then has this one alone) and, if it has instances, a new
+        instance. Its labels are those of the object
         if it has labels.
 
     Raises:

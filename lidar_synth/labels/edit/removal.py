@@ -119,7 +119,11 @@ def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
 
 
 def without(
-    scan: Scan, parts: Sequence[tuple[NDArray[np.bool_], NDArray[np.float32]]], model: Model, seed: int
+    scan: Scan,
+    parts: Sequence[tuple[NDArray[np.bool_], NDArray[np.float32]]],
+    model: Model,
+    seed: int,
+    start: float | None = None,
 ) -> Scan:
     """Remove returns from a scan and fill the hole.
 
@@ -128,6 +132,7 @@ def without(
         parts: for each object, (N,) True for its returns, and its box (7,).
         model: draws the hole; None for the estimate from its surroundings alone.
         seed: of the model's noise.
+        start: see ``inpaint``; None = its default.
 
     Returns:
         The scan with its remaining points unchanged and in order. Points of the hole take the place of removed ones;
@@ -150,7 +155,7 @@ def without(
     which = np.flatnonzero(hole & (donor >= 0))
     filled = _copies(scan, rays, which, donor[which], rho[which])
     if model is not None:
-        filled = redrawn(scan[~removed], filled, rays, which, model, seed)
+        filled = redrawn(scan[~removed], filled, rays, which, model, seed, start)
     seen = np.linalg.norm(filled.points, axis=1) > 0
     return composed(scan, removed, rays, which[seen], filled[seen])
 
