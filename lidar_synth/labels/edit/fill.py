@@ -24,6 +24,7 @@ FRONT = 0.5
 SAME = 0.2
 """Relative difference of distance below which both sides of a hole are one surface."""
 
+_BASE = 12  # rays between the two places that give the direction of a wall
 _SMOOTH = 2  # rays to either side over which a distance is averaged
 
 
@@ -76,6 +77,9 @@ def _ring(step, hole, known, rho, near, ground, thing, donor, out):  # type: ign
         turn = (length + 1 + 2 * _SMOOTH) * step  # from the middle to the middle of the averaged rays
         flat = ground[left[0]] and ground[right[0]] if n > 0 and m > 0 else False
         same = min(a, b) > 0 and abs(a - b) < SAME * max(a, b)
+        if min(a, b) > 0 and not same and turn < 1.5:
+            same = abs(_ahead(known, rho, left, n, step, turn) - b) < SAME * b
+            same |= abs(_ahead(known, rho, right, m, step, turn) - a) < SAME * a
         for k in range(length):
             share = (k + 1 + _SMOOTH) * step / turn
             use_left = n > 0 and (m == 0 or share < 0.5)
@@ -97,6 +101,19 @@ def _ring(step, hole, known, rho, near, ground, thing, donor, out):  # type: ign
             smooth = _edge(known, rho, side[at - around : at + around + 1], -1)
             jump = abs(smooth - edge) > SAME * edge  # the source is of another surface than the edge
             out[j] = rho[source] if jump else base * rho[source] / smooth
+
+
+@numba.njit(cache=True)
+def _ahead(known, rho, side, size, step, turn):  # type: ignore[no-untyped-def]
+    """Distance at the other edge of a plane wall through the returns of a side; inf = none."""
+    if size < _BASE + 2 * _SMOOTH + 1:
+        return np.inf
+    near, far = _edge(known, rho, side, size), _edge(known, rho, side[_BASE : _BASE + 2 * _SMOOTH + 1], -1)
+    if far == 0:
+        return np.inf
+    rise = (np.cos(_BASE * step) / near - 1 / far) / np.sin(_BASE * step)
+    inverse = np.cos(turn) / near + np.sin(turn) * rise
+    return 1 / inverse if inverse > 0 else np.inf
 
 
 @numba.njit(cache=True)

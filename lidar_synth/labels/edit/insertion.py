@@ -29,7 +29,7 @@ from lidar_synth.labels.pasting import occluded, still_visible
 if TYPE_CHECKING:
     from lidar_synth.generate.generator import Generator
 
-TURN = 45.0
+TURN = 30.0
 """Largest angle, degrees, by which an object may be seen from another side than it was recorded from."""
 
 NEARER = 0.5
@@ -80,8 +80,7 @@ def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5
 
     Returns:
         A new scan with the object's box (a scan without boxes then has this one alone) and, if it has instances, a new
-        instance. Its labels are those of the object
-        if it has labels.
+        instance. Its labels are those of the object, if the scan has labels.
 
     Raises:
         DataError: if the place is outside the sensor's range, taken, or without ground; if the object would be seen
@@ -204,7 +203,7 @@ def _mirrored(old: NDArray[np.float64], x: float, y: float, yaw: float) -> bool:
             f"at most {TURN:g} degrees, for it or its mirror image",
             "Leave out the yaw: the recorded side then faces the sensor.",
         )
-    return bool(off[1] < off[0] and off[0] > np.radians(TURN))
+    return bool(off[1] < off[0])
 
 
 def _hits(
