@@ -6,6 +6,7 @@ image; only the state inside the hole follows the flow (Lugmayr et al., "RePaint
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -131,7 +132,7 @@ def _sample(generator: Generator, known: Tensor, noise: Tensor, inside: Tensor, 
 
 def _complete(image: RangeImage) -> RangeImage:
     """The image with every channel that a model may have."""
-    empty = {
+    empty: dict[str, NDArray[Any]] = {
         "reflectance": np.zeros(image.range.shape, np.float32),
         "label": np.full(image.range.shape, IGNORE, np.uint8),
     }
