@@ -108,13 +108,14 @@ def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
         around[around] = ground.above(scan.points[around], box.values[0]) > FLOOR
     else:
         around &= scan.points[:, 2] > box.values[0, 2] - box.values[0, 5] / 2 + FLOOR
-    if scan.label is not None:
-        around &= np.isin(scan.label, np.unique(scan.label[mine]))
-        around &= scan.label < THINGS
+    if scan.label is not None:  # in the box, also returns at the object's edge whose label is another one
+        same = np.isin(scan.label, np.unique(scan.label[mine])) & (scan.label < THINGS)
+        around &= same | (box.contain(scan.points)[0] & ~GROUND[scan.label])
     if scan.instance is not None and mine.any():
         around &= np.isin(scan.instance, [0, *np.unique(scan.instance[mine])])
     if scan.boxes is not None:
-        around &= ~scan.boxes.contain(scan.points).any(0)
+        others = ~(scan.boxes.values == box.values).all(1)
+        around &= ~scan.boxes[others].contain(scan.points).any(0)
     return np.asarray(mine | around)
 
 
