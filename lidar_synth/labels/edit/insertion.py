@@ -85,6 +85,16 @@ def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5
     Raises:
         DataError: if the place is outside the sensor's range, taken, or without ground; if the object would be seen
             from a side that was not recorded, from too near, or not at all.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.labels import edit, objects_of
+        >>> town = Town(seed=0, scans=1)[0]
+        >>> number, car = next((i, o) for i, o in objects_of(town, 200).items() if o.scan.boxes.names == ("Car",))
+        >>> emptied = edit.remove(town, number)
+        >>> back = edit.insert(emptied, car)  # at its old place
+        >>> len(back.boxes) - len(emptied.boxes), back.boxes.names[-1]
+        (1, 'Car')
     """
     placed = _place(scan, item, pose)
     rays = rays_of_scan(scan)
@@ -130,6 +140,15 @@ def move(
 
     Raises:
         DataError, ConfigError: as ``remove`` and ``insert``.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.labels import edit, objects_of
+        >>> town = Town(seed=0, scans=1)[0]
+        >>> number, car = next((i, o) for i, o in objects_of(town, 200).items() if o.scan.boxes.names == ("Car",))
+        >>> moved = edit.move(town, number, car.box[:2] * 1.02)  # a little further away
+        >>> moved.boxes.names[-1], len(moved.boxes) == len(town.boxes)
+        ('Car', True)
     """
     cut = cut_out(scan, box)
     return insert(remove(scan, box, model=model, seed=seed), cut, pose, least=least)
