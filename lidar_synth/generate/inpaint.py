@@ -63,8 +63,8 @@ def inpaint(
         >>> hole = np.zeros(image.range.shape, bool)
         >>> hole[20:40, 100:180] = True
         >>> [drawn] = inpaint(generator, [image], [hole], seed=1, indices=[0])
-        >>> bool((drawn.range[~hole] == image.range[~hole]).all()), bool((drawn.range[hole] == image.range[hole]).all())
-        (True, False)
+        >>> bool((drawn.range[~hole] == image.range[~hole]).all())
+        True
     """
     if generator.condition is not None:
         raise ConfigError(f"{generator.name!r}, a model conditioned on {generator.condition!r}, to fill holes",
