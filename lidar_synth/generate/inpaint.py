@@ -55,13 +55,11 @@ def inpaint(
         DataError: on images of another sensor.
 
     Example:
-        >>> import numpy as np
         >>> from lidar_synth import load_generator
         >>> from lidar_synth.generate.inpaint import inpaint
         >>> generator = load_generator("town")
         >>> [image] = generator.range_images(seed=0, indices=[0])
-        >>> hole = np.zeros(image.range.shape, bool)
-        >>> hole[20:40, 100:180] = True
+        >>> hole = (image.range > 10) & (image.range < 20)
         >>> [drawn] = inpaint(generator, [image], [hole], seed=1, indices=[0])
         >>> bool((drawn.range[~hole] == image.range[~hole]).all())
         True
