@@ -99,7 +99,7 @@ class Mixed:
 
     def _check_boxes(self, known: Collection[str]) -> None:
         """Check that the first synthetic scans have boxes, and only of known classes."""
-        hint = "labels: mix with a bank of objects gives a scan boxes."
+        hint = "labels: mix with a bank of objects gives a scan boxes, labels: boxes keeps its own."
         used = False
         for position in np.flatnonzero(self.mixed.plan().domain)[:LOOKED_AT]:
             scan = self.mixed[int(position)]

@@ -46,7 +46,18 @@ def test_the_api_has_every_public_name() -> None:
 
 def test_the_command_line_has_every_command_and_no_control_characters() -> None:
     text = TABLES["command_line"]()
-    groups = ("bank merge", "bank split", "bank head", "sensor fit", "skin fit", "skin show", "metrics setup")
+    groups = (
+        "bank merge",
+        "bank split",
+        "bank head",
+        "edit remove",
+        "edit insert",
+        "edit move",
+        "sensor fit",
+        "skin fit",
+        "skin show",
+        "metrics setup",
+    )
     assert re.findall(r"^## (.*)$", text, re.M) == [*COMMANDS, *groups]
     assert text.isprintable() or set(filter(lambda c: not c.isprintable(), text)) == {"\n"}
 

@@ -274,6 +274,19 @@ def test_a_bank_is_read_by_url(made: Path) -> None:
             read_url(wrong)
 
 
+def test_scans_with_boxes_and_without_labels_serve_a_detector(made: Path, tmp_path: Path) -> None:
+    unlabelled, root = synthetic(tmp_path / "unlabelled", SYNTHETIC, labels=False), made / "kitti"
+    listed = write_infos(
+        tmp_path / "det", root / "train.json", MIX | {"synthetic": unlabelled, "labels": "boxes"},
+        data_root=root, points="training/velodyne_reduced",
+    )  # fmt: skip
+    loaded = train_set(DETECTION) | {"ann_file": str(listed), "pipeline": []}
+    dataset = DATASETS.build(loaded)
+    infos = [dataset.get_data_info(i) for i in range(len(dataset))]
+    made_up = [info for info in infos if info["lidar_points"]["lidar_path"].startswith("lsynth://")]
+    assert len(made_up) == EXTRA and all(len(info["ann_info"]["gt_labels_3d"]) > 0 for info in made_up)
+
+
 def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_path: Path) -> None:
     listed, root = made / "sk" / "train.json", {"data_root": made / "sk"}
     for labels in ("none", "ignore"):

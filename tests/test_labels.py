@@ -39,6 +39,7 @@ CALLS: dict[str, dict[str, Any]] = {
     "mix polar": {"kind": "polar"},
     "mix exchange": {"kind": "exchange"},
     "mix laser": {"kind": "laser"},
+    "boxes": {},
 }
 
 
@@ -84,8 +85,11 @@ def test_every_policy_and_kind_is_called_here() -> None:
 @pytest.mark.parametrize("name", CALLS)
 def test_a_policy_is_a_function_of_scan_and_generator(name: str, synthetic: Scan, real: list[Scan]) -> None:
     policy_name, options = call(name)
+    known = FIELDS
+    if policy_name == "boxes":
+        synthetic, known = replace(synthetic, boxes=real[0].boxes), FIELDS | {"boxes"}
     before = [{n: a.copy() for n, a in arrays(s).items()} for s in (synthetic, *real)]
-    policy = make_policy(policy_name, real=real, fields=FIELDS, **options)
+    policy = make_policy(policy_name, real=real, fields=known, **options)
     first, again = policy(synthetic, keyed_rng(4, 1)), policy(synthetic, keyed_rng(4, 1))
     copied = pickle.loads(pickle.dumps(policy))(synthetic, keyed_rng(4, 1))  # as spawned workers get it
     assert same(first, again) and same(first, copied)
@@ -274,7 +278,7 @@ def test_objects_by_name_and_in_place_of_the_scans_own() -> None:
     scan.boxes = Boxes(scan.boxes.values, ("Car", "Van"), instance=scan.boxes.instance)
     bank = ObjectBank.from_scans([scan])
     host = replace(cast([car(20, 0)]), boxes=None)
-    mixed = make_policy("mix", fields=FIELDS, objects=bank, count={"Van": 3})(host, keyed_rng(0))
+    mixed = make_policy("mix", fields=FIELDS, objects=bank, count={"Van": 3}, clear=False)(host, keyed_rng(0))
     assert mixed.boxes is not None and mixed.boxes.names == ("Van",)
     assert (mixed.label == CAR).sum() == (host.label == CAR).sum() + bank.counts[1]
     clear = make_policy("mix", fields=FIELDS, objects=bank, clear=True)(host, keyed_rng(0))
@@ -301,7 +305,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
         ("mix", {"real": bare}, "no box with 5 points in 1 scans.*ObjectBank.from_scans"),
         ("mix", {"real": [cast([car(8, 2)])], "count": {"Tram": 1}}, "names and points"),
         ("mix", {"real": [cast([car(8, 2)])], "count": 0}, "count=0"),
-        ("mix", {"real": [cast([car(8, 2)])], "clear": True, "fields": plain}, "clear=True"),
+        ("mix", {"real": [cast([car(8, 2)])], "fields": plain}, "neither labels nor boxes.*clear=False"),
         ("mix", {"real": bare, "kind": "polar"}, "kind='polar', with scans without labels"),
         ("mix", {"real": [], "kind": "laser"}, "kind='laser', with none"),
         ("mix", {"kind": "laser"}, "kind='laser', with none"),

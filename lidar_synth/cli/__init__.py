@@ -15,6 +15,7 @@ from lidar_synth.cli.bank import bank, info, repair, verify
 from lidar_synth.cli.convert import convert
 from lidar_synth.cli.curate import curate
 from lidar_synth.cli.doctor import doctor
+from lidar_synth.cli.edit import edit
 from lidar_synth.cli.evaluate import evaluate
 from lidar_synth.cli.import_ import import_
 from lidar_synth.cli.label import label
@@ -73,6 +74,7 @@ def _options(
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)
 app.add_typer(bank)
+app.add_typer(edit)
 app.add_typer(sensor)
 app.add_typer(skin)
 app.add_typer(metrics)

@@ -70,6 +70,18 @@ def bake(
         typer.echo(f"{out}: this share is finished; the last of all {len(plan.shards)} shards completes the bank")
     else:
         typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards, {index.size / 1e6:.3g} MB")
+        _report_unboxed(out)
+
+
+def _report_unboxed(bank: Path, scans: int = 8) -> None:
+    """Print how many objects of the first scans have no box, for those who train a detector."""
+    from lidar_synth.bank import Bank
+    from lidar_synth.labels.edit import measure
+
+    opened = Bank(bank)
+    found = measure(opened[i] for i in range(min(scans, len(opened))))
+    if found.objects:
+        typer.echo(f"  {found}; a detector needs labels: mix, which removes them and pastes objects with boxes")
 
 
 def _resources(plan: "BakePlan", workers: int | None, address: str | None, slurm: list[str] | None) -> "Resources":

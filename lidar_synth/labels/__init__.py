@@ -1,5 +1,6 @@
 """Label policies of synthetic scans by name, and objects that are pasted into scans."""
 
+from lidar_synth.labels import edit
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.exchange import swap_bands, swap_sector, thinned
 from lidar_synth.labels.objects import Object, instances_of, objects_of
@@ -12,6 +13,7 @@ __all__ = [
     "LabelPolicy",
     "Object",
     "ObjectBank",
+    "edit",
     "instances_of",
     "make_policy",
     "objects_of",

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.bank import ObjectBank
+from lidar_synth.labels.edit.redraw import open_model
+from lidar_synth.labels.edit.unboxed import BOXED, closed
 from lidar_synth.labels.exchange import swap_bands, swap_sector, thinned
-from lidar_synth.labels.objects import Object, instances_of, objects_of
+from lidar_synth.labels.objects import THINGS, Object, instances_of, objects_of
 from lidar_synth.labels.own import Ignored, Own, generated
 from lidar_synth.labels.pasting import paste
 
@@ -34,7 +36,9 @@ class Objects:
         groups: (indices of objects in the bank, number to place) pairs; objects are sampled from each group.
         least: minimum number of visible points of an object.
         turn: maximum angle, degrees to either side, by which an object is turned about the sensor.
-        clear: whether to remove the returns of the scan's own objects, which have no boxes.
+        clear: whether to remove the scan's own objects that have no box, and to fill the holes; a detector would
+            learn that they are background.
+        model: draws the holes; None fills them by geometry, see ``edit.remove``.
     """
 
     own: Own | Ignored
@@ -42,12 +46,14 @@ class Objects:
     groups: tuple[tuple[NDArray[np.intp], int], ...]
     least: int = 5
     turn: float = 0.0
-    clear: bool = False
+    clear: bool = True
+    model: str | Path | None = None
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        if self.clear:  # before labels of low confidence are ignored
+            things = {int(label) for label in np.unique(self.bank.label) if label < THINGS}
+            scan = closed(scan, open_model(self.model), int(rng.integers(1 << 32)), {*BOXED, *things})
         scan = self.own(scan, rng)
-        if self.clear and scan.boxes is None and scan.label is not None:
-            scan = scan[~np.isin(scan.label, np.unique(self.bank.label))]
         for indices, count in self.groups:
             picks = rng.choice(indices, min(TRIES * count, len(indices)), replace=False)
             angles = np.radians(rng.uniform(-self.turn, self.turn, len(picks)))
@@ -85,7 +91,8 @@ class Polar:
             angles = rng.uniform(-np.pi, np.pi, len(objects))
             turned = (objects[i].turned(a) for i, a in zip(rng.permutation(len(objects)), angles, strict=True))
             mixed = paste(mixed, turned, count=self.objects)
-        return mixed if has_boxes else replace(mixed, boxes=None)  # with boxes, all other objects would be negatives
+        known = has_boxes and (scan.label is not None or scan.boxes is not None)
+        return mixed if known else replace(mixed, boxes=None)  # with boxes, all other objects would be negatives
 
 
 @dataclass(frozen=True)
@@ -137,7 +144,8 @@ def objects(
     count: int | Mapping[str, int] = 10,
     least: int = 5,
     turn: float = 0.0,
-    clear: bool = False,
+    clear: bool = True,
+    model: str | Path | None = None,
     threshold: float = 0.0,
 ) -> Objects:
     """Make the policy ``mix`` that pastes objects and their boxes.
@@ -147,11 +155,12 @@ def objects(
         fields: the fields of the synthetic scans.
         objects: a bank of objects, or its file.
         count: maximum number of objects to place in a scan, in total or as ``{name of the boxes: number}``.
-        least, turn, clear: see ``Objects``.
+        least, turn, clear, model: see ``Objects``.
         threshold: minimum confidence of the synthetic scans' own labels, see ``generated``.
 
     Raises:
-        ConfigError: if there are no boxes, or none of a given name; on other invalid values.
+        ConfigError: if there are no boxes, or none of a given name; if the synthetic scans have neither labels nor
+            boxes, so that their own objects cannot be found; on other invalid values.
     """
     limits = count if isinstance(count, Mapping) else {"": count}
     if min(limits.values(), default=0) < 1 or least < 1 or not 0 <= turn <= 180:
@@ -165,9 +174,13 @@ def objects(
         if not len(indices):
             raise ConfigError(f"count={count}, least={least}", f"names and points of {bank} ({sorted(set(names))})")
         groups.append((indices, number))
-    if clear and "label" not in fields:
-        raise ConfigError("clear=True for synthetic scans without labels", "clear=False")
-    return Objects(_own(fields, threshold), bank, tuple(groups), least, turn, clear)
+    if clear and not {"label", "boxes"} & fields:
+        raise ConfigError(
+            "labels='mix', kind='objects', for synthetic scans with neither labels nor boxes",
+            "labels or boxes: without them their own objects cannot be found, and are background for a detector",
+            "clear=False, if the scans hold no such objects.",
+        )
+    return Objects(_own(fields, threshold), bank, tuple(groups), least, turn, clear, model)
 
 
 def polar(
@@ -212,7 +225,7 @@ def exchange(
 
 
 def _own(fields: frozenset[str], threshold: float) -> Own | Ignored:
-    return generated(None, fields, threshold) if "label" in fields else Ignored()
+    return generated(None, fields, threshold) if "label" in fields else Ignored(boxed="boxes" in fields)
 
 
 def _labelled(real: Source | None, kind: str) -> tuple[Source, Scan]:

@@ -105,6 +105,12 @@ def holding(scan: Scan) -> Scan:
     return replace(scan, boxes=replace(scan.boxes, values=values))
 
 
+def belonging(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
+    """(N,) True for the returns of the object in one box: those of its instance, or those above the ground."""
+    has_instance = scan.instance is not None and box.instance[0] > 0
+    return _instance(scan, box) if has_instance else _standing(scan, box)
+
+
 def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     """(N,) True for points of a box's instance that lie within it or within ``NOISE`` of it."""
     wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
@@ -113,8 +119,7 @@ def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
 
 def _cut(scan: Scan, box: Boxes) -> Object | None:
     """The object in one box; None if it contains no points."""
-    has_instance = scan.instance is not None and box.instance[0] > 0
-    mine = np.flatnonzero(_instance(scan, box) if has_instance else _standing(scan, box))
+    mine = np.flatnonzero(belonging(scan, box))
     return (
         _object(scan, mine, replace(box, values=grown(box.values[0], scan.points[mine])[None])) if len(mine) else None
     )
@@ -138,6 +143,7 @@ def _object(scan: Scan, mine: NDArray[np.intp], box: Boxes) -> Object:
         scan.reflectance[mine],
         scan.sensor,
         label=np.full(len(mine), label, np.uint8) if scan.label is None else scan.label[mine],
+        ring=None if scan.ring is None else scan.ring[mine],
         boxes=replace(box, dont_care=np.zeros((0, 4), np.float32)),
         id=scan.id,
     )

@@ -24,11 +24,18 @@ class Unlabelled:
 
 @dataclass(frozen=True)
 class Ignored:
-    """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan; the sample keeps its keys."""
+    """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan; the sample keeps its keys.
+
+    Args:
+        boxed: whether the scan keeps its boxes.
+    """
+
+    boxed: bool = False
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         label, confidence = np.full(len(scan), IGNORE, np.uint8), np.zeros(len(scan), np.float32)
-        return replace(scan, label=label, raw_label=None, instance=None, confidence=confidence, boxes=None)
+        return replace(scan, label=label, raw_label=None, instance=None, confidence=confidence,
+                       boxes=scan.boxes if self.boxed else None)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -65,6 +72,32 @@ def trusted(
     if threshold > 0:
         label = np.where(confidence >= threshold, label, np.uint8(IGNORE))
     return replace(scan, label=label, raw_label=None, confidence=confidence)
+
+
+@dataclass(frozen=True)
+class OwnBoxes:
+    """``boxes``: for detectors; the scan keeps its own boxes, and its labels if it has any."""
+
+    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        if scan.boxes is None:
+            raise DataError(f"synthetic scan {scan.id!r} has no boxes", "boxes, for a detector",
+                            "labels='mix' pastes objects with their boxes.")  # fmt: skip
+        return scan
+
+
+def boxes(real: Source | None, fields: frozenset[str]) -> OwnBoxes:
+    """Make the policy ``boxes``: the scans' own boxes, for a detector; point labels are not needed.
+
+    Raises:
+        ConfigError: if the scans have no boxes.
+    """
+    if "boxes" not in fields:
+        raise ConfigError(
+            f"labels='boxes', but besides points the synthetic scans only have {sorted(fields) or 'no fields'}",
+            "scans with boxes, such as the town's",
+            "Scans of a bank or a model have none: labels='mix' pastes objects with their boxes.",
+        )
+    return OwnBoxes()
 
 
 def unlabelled(real: Source | None, fields: frozenset[str]) -> Unlabelled:

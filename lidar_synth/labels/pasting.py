@@ -55,7 +55,7 @@ def paste(scan: Scan, objects: Iterable[Object], *, count: int | None = None, le
     placed.sort(key=lambda o: float(np.hypot(o.box[0], o.box[1])))
     view = View(scan)
     shown = [o for o in placed if view.add(o, least)]
-    own = _own_boxes(scan, view.parts[0].seen, least)
+    own = _own(scan, view.parts[0].seen, least)
     pasted = [_as_seen(o.scan, part) for o, part in zip(shown, view.parts[1:], strict=True)]
     return merged(own, [p for p in pasted if len(p) >= least])
 
@@ -86,23 +86,37 @@ def _as_seen(scan: Scan, part: VisibleReturns) -> Scan:
     """The visible returns of an object, as one instance, with its occlusion."""
     assert scan.boxes is not None
     visible = scan[part.seen]
-    boxes = replace(_occluded(scan.boxes, np.array([part.share])), instance=np.ones(1, np.int32))
+    boxes = replace(occluded(scan.boxes, np.array([part.share])), instance=np.ones(1, np.int32))
     return replace(visible, instance=np.ones(len(visible), np.int32), boxes=boxes)
 
 
-def _own_boxes(scan: Scan, seen: NDArray[np.bool_], least: int) -> Scan:
+def _own(scan: Scan, seen: NDArray[np.bool_], least: int) -> Scan:
     """The scan reduced to its visible points (N,), with the occlusion of its boxes updated."""
+    remaining, boxes = still_visible(scan, seen, least)
+    return replace(scan[remaining], boxes=boxes)
+
+
+def still_visible(scan: Scan, seen: NDArray[np.bool_], least: int) -> tuple[NDArray[np.bool_], Boxes]:
+    """What remains of a scan behind new objects.
+
+    Args:
+        scan: N points.
+        seen: (N,) True for points that are still visible.
+        least: minimum number of returns of an object; one that falls below it is removed with its box.
+
+    Returns:
+        (N,) True for the remaining points, and the remaining boxes with their occlusion updated.
+    """
     if scan.boxes is None:
-        return replace(scan[seen], boxes=Boxes(np.zeros((0, 7), np.float32), ()))
+        return seen, Boxes(np.zeros((0, 7), np.float32), ())
     inside = standing(scan, scan.boxes)
     before, after = inside.sum(1), (inside & seen).sum(1)
     removed = (after < before) & (after < least)
-    remaining = seen & ~inside[removed].any(0)
     share = after / np.maximum(before, 1) + (before == 0)
-    return replace(scan[remaining], boxes=_occluded(scan.boxes, share)[~removed])
+    return seen & ~inside[removed].any(0), occluded(scan.boxes, share)[~removed]
 
 
-def _occluded(boxes: Boxes, share: NDArray[np.float64]) -> Boxes:
+def occluded(boxes: Boxes, share: NDArray[np.float64]) -> Boxes:
     """The boxes with occlusion levels updated by the shares (M,) of their returns that are still visible."""
     level = np.select([share >= least for least, _ in OCCLUSION], [level for _, level in OCCLUSION])
     # Good visibility here does not exclude earlier occlusion: unknown (-1 or 3) stays unknown.

@@ -9,7 +9,7 @@ import numpy as np
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.mix import exchange, laser, objects, polar
-from lidar_synth.labels.own import condition, generated, ignored, unlabelled
+from lidar_synth.labels.own import boxes, condition, generated, ignored, unlabelled
 from lidar_synth.labels.pseudo import pseudo
 
 LabelPolicy = Callable[[Scan, np.random.Generator], Scan]
@@ -39,6 +39,7 @@ POLICIES: dict[str, Callable[..., LabelPolicy]] = {
     "condition": condition,
     "pseudo": pseudo,
     "mix": mix,
+    "boxes": boxes,
 }
 """Builders by name: ``(real, fields, **options) -> LabelPolicy``."""
 
@@ -51,7 +52,7 @@ def make_policy(
     Args:
         labels: a name of ``POLICIES``, or a policy, which is returned as it is.
         real: the real labelled scans, for policies that draw from them.
-        fields: the fields of ``POINT_FIELDS`` that the synthetic scans have.
+        fields: the fields of ``POINT_FIELDS`` that the synthetic scans have, and "boxes" if they have boxes.
         options: of the policy.
 
     Raises:

@@ -14,11 +14,13 @@ from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels import LabelPolicy, make_policy
+from lidar_synth.labels.edit.unboxed import make_handling
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
 from lidar_synth.mixing.epochs import CurrentEpoch, Position
 from lidar_synth.mixing.items import to_item
+from lidar_synth.mixing.notices import Notices
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
 from lidar_synth.mixing.schedules import Schedule, make_schedule
@@ -63,6 +65,9 @@ class MixedScans(Dataset[Any]):
             your own function.
         unlabelled: ``"error"`` refuses a batch without any valid label; ``"allow"`` returns it, which is always the
             case with ``labels="none"``.
+        unboxed: what is done to objects without a box in synthetic scans with boxes: ``"close"`` removes them and fills
+            the holes, ``"keep"`` hands them out, ``"error"`` refuses the scan; or your own ``(scan) -> scan``. A
+            detector would learn that they are background. A scan without boxes is not changed.
         as_sensor: turns every synthetic scan into one of this sensor, before the label policy and in the process that
             loads the sample: a ``Transfer``, a preset's name, a YAML file or a ``Sensor``. So a bank of one sensor
             serves the scans of another. Losses and noise are new for every position of an epoch. Real scans stay
@@ -109,6 +114,7 @@ class MixedScans(Dataset[Any]):
         to_sample: ToSample = to_item,
         collate: Form | Callable[[Any], Any] = "offsets",
         unlabelled: Unlabelled = "error",
+        unboxed: str | Callable[[Scan], Scan] = "close",
         as_sensor: Transfer | Sensor | str | Path | None = None,
         real_as_is: bool = False,
         compare: bool = True,
@@ -131,6 +137,8 @@ class MixedScans(Dataset[Any]):
         options = dict(label_options or {})
         rings = frozenset() if target is None else frozenset({"ring"})
         self._policies = [make_policy(labels, real=scans, fields=s.fields | rings, **options) for s in self.synthetic]
+        self._without_unboxed = make_handling(unboxed) if isinstance(unboxed, str) else unboxed
+        self._notices = Notices()
         self._augment, self._augment_real = augment, augment_real
         self._to_sample, self._real_as_is = to_sample, real_as_is
         if isinstance(collate, str):
@@ -299,6 +307,7 @@ class MixedScans(Dataset[Any]):
             return real
         if real.domain != REAL:  # scans of the town, for instance, count as real here
             real = replace(real, domain=REAL)
+        self._notices.real(real)
         rng = keyed_rng(self.seed, epoch, position)
         if self._augment is not None and self._augment_real:
             real = self._augment(real, rng)
@@ -316,7 +325,13 @@ class MixedScans(Dataset[Any]):
     def _finish(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
         if self._transfer is not None:
             scan = self._transfer(scan, rng)
+        given = scan
+        if scan.boxes is not None:  # before labels of low confidence are ignored
+            scan = self._without_unboxed(scan)
         scan = self._policies[source](scan, rng)
+        self._notices.synthetic(given, scan)
+        if scan.boxes is not None:
+            scan = self._without_unboxed(scan)
         if self._augment is not None:
             scan = self._augment(scan, rng)
         return self._to_sample(scan, rng)

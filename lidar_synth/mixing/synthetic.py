@@ -21,7 +21,7 @@ class Synthetic(Protocol):
 
     Attributes:
         sensor: the sensor of the scans.
-        fields: the fields of ``POINT_FIELDS`` that the scans have.
+        fields: the fields of ``POINT_FIELDS`` that the scans have, and "boxes" if they have boxes.
         length: number of scans, numbered 0 .. length - 1; None = endless.
         identity: text of everything that determines the scans, such as checkpoint and seed; part of the plan's hash.
     """
@@ -134,7 +134,7 @@ class Held:
     def __init__(self, source: Source) -> None:
         first = source[0]
         self.sensor: Sensor = getattr(source, "sensor", first.sensor)
-        self.fields = frozenset(first.fields())
+        self.fields = frozenset(first.fields()) | (frozenset() if first.boxes is None else {"boxes"})
         self.length: int | None = len(source)
         self.identity = identity_of(source)
         self._source = source

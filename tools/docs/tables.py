@@ -53,6 +53,11 @@ FURTHER = (
     "lidar_synth.mixing.items.to_item",
     "lidar_synth.mixing.collate.Collate",
     "lidar_synth.labels.augment",
+    "lidar_synth.labels.edit.removal.remove",
+    "lidar_synth.labels.edit.insertion.insert",
+    "lidar_synth.labels.edit.insertion.move",
+    "lidar_synth.labels.edit.unboxed.measure",
+    "lidar_synth.labels.edit.unboxed.closed",
     "lidar_synth.datasets.classes.Taxonomy",
     "lidar_synth.train.runs.run",
     "lidar_synth.train.config.load.load_config",
@@ -88,9 +93,8 @@ def command_line() -> str:
     """The help of every command, in the order of the program's own help."""
     group = get_command(app)
     assert isinstance(group, TyperGroup)
-    return "\n".join(
-        _helps(group, Context(group, info_name="lidar-synth"), [*COMMANDS, "bank", "sensor", "skin", "metrics"])
-    )
+    names = [*COMMANDS, "bank", "edit", "sensor", "skin", "metrics"]
+    return "\n".join(_helps(group, Context(group, info_name="lidar-synth"), names))
 
 
 def _helps(group: TyperGroup, above: Context, names: list[str]) -> Iterator[str]:

@@ -1,0 +1,138 @@
+"""Part of a range image drawn again by a generator: known cells are kept, the cells of a hole are sampled.
+
+In every step the state outside the hole is the known one at that time, y_t = (1 - t) y0 + t y1 with y0 the encoded
+image; only the state inside the hole follows the flow (Lugmayr et al., "RePaint", CVPR 2022, for a rectified flow).
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import adaptive_max_pool2d
+
+from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.flow.solvers import solve
+from lidar_synth.generate.generator import Generator
+from lidar_synth.geometry.normalize import CHANNELS
+from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.noise import gaussian, uniform
+
+START = 0.6
+"""Latest time of the noise from which a hole is sampled: the provisional content keeps its large shapes."""
+
+
+def inpaint(
+    generator: Generator,
+    images: Sequence[RangeImage],
+    holes: Sequence[NDArray[np.bool_]],
+    seed: int,
+    indices: Sequence[int],
+    start: float = START,
+) -> list[RangeImage]:
+    """Draw the holes of range images again.
+
+    Args:
+        generator: an unconditional model.
+        images: B images on the model's grid with provisional content in the holes. Missing labels are ignored ones,
+            missing reflectance is 0.
+        holes: (H, W) each, True for cells to draw.
+        seed: seed of the noise, 0 <= seed < 2^64.
+        indices: B indices of the noise, 0 <= index < 2^63.
+        start: time in (0, 1] from which the flow starts: 1 ignores the provisional content, less keeps its large
+            shapes. The steps are those of the model's time grid from the last time at or below it.
+
+    Returns:
+        B images: outside the holes the given values, inside those of the model, with ``confidence`` if it has labels.
+
+    Raises:
+        ConfigError: on a conditional model, or a start outside (0, 1].
+        DataError: on images of another sensor.
+
+    Example:
+        >>> from lidar_synth import load_generator
+        >>> from lidar_synth.generate.inpaint import inpaint
+        >>> generator = load_generator("town")
+        >>> [image] = generator.range_images(seed=0, indices=[0])
+        >>> hole = (image.range > 10) & (image.range < 20)
+        >>> [drawn] = inpaint(generator, [image], [hole], seed=1, indices=[0])
+        >>> bool((drawn.range[~hole] == image.range[~hole]).all())
+        True
+    """
+    if generator.condition is not None:
+        raise ConfigError(f"{generator.name!r}, a model conditioned on {generator.condition!r}, to fill holes",
+                          "an unconditional model", "Use model='town', or no model.")  # fmt: skip
+    if not 0 < start <= 1:
+        raise ConfigError(f"start={start}", "a time in (0, 1]")
+    for image in images:
+        check_grid(image.sensor, generator.sensor)
+    drawn = []
+    for first in range(0, len(images), generator.batch):
+        part = slice(first, first + generator.batch)
+        drawn += _batch(generator, images[part], holes[part], seed, indices[part], start)
+    return drawn
+
+
+def check_grid(given: Sensor, wanted: Sensor) -> None:
+    """Check that two sensors have one grid; names and range limits may differ.
+
+    Raises:
+        DataError: on different rows or columns.
+    """
+    if given.shape != wanted.shape or not np.array_equal(given.edges, wanted.edges):
+        raise DataError(
+            f"a scan of sensor {given.name!r} ({given.shape[0]} x {given.shape[1]}) for a model of {wanted.name!r} "
+            f"({wanted.shape[0]} x {wanted.shape[1]})",
+            "scans on the model's grid",
+            "Use model=None, or a model that was trained for this sensor.",
+        )
+
+
+def _batch(
+    generator: Generator,
+    images: Sequence[RangeImage],
+    holes: Sequence[NDArray[np.bool_]],
+    seed: int,
+    indices: Sequence[int],
+    start: float,
+) -> list[RangeImage]:
+    codec, device = generator.codec, generator.device
+    known = codec.encode(generator.tensors.from_images([_complete(image) for image in images]).to(device))
+    mask = torch.from_numpy(np.stack(holes)).to(device, torch.float32)[:, None]
+    inside = adaptive_max_pool2d(mask, codec.shape[1:]) > 0
+    noise = gaussian(seed, indices, codec.shape, device)
+    draws = uniform(seed, indices, (codec.draws, *generator.sensor.shape), device) if codec.draws else None
+    with torch.inference_mode():
+        state = codec.decode(_sample(generator, known, noise, inside, start), draws)
+    results = []
+    for image, hole, new in zip(images, holes, generator.tensors.to_images(state, generator.sensor), strict=True):
+        channels = {n: np.where(hole, v, image.channels.get(n, v)) for n, v in new.channels.items()}
+        results.append(RangeImage(np.where(hole, new.range, image.range), image.sensor, channels))
+    return results
+
+
+def _sample(generator: Generator, known: Tensor, noise: Tensor, inside: Tensor, start: float) -> Tensor:
+    """The states (B, *shape) at time 0, which are the known ones outside the hole."""
+    grid = [t for t in generator.header.time_grid if t <= start]
+    if len(grid) < 2:
+        raise ConfigError(f"start={start} for the time grid {tuple(generator.header.time_grid)}", "a later time in it")
+    y = (1 - grid[0]) * known + grid[0] * noise
+    for t, t_next in pairwise(grid):
+        y = solve(generator.network, y, (t, t_next))
+        y = torch.where(inside, y, (1 - t_next) * known + t_next * noise)
+    return y
+
+
+def _complete(image: RangeImage) -> RangeImage:
+    """The image with every channel that a model may have."""
+    empty: dict[str, NDArray[Any]] = {
+        "reflectance": np.zeros(image.range.shape, np.float32),
+        "label": np.full(image.range.shape, IGNORE, np.uint8),
+    }
+    assert set(empty) | {"range"} == set(CHANNELS)
+    return RangeImage(image.range, image.sensor, empty | image.channels)

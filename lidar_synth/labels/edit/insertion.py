@@ -1,0 +1,284 @@
+"""An object set into a scan at a new place, as the sensor would have seen it there.
+
+The object's recorded surface is placed anew, and every ray of the scan is cast at it. A ray that hits it before its own
+return gets the object's; one whose return is nearer keeps it. So the object hides what is behind it and is hidden by
+what is in front of it, on the rays of this very scan.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.transfer.casting import Hits, first_hits
+from lidar_synth.geometry.transfer.rays import Rays
+from lidar_synth.geometry.transfer.surfaces import Surfaces, estimate, rings_of
+from lidar_synth.labels.boxes import grown, joined, overlapping
+from lidar_synth.labels.edit.compose import composed, next_instance
+from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
+from lidar_synth.labels.edit.removal import remove, selected
+from lidar_synth.labels.ground import ground_under
+from lidar_synth.labels.objects import Object, objects_of
+from lidar_synth.labels.pasting import occluded, still_visible
+
+if TYPE_CHECKING:
+    from lidar_synth.generate.generator import Generator
+
+TURN = 30.0
+"""Largest angle, degrees, by which an object may be seen from another side than it was recorded from."""
+
+NEARER = 0.5
+"""Smallest new distance of an object as a share of the recorded one; nearer, it would need returns that it lacks."""
+
+GRAZE = 0.05
+"""Metres by which the object has to be in front of a return to replace it."""
+
+Pose = Sequence[float]
+"""x and y in metres and, optionally, yaw in radians, counter-clockwise about +z from +x, in the sensor frame."""
+
+
+class Placed(NamedTuple):
+    """The place of an object.
+
+    Args:
+        old: (7,) its recorded box.
+        box: (7,) its new box.
+        mirrored: whether its mirror image about its long axis is used.
+    """
+
+    old: NDArray[np.float64]
+    box: NDArray[np.float32]
+    mirrored: bool
+
+    def points(self, points: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(N, 3) recorded points at the new place, metres."""
+        offset = points - self.old[:3]
+        c, s = np.cos(self.old[6]), np.sin(self.old[6])
+        along, across = offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s
+        across = -across if self.mirrored else across
+        x, y, z, *_, yaw = self.box.astype(np.float64)
+        c, s = np.cos(yaw), np.sin(yaw)
+        return np.stack([along * c - across * s + x, along * s + across * c + y, offset[:, 2] + z], 1)
+
+
+def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5) -> Scan:
+    """Set an object into a scan.
+
+    Args:
+        scan: N points; the ground is found by its labels, or by the lowest returns if it has none.
+        item: an object of ``objects_of`` or of an ``ObjectBank``. A mirror image of it is used if that shows the side
+            that is seen.
+        pose: x and y of its box's centre, and its yaw; by default the recorded place. Without a yaw, the sensor sees
+            the object from the side from which it was recorded. Its height follows from the ground.
+        least: minimum number of visible returns of an object, also of the scan's own: one that is hidden further
+            loses its box and its returns.
+
+    Returns:
+        A new scan with the object's box (a scan without boxes then has this one alone) and, if it has instances, a new
+        instance. Its labels are those of the object, if the scan has labels.
+
+    Raises:
+        DataError: if the place is outside the sensor's range, taken, or without ground; if the object would be seen
+            from a side that was not recorded, from too near, or not at all.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.labels import edit, objects_of
+        >>> town = Town(seed=0, scans=1)[0]
+        >>> number, car = next((i, o) for i, o in objects_of(town, 200).items() if o.scan.boxes.names == ("Car",))
+        >>> emptied = edit.remove(town, number)
+        >>> back = edit.insert(emptied, car)  # at its old place
+        >>> len(back.boxes) - len(emptied.boxes), back.boxes.names[-1]
+        (1, 'Car')
+    """
+    placed = _place(scan, item, pose)
+    rays = rays_of_scan(scan)
+    window = np.flatnonzero(rays.through(placed.box + np.array([0, 0, 0, 0.6, 0.6, 0.6, 0], np.float32)))
+    rho, hits, at = _hits(item, placed, rays, window)
+    seen = np.isfinite(rho) & (rho < rays.rho[window] - GRAZE)
+    if seen.sum() < least:
+        raise DataError(
+            f"an object at {_place_text(placed.box)} with {seen.sum()} visible returns of {np.isfinite(rho).sum()}",
+            f"at least {least}",
+            "Choose a nearer place, or one that nothing hides.",
+        )
+    replaced = np.zeros(len(scan), bool)
+    hidden = seen | _behind(rays, window, rho)
+    points = rays.point[window[hidden]]
+    replaced[points[points >= 0]] = True
+    remaining, boxes = still_visible(scan, ~replaced, least)
+    which = window[seen]
+    fields = _fields(scan, item, hits, at[seen])
+    new = replace(scan[np.zeros(len(which), np.intp)], points=rays.points(which, rho[seen]), **fields)
+    assert item.scan.boxes is not None
+    instance = np.array([next_instance(scan) if scan.instance is not None else -1], np.int32)
+    values = grown(placed.box, new.points)[None]
+    own = Boxes(values, item.scan.boxes.names, occlusion=item.scan.boxes.occlusion.copy(), instance=instance)
+    own = occluded(own, np.array([seen.sum() / np.isfinite(rho).sum()]))
+    result = composed(scan, ~remaining, rays, which, new)
+    return replace(result, boxes=joined([boxes, own]))
+
+
+def move(
+    scan: Scan, box: int, pose: Pose, *, model: "Generator | str | Path | None" = None, seed: int = 0, least: int = 5
+) -> Scan:
+    """Move an object of a scan: ``remove`` it and ``insert`` it at another place.
+
+    Args:
+        scan: N points with boxes.
+        box: the number of the object's box.
+        pose, least: see ``insert``.
+        model, seed: see ``remove``.
+
+    Returns:
+        A new scan; the moved box is the last one.
+
+    Raises:
+        DataError, ConfigError: as ``remove`` and ``insert``.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.labels import edit, objects_of
+        >>> town = Town(seed=0, scans=1)[0]
+        >>> number, car = next((i, o) for i, o in objects_of(town, 200).items() if o.scan.boxes.names == ("Car",))
+        >>> moved = edit.move(town, number, car.box[:2] * 1.02)  # a little further away
+        >>> moved.boxes.names[-1], len(moved.boxes) == len(town.boxes)
+        ('Car', True)
+    """
+    cut = cut_out(scan, box)
+    return insert(remove(scan, box, model=model, seed=seed), cut, pose, least=least)
+
+
+def cut_out(scan: Scan, box: int) -> Object:
+    """The object in a box of a scan, with the rings of its returns.
+
+    Raises:
+        DataError: if there is no such box, or no return in it.
+    """
+    selected(scan, box)
+    if scan.ring is None:
+        ring, on_grid = rings_of(scan)
+        sensor = replace(scan.sensor, firings=None) if on_grid else scan.sensor  # as many as columns
+        scan = replace(scan, ring=ring.astype(np.int16), sensor=sensor)
+    found = objects_of(scan, least=1)
+    if box not in found:
+        raise DataError(f"box {box} of scan {scan.id!r} without a return", "a box with an object")
+    return found[box]
+
+
+def _place(scan: Scan, item: Object, pose: Pose | None) -> Placed:
+    """The object at its pose on the ground."""
+    old = item.box.astype(np.float64)
+    x, y, yaw = _complete(old, pose)
+    distance, recorded = float(np.hypot(x, y)), float(np.hypot(old[0], old[1]))
+    box = np.array([x, y, 0, *old[3:6], yaw], np.float32)
+    limits = max(scan.sensor.range_min, 1.0), scan.sensor.range_max
+    if not limits[0] < distance < limits[1]:
+        raise DataError(f"an object at {_place_text(box)}, {distance:.1f} m away",
+                        f"a place {limits[0]:g} to {limits[1]:g} m from the sensor {scan.sensor.name!r}")  # fmt: skip
+    if distance < NEARER * recorded:
+        raise DataError(f"an object recorded at {recorded:.1f} m, to be seen at {distance:.1f} m",
+                        f"at least {NEARER * recorded:.1f} m, because it has too few returns for less")  # fmt: skip
+    if scan.boxes is not None and (taken := overlapping(box, scan.boxes.values)).any():
+        number = int(np.flatnonzero(taken)[0])
+        raise DataError(f"an object at {_place_text(box)}, which overlaps box {number} ({scan.boxes.names[number]})",
+                        "a free place", "Remove that object first, or choose another place.")  # fmt: skip
+    ground = ground_under(scan, box)
+    if ground is None or not ground.encloses:
+        raise DataError(f"an object at {_place_text(box)}, where the scan has no level ground", "ground around the box")
+    if not ground.free:
+        raise DataError(f"an object at {_place_text(box)}, where the scan has other returns", "a free place")
+    box[2] = ground.height + old[2] - item.ground
+    return Placed(old, box, _mirrored(old, x, y, yaw))
+
+
+def _complete(old: NDArray[np.float64], pose: Pose | None) -> tuple[float, float, float]:
+    """x, y and yaw of a pose."""
+    values = [float(v) for v in (old[[0, 1, 6]] if pose is None else pose)]
+    if len(values) not in (2, 3) or not np.isfinite(values).all():
+        raise DataError(f"pose {pose}", "x, y in metres, or x, y and yaw in radians")
+    if len(values) == 2:
+        values.append(float(old[6] + np.arctan2(values[1], values[0]) - np.arctan2(old[1], old[0])))
+    return values[0], values[1], values[2]
+
+
+def _mirrored(old: NDArray[np.float64], x: float, y: float, yaw: float) -> bool:
+    """Whether the mirror image of an object shows the side that is seen at its new place.
+
+    Raises:
+        DataError: if neither the object nor its mirror image does.
+    """
+    recorded = np.arctan2(-old[1], -old[0]) - old[6]
+    seen = np.arctan2(-y, -x) - yaw
+    off = [abs((seen - side + np.pi) % (2 * np.pi) - np.pi) for side in (recorded, -recorded)]
+    if min(off) > np.radians(TURN):
+        raise DataError(
+            f"an object seen from {np.degrees(off[0]):.0f} degrees beside the side that was recorded",
+            f"at most {TURN:g} degrees, for it or its mirror image",
+            "Leave out the yaw: the recorded side then faces the sensor.",
+        )
+    return bool(off[1] < off[0])
+
+
+def _hits(
+    item: Object, placed: Placed, rays: ScanRays, window: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], Hits, NDArray[np.intp]]:
+    """(n,) the horizontal distance at which each ray of the window hits the object, inf = never; all hits, and the
+    index (n, 2) of each ray's."""
+    rho, at = np.full(len(window), np.inf), np.zeros((len(window), 2), np.intp)
+    surfaces = _surfaces(item.scan)
+    rings, first, which = np.unique(rays.ring[window], return_index=True, return_inverse=True)
+    slope = np.array([np.median(rays.slope[window[which == k]]) for k in range(len(rings))])
+    count = round(2 * np.pi / rays.step)
+    raster = Rays(slope, rays.height[window[first]], rays.azimuth[window[first]], rays.step, count)
+    hits = first_hits(surfaces, placed.points(surfaces.scan.points), raster, np.array([0.0, 0.0, 1.0]))
+    if len(window):
+        firing = np.rint((rays.azimuth[window] - raster.first[which]) / rays.step).astype(np.intp) % count
+        at = np.stack([which, firing], 1)
+        rho = hits.rho[which, firing]
+    return rho, hits, at
+
+
+def _surfaces(part: Scan) -> Surfaces:
+    """The surfaces of an object's returns."""
+    ring, on_grid = rings_of(part)
+    sensor = replace(part.sensor, firings=None) if on_grid else part.sensor
+    return estimate(
+        Scan(part.points, part.reflectance, sensor, label=part.label, ring=ring.astype(np.int16), id=part.id)
+    )
+
+
+def _behind(rays: ScanRays, window: NDArray[np.intp], rho: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(n,) rays of the window between two that hit the object in their ring, whose return lies behind it."""
+    behind = np.zeros(len(window), bool)
+    for ring in np.unique(rays.ring[window]):
+        mine = np.flatnonzero(rays.ring[window] == ring)
+        hit = np.flatnonzero(np.isfinite(rho[mine]))
+        if len(hit):
+            start = hit[np.argmax(np.diff(hit, append=hit[0] + len(mine))) + 1 - len(hit)]  # after the widest gap
+            length = len(mine) - np.diff(hit, append=hit[0] + len(mine)).max() + 1
+            inner = mine[(start + np.arange(length)) % len(mine)]
+            behind[inner] = rays.rho[window[inner]] > np.min(rho[mine][hit])
+    return behind
+
+
+def _fields(scan: Scan, item: Object, hits: Hits, at: NDArray[np.intp]) -> dict[str, Any]:
+    """The fields of the object's points that the scan has."""
+    row, firing = at.T
+    fields: dict[str, Any] = {"reflectance": hits.reflectance[row, firing].astype(np.float32)}
+    if scan.label is not None:
+        fields["label"] = hits.carried["label"][row, firing].astype(np.uint8)
+    if scan.instance is not None:
+        fields["instance"] = np.full(len(row), next_instance(scan), np.int32)
+    if scan.confidence is not None:
+        fields["confidence"] = np.ones(len(row), np.float32)
+    return fields
+
+
+def _place_text(box: NDArray[np.float32]) -> str:
+    return f"({box[0]:.1f}, {box[1]:.1f})"

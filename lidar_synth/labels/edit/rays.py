@@ -1,0 +1,89 @@
+"""The rays of one scan, ring by ring: those of its returns, and those that came back without a return."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.transfer.kernels import WIDEST
+from lidar_synth.geometry.transfer.surfaces import rings_of
+
+
+class ScanRays(NamedTuple):
+    """E rays, ordered by ring and clockwise within a ring; the last of a ring is followed by its first.
+
+    Args:
+        point: (E,) index of the return; -1 = none.
+        ring: (E,) int64, 0 = highest.
+        azimuth: (E,) radians, clockwise from straight ahead.
+        slope: (E,) tangent of the elevation, seen from the laser.
+        height: (E,) metres above the sensor's origin at which the laser starts.
+        rho: (E,) horizontal distance of the return, metres; inf = none.
+        start: (R + 1,) first ray of each ring that has returns, and E.
+        step: radians between two firings.
+    """
+
+    point: NDArray[np.int64]
+    ring: NDArray[np.int64]
+    azimuth: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    height: NDArray[np.float64]
+    rho: NDArray[np.float64]
+    start: NDArray[np.int64]
+    step: float
+
+    def points(self, which: NDArray[np.intp], rho: NDArray[np.float64]) -> NDArray[np.float32]:
+        """(n, 3) points on some rays at horizontal distances (n,), metres."""
+        azimuth, z = self.azimuth[which], self.height[which] + self.slope[which] * rho
+        return np.stack([rho * np.cos(azimuth), -rho * np.sin(azimuth), z], 1).astype(np.float32)
+
+    def through(self, box: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(E,) whether each ray passes through a box (7,)."""
+        c, s = np.cos(float(box[6])), np.sin(float(box[6]))
+        dx, dy = np.cos(self.azimuth), -np.sin(self.azimuth)
+        origin = (-box[0] * c - box[1] * s, box[0] * s - box[1] * c, self.height - box[2])
+        along = (dx * c + dy * s, dy * c - dx * s, self.slope)
+        enter, leave = np.zeros(len(dx)), np.full(len(dx), np.inf)
+        for o, d, size in zip(origin, along, box[3:6], strict=True):
+            d = np.where(np.abs(d) < 1e-9, 1e-9, d)
+            a, b = (-size / 2 - o) / d, (size / 2 - o) / d
+            enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
+        return np.asarray(enter <= leave)
+
+
+def rays_of_scan(scan: Scan) -> ScanRays:
+    """The rays of a scan of N returns; gaps between the returns of a ring are rays without a return.
+
+    The rings are ``scan.ring``, or follow from the order of the points, or are the rows of the sensor's grid. Only in
+    the last case rays start at the origin.
+    """
+    ring, on_grid = rings_of(scan)
+    optics = np.zeros(1) if on_grid else scan.sensor.optics()[1]
+    x, y, z = scan.points.astype(np.float64).T
+    azimuth, rho = -np.arctan2(y, x), np.maximum(np.hypot(x, y), 1e-3)
+    height = optics[np.minimum(ring, len(optics) - 1)]
+    order = np.lexsort((azimuth, ring))
+    ring, azimuth, rho, height = ring[order], azimuth[order], rho[order], height[order]
+    slope = (z[order] - height) / rho
+    last = np.append(ring[1:] != ring[:-1], True)
+    first = np.flatnonzero(np.append(True, last[:-1]))
+    following = np.arange(1, len(ring) + 1)
+    following[last] = first
+    gap = azimuth[following] - azimuth + 2 * np.pi * last
+    step = 2 * np.pi / (scan.sensor.columns if on_grid else scan.sensor.firings or scan.sensor.columns)
+    added = np.where(gap > WIDEST * step, np.rint(gap / step).astype(np.int64) - 1, 0)
+    source = np.repeat(np.arange(len(ring)), added + 1)
+    ends = np.cumsum(added + 1)
+    nth = np.arange(len(source)) - (ends - added - 1)[source]
+    share = nth / (added[source] + 1)
+    return ScanRays(
+        point=np.where(nth == 0, order[source], -1),
+        ring=ring[source],
+        azimuth=azimuth[source] + share * gap[source],
+        slope=(1 - share) * slope[source] + share * slope[following[source]],
+        height=height[source],
+        rho=np.where(nth == 0, rho[source], np.inf),
+        start=np.append((ends - added - 1)[first], len(source)),
+        step=step,
+    )

@@ -1,0 +1,199 @@
+"""Objects taken out of a scan, and the surfaces behind them in their place.
+
+The hole consists of the rays that the object returned or absorbed. They are continued from the same rings beside it
+(``fill``), and drawn again by a generator if there is one (``redraw``).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.labels.edit.compose import composed
+from lidar_synth.labels.edit.fill import continued
+from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
+from lidar_synth.labels.edit.redraw import Model, open_model, redrawn
+from lidar_synth.labels.ground import FLOOR, GROUND, ground_under, standing
+from lidar_synth.labels.objects import NOISE, THINGS, belonging
+
+if TYPE_CHECKING:
+    from lidar_synth.generate.generator import Generator
+
+Which = int | Sequence[int] | Boxes | NDArray[np.float32]
+"""Boxes: by their numbers in the scan, or by their values."""
+
+MARGIN = 0.05
+"""Metres around an object within which a ray without a return is taken for one that the object absorbed."""
+
+
+def remove(scan: Scan, box: Which, *, model: "Generator | str | Path | None" = None, seed: int = 0) -> Scan:
+    """Remove objects from a scan, with their boxes, and fill the holes with what is behind them.
+
+    Args:
+        scan: N points.
+        box: number of a box of the scan, several numbers, or a box (7,) or ``Boxes`` in the sensor frame.
+        model: an unconditional generator on the scan's grid, its name or file, that draws the holes; None, the
+            default, fills them by geometry alone.
+        seed: of the model's noise.
+
+    Returns:
+        A new scan. All other points, labels, boxes and instances are unchanged.
+
+    Raises:
+        DataError: on a box that the scan does not have, that is out of the sensor's range or that holds no return;
+            with a model, on a scan of another sensor.
+        ConfigError: on an unknown or a conditional model.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.labels import edit
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> number = scan.boxes.names.index("Car")
+        >>> emptied = edit.remove(scan, number)
+        >>> len(scan.boxes) - len(emptied.boxes)
+        1
+    """
+    boxes, numbers = selected(scan, box)
+    parts = [(returns_of(scan, boxes[[i]]), boxes.values[i]) for i in range(len(boxes))]
+    if numbers is None and not any(mine.any() for mine, _ in parts):
+        raise DataError(f"box {_text(boxes.values[0])} of scan {scan.id!r} without a return", "a box with an object")
+    result = without(scan, parts, open_model(model), seed)
+    if scan.boxes is None or numbers is None:
+        return result
+    return replace(result, boxes=scan.boxes[~np.isin(np.arange(len(scan.boxes)), numbers)])
+
+
+def selected(scan: Scan, box: Which) -> tuple[Boxes, list[int] | None]:
+    """The boxes that an argument names, and their numbers in the scan, None for boxes of its own.
+
+    Raises:
+        DataError: on a number or a place that the scan does not have.
+    """
+    given = np.asarray(box.values if isinstance(box, Boxes) else box)
+    if given.dtype.kind in "iu" and given.ndim < 2:
+        numbers = np.atleast_1d(given).tolist()
+        count = 0 if scan.boxes is None else len(scan.boxes)
+        if scan.boxes is None or not numbers or min(numbers) < 0 or max(numbers) >= count:
+            given_text = f"box {given.tolist()} of scan {scan.id!r} with {count} boxes"
+            raise DataError(given_text, "numbers of its boxes, from 0",
+                            "A scan without boxes takes a box (7,): x, y, z, length, width, height, yaw.")  # fmt: skip
+        return scan.boxes[numbers], numbers
+    if given.ndim == 0 or given.shape[-1] != 7 or given.dtype.kind not in "iuf":
+        raise DataError(f"a box of shape {given.shape}", "(7,): x, y, z, length, width, height, yaw")
+    boxes = box if isinstance(box, Boxes) else Boxes(given.astype(np.float32), ("Misc",) * (given.size // 7))
+    for values in boxes.values:
+        if (distance := float(np.linalg.norm(values[:3]))) > scan.sensor.range_max:
+            raise DataError(f"a box {_text(values)}, {distance:.1f} m away",
+                            f"at most {scan.sensor.range_max:g} m, the range of {scan.sensor.name!r}")  # fmt: skip
+    return boxes, None
+
+
+def _text(values: NDArray[np.float32]) -> str:
+    return f"at ({values[0]:.1f}, {values[1]:.1f}, {values[2]:.1f})"
+
+
+def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
+    """(N,) the returns of the object in one box, with those of its mirrors and aerials just outside."""
+    mine = belonging(scan, box)
+    wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
+    around = Boxes(wide, box.names).contain(scan.points)[0] & ~mine
+    ground = ground_under(scan, box.values[0])
+    if ground is not None:
+        around[around] = ground.above(scan.points[around], box.values[0]) > FLOOR
+    else:
+        around &= scan.points[:, 2] > box.values[0, 2] - box.values[0, 5] / 2 + FLOOR
+    if scan.label is not None:  # in the box, also returns at the object's edge whose label is another one
+        same = np.isin(scan.label, np.unique(scan.label[mine])) & (scan.label < THINGS)
+        around &= same | (box.contain(scan.points)[0] & ~GROUND[scan.label])
+    if scan.instance is not None and mine.any():
+        around &= np.isin(scan.instance, [0, *np.unique(scan.instance[mine])])
+    if scan.boxes is not None:
+        others = ~(scan.boxes.values == box.values).all(1)
+        around &= ~scan.boxes[others].contain(scan.points).any(0)
+    return np.asarray(mine | around)
+
+
+def without(
+    scan: Scan,
+    parts: Sequence[tuple[NDArray[np.bool_], NDArray[np.float32]]],
+    model: Model,
+    seed: int,
+    start: float | None = None,
+) -> Scan:
+    """Remove returns from a scan and fill the hole.
+
+    Args:
+        scan: N points.
+        parts: for each object, (N,) True for its returns, and its box (7,).
+        model: draws the hole; None for the estimate from its surroundings alone.
+        seed: of the model's noise.
+        start: see ``inpaint``; None = its default.
+
+    Returns:
+        The scan with its remaining points unchanged and in order. Points of the hole take the place of removed ones;
+        those on rays that had no return come after their neighbour in the ring. Boxes stay as they are.
+    """
+    removed = np.any([mine for mine, _ in parts], 0)
+    if not removed.any():
+        return scan
+    rays = rays_of_scan(scan)
+    there = rays.point >= 0
+    hole, near = there & removed[rays.point], np.full(len(there), np.inf)
+    near[hole] = rays.rho[hole]
+    for mine, box in parts:
+        if mine.any():
+            grown = box + np.array([0, 0, 0, *3 * [2 * MARGIN], 0], np.float32)
+            absorbed = ~there & rays.through(grown)
+            near[absorbed] = np.minimum(near[absorbed], np.hypot(*scan.points[mine, :2].T).min())
+            hole |= absorbed
+    donor, rho = continued(rays, hole, near, _ground(scan, rays), _things(scan, rays))
+    which = np.flatnonzero(hole & (donor >= 0))
+    filled = _copies(scan, rays, which, donor[which], rho[which])
+    if model is not None:
+        filled = redrawn(scan[~removed], filled, rays, which, model, seed, start)
+    seen = np.linalg.norm(filled.points, axis=1) > 0
+    return composed(scan, removed, rays, which[seen], filled[seen])
+
+
+def _ground(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:
+    """(E,) True for returns of the ground: by their labels, or without labels where a ring is level and low."""
+    ground = np.zeros(len(rays.point), bool)
+    there = rays.point >= 0
+    if scan.label is not None and (scan.label != IGNORE).any():
+        ground[there] = GROUND[scan.label[rays.point[there]]]
+    else:
+        low = np.percentile(scan.points[:, 2], 10) + 0.5 if len(scan) else 0.0
+        ground[there] = scan.points[rays.point[there], 2] < low
+    return ground
+
+
+def _things(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:
+    """(E,) True for returns of objects: by their labels, or in boxes."""
+    thing = np.zeros(len(scan), bool)
+    if scan.label is not None:
+        thing |= scan.label < THINGS
+    if scan.boxes is not None:
+        thing |= standing(scan, scan.boxes).any(0)
+    return np.asarray((rays.point >= 0) & thing[rays.point])
+
+
+def _copies(
+    scan: Scan, rays: ScanRays, which: NDArray[np.intp], donor: NDArray[np.int64], rho: NDArray[np.float64]
+) -> Scan:
+    """One point for each ray of the hole, with the fields of its source; points at the origin have no return."""
+    found = np.isfinite(rho)
+    points = np.where(found[:, None], rays.points(which, np.where(found, rho, 0.0)), np.float32(0))
+    limits = scan.sensor.range_min, scan.sensor.range_max
+    distance = np.linalg.norm(points, axis=1)
+    points[(distance < limits[0]) | (distance > limits[1])] = 0
+    copies = scan[np.maximum(rays.point[donor], 0)]
+    fields: dict[str, Any] = {"points": points.astype(np.float32)}
+    if scan.instance is not None:
+        fields["instance"] = np.zeros(len(which), np.int32)
+    return replace(copies, **fields)

@@ -1,0 +1,199 @@
+"""Objects of a synthetic scan that have no box: a detector would learn that they are background.
+
+Points of classes that detectors find are joined to clusters. Clusters outside all boxes are counted, and removed with
+their holes filled.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.datasets.classes import NAMES
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.labels.boxes import grown
+from lidar_synth.labels.edit.redraw import Model
+from lidar_synth.labels.edit.removal import without
+from lidar_synth.labels.ground import FLOOR, GROUND, standing
+from lidar_synth.labels.objects import LABELS
+
+BOXED = tuple(sorted(set(LABELS.values())))
+"""Train ids of the classes that have boxes."""
+
+LEAST = 20
+"""Minimum number of points of an unboxed object; smaller ones are too small for a detector, too."""
+
+TOLERANCE = 0.2
+"""Metres outside a box within which a point still belongs to it."""
+
+_REACH = 0.5  # metres; side of the cubes of which neighbours are joined
+
+
+class Unboxed(NamedTuple):
+    """The unboxed objects of a scan, or the sums over several.
+
+    Args:
+        scans: number of scans.
+        objects: number of clusters outside all boxes.
+        points: number of points of boxed classes.
+        outside: number of those outside all boxes.
+    """
+
+    scans: int
+    objects: int
+    points: int
+    outside: int
+
+    @property
+    def share(self) -> float:
+        """Share of the points of boxed classes that lie outside all boxes."""
+        return self.outside / max(self.points, 1)
+
+    def __str__(self) -> str:
+        rate = self.objects / max(self.scans, 1)
+        return f"{rate:.1f} objects without a box a scan ({self.share:.0%} of the points of their classes)"
+
+
+def clusters(scan: Scan, classes: Iterable[int] = BOXED, least: int = LEAST) -> NDArray[np.int64]:
+    """(N,) number of the unboxed object of each point, from 1 on; 0 = none.
+
+    Args:
+        scan: N points; without labels there is nothing to find, without boxes every object is unboxed.
+        classes: train ids of the classes that have boxes.
+        least: minimum number of points of an object.
+    """
+    number = np.zeros(len(scan), np.int64)
+    outside = np.flatnonzero(_outside(scan, classes))
+    if len(outside):
+        cube = np.floor(scan.points[outside] / _REACH).astype(np.int64) + (1 << 18)
+        keys, of = np.unique((cube[:, 0] << 40) | (cube[:, 1] << 20) | cube[:, 2], return_inverse=True)
+        root = np.arange(len(keys))
+        _join(keys, _NEIGHBOURS, root)
+        size = np.bincount(root[of], minlength=len(keys))
+        large = size >= least
+        number[outside] = (np.cumsum(large) * large)[root[of]]
+    return number
+
+
+def measure(scans: Iterable[Scan], classes: Iterable[int] = BOXED, least: int = LEAST) -> Unboxed:
+    """Count the unboxed objects of scans.
+
+    Example:
+        >>> from lidar_synth import load_generator
+        >>> from lidar_synth.labels.edit import measure
+        >>> found = measure(load_generator("town").scans(seed=0, indices=[0]))
+        >>> found.scans, found.share  # the model generates no boxes
+        (1, 1.0)
+    """
+    total = Unboxed(0, 0, 0, 0)
+    for scan in scans:
+        points = 0 if scan.label is None else int(np.isin(scan.label, list(classes)).sum())
+        found = (1, int(clusters(scan, classes, least).max(initial=0)), points, int(_outside(scan, classes).sum()))
+        total = Unboxed(*(a + b for a, b in zip(total, found, strict=True)))
+    return total
+
+
+def closed(scan: Scan, model: Model = None, seed: int = 0, classes: Iterable[int] = BOXED, least: int = LEAST) -> Scan:
+    """Remove the unboxed objects of a scan, and fill the holes with what is behind them.
+
+    Args:
+        scan: N points with labels; without labels the scan is returned as it is.
+        model: draws the holes; None fills them by geometry.
+        seed: of the model's noise.
+        classes, least: see ``clusters``.
+    """
+    number = clusters(scan, classes, least)
+    parts = [_with_rim(scan, number == k) for k in range(1, int(number.max(initial=0)) + 1)]
+    return without(scan, parts, model, seed) if parts else scan
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Refuses scans with unboxed objects."""
+
+    def __call__(self, scan: Scan) -> Scan:
+        if count := int(clusters(scan).max(initial=0)):
+            raise DataError(
+                f"synthetic scan {scan.id!r} with {count} objects without a box",
+                "a box for every object of " + ", ".join(NAMES[c] for c in BOXED),
+                "unboxed='close' removes them and fills the holes; unboxed='keep' hands them out.",
+            )
+        return scan
+
+
+def _kept(scan: Scan) -> Scan:
+    return scan
+
+
+HANDLING: dict[str, Callable[[Scan], Scan]] = {"close": closed, "keep": _kept, "error": Refusal()}
+"""What is done to unboxed objects of scans with boxes, by name."""
+
+
+def make_handling(name: str, model: Model = None) -> Callable[[Scan], Scan]:
+    """The handling of unboxed objects by its name: ``"close"`` removes them, ``"keep"`` does nothing, ``"error"``
+    refuses the scan.
+
+    Args:
+        name: a key of ``HANDLING``.
+        model: for ``"close"``, see ``closed``.
+
+    Raises:
+        ConfigError: on another name.
+    """
+    if name not in HANDLING:
+        raise ConfigError(f"unboxed={name!r}", f"one of {', '.join(map(repr, HANDLING))}")
+    return partial(closed, model=model) if name == "close" and model is not None else HANDLING[name]
+
+
+def _outside(scan: Scan, classes: Iterable[int]) -> NDArray[np.bool_]:
+    """(N,) True for points of some classes outside all boxes."""
+    if scan.label is None:
+        return np.zeros(len(scan), bool)
+    outside: NDArray[np.bool_] = np.isin(scan.label, list(classes))
+    if scan.boxes is not None and len(scan.boxes) and outside.any():
+        wide = scan.boxes.values + np.array([0, 0, 0, *3 * [2 * TOLERANCE], 0], np.float32)
+        outside[outside] = ~Boxes(wide, scan.boxes.names).contain(scan.points[outside]).any(0)
+        if scan.instance is not None:
+            outside &= ~((scan.instance > 0) & np.isin(scan.instance, scan.boxes.instance))
+    return outside
+
+
+def _with_rim(scan: Scan, mine: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """The returns of a cluster with those at its rim that have another label, and the box (7,) around it."""
+    low, high = scan.points[mine].min(0), scan.points[mine].max(0)
+    box = grown(np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32), scan.points[mine])
+    around = Boxes(box, ("Misc",)).contain(scan.points, above_floor=FLOOR)[0]
+    if scan.label is not None:
+        around &= ~GROUND[scan.label]
+    if scan.boxes is not None:
+        around &= ~standing(scan, scan.boxes).any(0)
+    return mine | around, box
+
+
+_NEIGHBOURS = np.array(
+    [(x << 40) + (y << 20) + z for x in (0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)],
+    np.int64,
+)
+"""Differences of the keys of a cube and of the half of its neighbours that come after it."""
+
+
+@numba.njit(cache=True)
+def _join(keys, neighbours, root):  # type: ignore[no-untyped-def]
+    """Fill ``root`` (K,) with the first of all cubes that each is connected with; keys (K,) are sorted."""
+    for i in range(len(keys)):
+        for step in neighbours:
+            j = np.searchsorted(keys, keys[i] + step)
+            if j < len(keys) and keys[j] == keys[i] + step:
+                a, b = i, j
+                while root[a] != a:
+                    a = root[a]
+                while root[b] != b:
+                    b = root[b]
+                root[max(a, b)] = min(a, b)
+    for i in range(len(keys)):
+        root[i] = root[root[i]]  # roots come before their cubes

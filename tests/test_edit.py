@@ -1,0 +1,220 @@
+"""Scan surgery, against worlds whose exact scan is known: without the object, and with it elsewhere."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pasting import assert_nothing_shares_a_ray
+from typer.testing import CliRunner
+from worlds import CAR, WALL, car, cast, wall
+
+from lidar_synth import ObjectBank, Town, load_generator, load_sensor, open_scans
+from lidar_synth.cli import app
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.formats import WRITERS
+from lidar_synth.geometry.projection import locate, project
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.labels import edit
+from lidar_synth.labels.edit.insertion import cut_out
+from lidar_synth.labels.edit.rays import rays_of_scan
+from lidar_synth.labels.edit.removal import returns_of
+
+BEHIND = wall(24, 0, np.pi / 2, length=80)
+
+
+def returned(scan: Scan, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Range and label in the cells of a hole."""
+    image = project(scan)
+    assert image.label is not None
+    return image.range[hole], image.label[hole]
+
+
+def cells_of(scan: Scan, points: np.ndarray) -> np.ndarray:
+    hole = np.zeros(scan.sensor.shape, bool)
+    hole.reshape(-1)[locate(scan.points[points], scan.sensor).cell] = True
+    return hole
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+@pytest.mark.parametrize("place", [(12, 2, 0.3), (9, -6, 1.4), (-14, 0.5, 0.1), (17, 5, 0.0)])
+def test_behind_a_removed_car_is_what_was_there(place: tuple[float, float, float], labelled: bool) -> None:
+    full, empty = cast([car(*place)], [BEHIND]), cast([], [BEHIND])
+    scan = full if labelled else replace(full, label=None, instance=None, boxes=replace(full.boxes, instance=None))
+    result = edit.remove(scan, 0)
+    hole = cells_of(full, full.instance == 1)
+    expected, label = returned(empty, hole)
+    got = project(result).range[hole]
+    assert ((got > 0) == (expected > 0)).mean() > 0.97
+    assert np.median(np.abs(got - expected)[got > 0]) < (0.02 if labelled else 0.12)
+    both = (got > 0) & (expected > 0)
+    assert (np.abs(got - expected) < 0.4)[both].mean() > (0.85 if labelled else 0.7)
+    if labelled:
+        assert (returned(result, hole)[1] == label).mean() > 0.93 and not (result.label == CAR).any()
+    kept = project(full).range[~hole]
+    assert np.allclose(project(result).range[~hole], kept, atol=1e-4)
+    assert result.boxes is not None and not len(result.boxes)
+
+
+def test_other_objects_do_not_grow_into_the_hole() -> None:
+    cars = [car(10, 0), car(10, 2.4), car(10, -2.4)]
+    full = cast(cars, [BEHIND])
+    result = edit.remove(full, 0)
+    assert result.boxes is not None and np.array_equal(result.boxes.instance, [2, 3])
+    for number in (2, 3):
+        assert (result.instance == number).sum() == (full.instance == number).sum()
+    assert set(np.unique(result.label[~np.isin(result.instance, [2, 3])])) == {WALL, 8}
+
+
+def test_what_stands_in_front_stays_and_does_not_continue_behind() -> None:
+    pole = wall(7, 0, 0.0, length=0.3)
+    full, empty = cast([car(12, 0, 1.5)], [BEHIND, pole]), cast([], [BEHIND, pole])
+    result = edit.remove(full, 0)
+    got, expected = project(result).range, project(empty).range
+    assert (np.abs(got - expected) < 0.3).mean() > 0.995
+
+
+def test_rays_that_the_object_absorbed_belong_to_the_hole() -> None:
+    full = cast([car(12, 0)], [BEHIND])
+    mine = np.flatnonzero(full.instance == 1)
+    windows = replace(full[np.delete(np.arange(len(full)), mine[::3])])
+    hole = cells_of(full, mine)
+    assert (project(edit.remove(windows, 0)).range[hole] > 0).mean() > 0.97
+
+
+def test_the_rays_of_a_scan_lead_to_its_points() -> None:
+    for scan in (cast([car(12, 0)]), Town(seed=3, scans=1)[0]):
+        rays = rays_of_scan(scan)
+        there = np.flatnonzero(rays.point >= 0)
+        assert np.array_equal(np.sort(rays.point[there]), np.arange(len(scan)))
+        assert np.allclose(rays.points(there, rays.rho[there]), scan.points[rays.point[there]], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [((10, 0, 0.3), (14, 6, None)), ((12, -4, 1.2), (8, 3, None)), ((-9, 2, 0.0), (11, -3, 3.0)),
+     ((10, 5, 0.2), (11, -6.2, -0.1))],
+)  # fmt: skip
+def test_a_moved_car_looks_as_the_sensor_would_see_it(old: Any, new: Any) -> None:
+    before = cast([car(*old)], [BEHIND])
+    pose = [v for v in new if v is not None]
+    result = edit.move(before, 0, pose)
+    assert result.boxes is not None and len(result.boxes) == 1 and result.boxes.names == ("Car",)
+    box = result.boxes.values[0]
+    assert np.allclose(box[:2], new[:2], atol=1e-3)
+    truth = cast([np.r_[box[:2], car(0, 0)[2:6], box[6]].astype(np.float32)], [BEHIND])
+    mine, true = cells_of(result, result.label == CAR), cells_of(truth, truth.instance == 1)
+    assert (mine & true).sum() / (mine | true).sum() > 0.7
+    assert 0.85 < mine.sum() / true.sum() < 1.15
+    both = mine & true
+    assert np.median(np.abs(project(result).range - project(truth).range)[both]) < 0.05
+    assert result.boxes.contain(result.points[result.label == CAR]).all()
+    number = result.boxes.instance[0]
+    assert (result.instance == number).sum() == (result.label == CAR).sum() > 50
+
+
+def test_an_inserted_car_hides_and_is_hidden() -> None:
+    pole = wall(6, 0.2, 0.0, length=0.4)
+    [item] = [cut_out(cast([car(12, 0, 1.57)]), 0)]
+    result = edit.insert(cast([], [pole, BEHIND]), item)
+    assert result.boxes is not None
+    front = cells_of(cast([], [pole]), cast([], [pole]).label == WALL)
+    assert (project(result).label[front] == WALL).all()
+    alone = edit.insert(cast([], [BEHIND]), item)
+    assert 20 < (result.label == CAR).sum() < (alone.label == CAR).sum()
+    assert_nothing_shares_a_ray(alone, 1)
+
+
+def test_objects_of_a_bank_are_inserted() -> None:
+    bank = ObjectBank.from_scans([cast([car(12, 0, 0.4)])])
+    result = edit.insert(cast([], [BEHIND]), bank[0], (13, 4))
+    assert result.boxes is not None
+    assert result.boxes.contain(result.points[result.label == CAR]).all() and (result.label == CAR).sum() > 100
+
+
+SCAN = cast([car(12, 0, 0.3), car(8, 8)], [BEHIND])
+ITEM = cut_out(SCAN, 0)
+BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
+    "number": (lambda: edit.remove(SCAN, 2), DataError, r"box 2 of scan 'world' with 2 boxes; expected numbers"),
+    "no boxes": (lambda: edit.remove(replace(SCAN, boxes=None), 0), DataError, "with 0 boxes.*takes a box"),
+    "shape": (lambda: edit.remove(SCAN, [1.0, 2.0]), DataError, r"a box of shape \(2,\)"),
+    "far": (lambda: edit.remove(SCAN, car(90, 0)), DataError, "90.0 m away; expected at most 80 m"),
+    "empty": (lambda: edit.remove(SCAN, car(-9, 0) + np.float32([0, 0, 6, 0, 0, 0, 0])), DataError, "without a return"),
+    "model": (lambda: edit.remove(SCAN, 0, model="nothing"), ConfigError, "model 'nothing'; expected a shipped one"),
+    "conditional": (lambda: edit.remove(SCAN, 0, model="town-semantic"), ConfigError, "expected an unconditional"),
+    "sensor": (
+        lambda: edit.remove(cast([car(12, 0)], sensor=load_sensor("os1_128")), 0, model="town"),
+        DataError, "a scan of sensor 'os1_128' .* for a model of 'town'.*model=None",
+    ),
+    "overlap": (lambda: edit.insert(SCAN, ITEM, (8, 7)), DataError, r"overlaps box 1 \(Car\); expected a free place"),
+    "wall": (lambda: edit.insert(SCAN, ITEM, (24, 0)), DataError, "no level ground|other returns"),
+    "behind": (lambda: edit.insert(SCAN, ITEM, (30, 0)), DataError, "no level ground"),
+    "out of range": (lambda: edit.insert(SCAN, ITEM, (95, 0)), DataError, "95.0 m away; expected a place 1.45 to 80 m"),
+    "too near": (lambda: edit.insert(SCAN, ITEM, (4, -3)), DataError, "at least 6.0 m"),
+    "other side": (lambda: edit.insert(SCAN, ITEM, (-12, 3, 1.7)), DataError, "beside the side that was recorded"),
+    "pose": (lambda: edit.insert(SCAN, ITEM, (1.0,)), DataError, "expected x, y in metres"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_refused(name: str) -> None:
+    run, kind, message = BAD[name]
+    with pytest.raises(kind, match=message):
+        run()
+
+
+def test_files_keep_their_fields() -> None:
+    """A file in ring order stays in ring order, and its classes as in the file stay."""
+    town = Town(seed=4, scans=1)[0]
+    number = max((i for i, n in enumerate(town.boxes.names) if n == "Car"),
+                 key=lambda i: returns_of(town, town.boxes[[i]]).sum())  # fmt: skip
+    result = edit.remove(town, number)
+    assert sorted(result.fields()) == sorted(town.fields())
+    assert (np.diff(result.ring.astype(int)) >= 0).all() == (np.diff(town.ring.astype(int)) >= 0).all()
+    removed = returns_of(town, town.boxes[[number]])
+    rows = {tuple(row) for row in result.points[:: max(len(result) // 500, 1)].tolist()}
+    assert len(rows & {tuple(row) for row in town.points[~removed].tolist()}) > 400
+    assert result.raw_label is not None and set(np.unique(result.raw_label)) <= set(np.unique(town.raw_label)) | {0}
+
+
+@pytest.mark.slow
+def test_the_flow_draws_the_hole_and_nothing_else() -> None:
+    generator = load_generator("town")
+    [scan] = generator.scans(seed=5, indices=[1])
+    scan = replace(scan, boxes=Boxes(np.zeros((0, 7), np.float32), ()))
+    assert edit.measure([scan]).objects > 0
+    by_geometry, drawn, again = edit.closed(scan), edit.closed(scan, generator), edit.closed(scan, generator)
+    assert np.array_equal(drawn.points, again.points)
+    before, filled, new = ({tuple(p) for p in s.points.tolist()} for s in (scan, by_geometry, drawn))
+    assert before & filled == before & new and len(before & new) > 0.8 * len(before)
+    assert len(new - before) > 0.5 * len(filled - before) and not filled - before <= new
+    for result in (by_geometry, drawn):
+        assert edit.measure([result]).objects == 0
+
+
+def test_the_command_line_edits_scans(tmp_path: Path) -> None:
+    writer = WRITERS["npz"](tmp_path / "in")
+    writer.write(SCAN, 0)
+    writer.finish()
+    ObjectBank.from_scans([cast([car(12, 0, 0.4)])]).save(tmp_path / "objects.npz")
+    calls = {
+        "named": ["remove", "--name", "Car"],
+        "numbered": ["remove", "--box", "1"],
+        "moved": ["move", "--box", "0", "--at", "14,-6"],
+        "inserted": ["insert", "--objects", str(tmp_path / "objects.npz"), "--at", "10,-9"],
+    }
+    counts = {}
+    for name, (command, *options) in calls.items():
+        result = CliRunner().invoke(app, ["edit", command, str(tmp_path / "in"), str(tmp_path / name), *options])
+        assert result.exit_code == 0, result.output + str(result.exception)
+        scan = open_scans(tmp_path / name)[0]
+        counts[name] = len(scan.boxes)
+    assert counts == {"named": 0, "numbered": 1, "moved": 2, "inserted": 3}
+    for options, message in {
+        ("--name", "Dragon"): "expected the class of some box",
+        (): "expected one of the two",
+    }.items():
+        result = CliRunner().invoke(app, ["edit", "remove", str(tmp_path / "in"), str(tmp_path / "out"), *options])
+        assert isinstance(result.exception, ConfigError) and message in str(result.exception)
