@@ -15,6 +15,8 @@ from PIL import Image
 from small_models import GRID, SENSOR, write
 
 import lidar_synth.generate.generator as module
+from lidar_synth.bake.job import make_plan
+from lidar_synth.bake.options import BakeJob
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.flow.solvers import solve, uniform_grid
@@ -310,6 +312,9 @@ def test_a_dense_model_generates_half_of_its_columns(tmp_path: Path) -> None:
     image, coarse = full.range_images(0, [3])[0], half.range_images(0, [3])[0]
     assert coarse.range.shape == (image.range.shape[0], image.range.shape[1] // 2)
     assert half.scans(0, [3])[0].sensor == half.sensor
+    plans = [make_plan(tmp_path, BakeJob(model=str(path), count=2, columns=c)) for c in (None, SENSOR.columns // 2)]
+    assert [plan.facts.sensor.columns for plan in plans] == [SENSOR.columns, SENSOR.columns // 2]
+    assert ["columns" in plan.facts.settings for plan in plans] == [False, True]  # as in banks of earlier versions
     with pytest.raises(ConfigError, match="one of"):
         load_generator(path, columns=10)
     with pytest.raises(ConfigError, match="one of 1024"):

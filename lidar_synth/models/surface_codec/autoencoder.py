@@ -93,7 +93,7 @@ class SurfaceAutoencoder(Network):
         # Not a convolution: oneDNN's with this kernel and stride gives wrong values in bfloat16 (torch 2.13).
         self.stem = nn.Linear((channels + 1) * cells, encoder_widths[0])
         self.encode_outer = Residual(encoder_widths[0])
-        self.merge = nn.Conv2d(*encoder_widths, 2, 2)
+        self.merge = nn.Conv2d(encoder_widths[0], encoder_widths[1], 2, 2)
         self.encode_inner = nn.Sequential(*(Residual(encoder_widths[1]) for _ in range(2)))
         self.to_latent = nn.Conv2d(encoder_widths[1], latent_channels, 1)
         self.from_latent = nn.Conv2d(latent_channels, inner, 1)
@@ -179,7 +179,7 @@ class SurfaceAutoencoder(Network):
         patch = PATCH[0], PATCH[1] // merged
         surfaces = self.expand(self.bounded(z), merged=merged)
         cells = surfaces.sample(to_patches(uniform_noise, patch), self.noise, self.normalisation)
-        distance, value, code, likely = from_patches(cells, patch, (rows, columns)).split(1, 1)
+        distance, value, code, likely = torch.split(from_patches(cells, patch, (rows, columns)), 1, 1)
         bits = torch.cat([(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
         return torch.cat([distance, value, bits * (2 * torch.atanh(likely.clamp(max=0.9999)))], 1)
 

@@ -35,19 +35,20 @@ def cell_norm(x: Tensor) -> Tensor:
 
 def split(x: Tensor, patch: tuple[int, int]) -> Tensor:
     """(B, P C, h, w), P cells of a patch first, to (B, C, h rows, w columns)."""
-    rows, columns = patch
-    x = x.movedim(1, -1).unflatten(-1, (rows, columns, -1)).transpose(2, 3)
-    return x.flatten(3, 4).flatten(1, 2).movedim(-1, 1)
+    batch, _, h, w = x.shape
+    x = x.movedim(1, -1).reshape(batch, h, w, *patch, -1).transpose(2, 3)
+    return x.reshape(batch, h * patch[0], w * patch[1], -1).movedim(-1, 1)
 
 
 def to_patches(x: Tensor, patch: tuple[int, int]) -> Tensor:
     """(B, C, H, W) to (N, C, P), all patches of all images row by row, P = rows * columns."""
-    x = x.unflatten(3, (-1, patch[1])).unflatten(2, (-1, patch[0]))
-    return x.permute(0, 2, 4, 1, 3, 5).flatten(0, 2).flatten(2)
+    batch, channels, height, width = x.shape
+    x = x.reshape(batch, channels, height // patch[0], patch[0], width // patch[1], patch[1])
+    return x.permute(0, 2, 4, 1, 3, 5).reshape(-1, channels, patch[0] * patch[1])
 
 
 def from_patches(x: Tensor, patch: tuple[int, int], resolution: tuple[int, int]) -> Tensor:
     """The inverse of ``to_patches``."""
     rows, columns = resolution[0] // patch[0], resolution[1] // patch[1]
-    x = x.unflatten(2, patch).unflatten(0, (-1, rows, columns))
-    return x.permute(0, 3, 1, 4, 2, 5).flatten(4).flatten(2, 3)
+    x = x.reshape(-1, rows, columns, x.shape[1], *patch)
+    return x.permute(0, 3, 1, 4, 2, 5).reshape(len(x), -1, *resolution)

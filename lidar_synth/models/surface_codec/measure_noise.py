@@ -94,4 +94,5 @@ def _return_scores(surfaces: Surfaces, distance: Tensor, generator: torch.Genera
 
 
 def _normal(share: Tensor) -> Tensor:
-    return torch.special.ndtri(share.clamp(_SURE, 1 - _SURE))
+    score: Tensor = torch.special.ndtri(share.clamp(_SURE, 1 - _SURE))
+    return score

@@ -121,7 +121,8 @@ class Surfaces(NamedTuple):
 def _mixed(own: Tensor, correlation: Tensor, shared: Tensor) -> Tensor:
     """Uniform numbers of cells, correlated by what they share (a Gaussian copula)."""
     normal = correlation.sqrt() * torch.special.ndtri(shared) + (1 - correlation).sqrt() * torch.special.ndtri(own)
-    return torch.special.ndtr(normal).clamp(_SURE, 1 - _SURE)
+    mixed: Tensor = torch.special.ndtr(normal)
+    return mixed.clamp(_SURE, 1 - _SURE)
 
 
 def _pick(x: Tensor, chosen: Tensor) -> Tensor:
@@ -150,10 +151,10 @@ def surfaces_of(x: Tensor, surfaces: int, classes: int, patch: tuple[int, int], 
             middle of those that it takes the place of.
     """
     rows, columns = patch
-    whole, each = x.float().split([surfaces * (NUMBERS + classes), rows * columns * (surfaces + PER_CELL)], 1)
-    numbers, kinds = whole.unflatten(1, (surfaces, -1)).split([NUMBERS, classes], 2)
+    whole, each = torch.split(x.float(), [surfaces * (NUMBERS + classes), rows * columns * (surfaces + PER_CELL)], 1)
+    numbers, kinds = torch.split(whole.unflatten(1, (surfaces, -1)), [NUMBERS, classes], 2)
     each = each.unflatten(1, (surfaces + PER_CELL, -1, merged)).mean(3)
-    choice, offsets = each.split([surfaces, PER_CELL], 1)
+    choice, offsets = torch.split(each, [surfaces, PER_CELL], 1)
     distance, down, across, spread, returned, median, dim, blank = numbers[..., None].unbind(2)
     cell = torch.arange(each.shape[2], device=x.device)
     columns = columns // merged
