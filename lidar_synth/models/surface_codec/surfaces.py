@@ -152,8 +152,8 @@ def surfaces_of(x: Tensor, surfaces: int, classes: int, patch: tuple[int, int], 
     """
     rows, columns = patch
     whole, each = torch.split(x.float(), [surfaces * (NUMBERS + classes), rows * columns * (surfaces + PER_CELL)], 1)
-    numbers, kinds = torch.split(whole.unflatten(1, (surfaces, -1)), [NUMBERS, classes], 2)
-    each = each.unflatten(1, (surfaces + PER_CELL, -1, merged)).mean(3)
+    numbers, kinds = torch.split(whole.reshape(len(x), surfaces, -1), [NUMBERS, classes], 2)
+    each = each.reshape(len(x), surfaces + PER_CELL, -1, merged).mean(3)
     choice, offsets = torch.split(each, [surfaces, PER_CELL], 1)
     distance, down, across, spread, returned, median, dim, blank = numbers[..., None].unbind(2)
     cell = torch.arange(each.shape[2], device=x.device)
