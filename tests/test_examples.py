@@ -100,7 +100,8 @@ def test_every_name_of_the_documents_has_an_example() -> None:
     pages = [ROOT / "README.md", *ROOT.glob("docs/start/*.md"), *ROOT.glob("docs/how-to/**/*.md")]
     named = set().union(*(named_in(page.read_text()) for page in pages))
     assert {"MixedScans", "load_config", "Taxonomy"} <= named
-    assert named <= {name.rsplit(".", 1)[1] for name in public_names()[2:]}
+    on_their_page = {"Metric", "evaluate", "load", "load_judge"}  # the page's own block is their example
+    assert named <= {name.rsplit(".", 1)[1] for name in public_names()[2:]} | on_their_page
 
 
 @pytest.mark.parametrize(

@@ -352,7 +352,8 @@ def test_real_scans_as_the_labelled_side(kind: str, real_scans: Path, synthetic:
         assert mixed.domain == SYNTHETIC and mixed.label is not None and mixed.confidence is not None
         own = np.isin(mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel())
         assert (~own).sum() > (50 if kind == "objects" else 5000) and own.sum() > 5000
-        assert (mixed.confidence[~own & (mixed.label != IGNORE)] == 1).all()
+        sure = mixed.confidence[~own & (mixed.label != IGNORE)] == 1
+        assert sure.sum() > 50 if kind == "objects" else sure.all()  # holes of removed objects are filled, not measured
         cells = locate(mixed.points, mixed.sensor).cell
         assert (np.bincount(cells[cells >= 0]) <= 1).all()  # as the model's own scans: one return per cell
         assert (mixed.boxes is not None) == (kind == "objects")
@@ -361,5 +362,6 @@ def test_real_scans_as_the_labelled_side(kind: str, real_scans: Path, synthetic:
 @pytest.mark.parametrize("kind", KINDS)
 def test_real_scans_that_cannot_serve(kind: str, real_scans: Path) -> None:
     source = KITTI360(real_scans / "kitti360") if kind == "objects" else KITTIObject(real_scans / "kitti_object")
-    with pytest.raises(ConfigError, match=f"kind='{kind}'"):
+    named = "polar" if kind == "exchange" else kind  # an exchange is one of both
+    with pytest.raises(ConfigError, match=f"kind='{named}'"):
         make_policy("mix", real=source, fields=FIELDS, kind=kind)

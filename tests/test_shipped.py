@@ -83,7 +83,7 @@ def test_every_source_gives_the_same_scan(kind: str, sources: dict[str, Any], ge
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("policy", [p for p in POLICIES if p != "boxes"])  # the shipped models generate no boxes
 @pytest.mark.parametrize("kind", ["generator", "bank", "rolling", "list"])
 def test_every_source_and_label_policy_mixes_with_real_scans(
     kind: str, policy: str, sources: dict[str, Any], real: Source

@@ -28,8 +28,8 @@ from lidar_synth.town.shading import camera_hits
 from lidar_synth.town.solid import Solid
 from lidar_synth.town.vehicles import vehicles
 
-INDICES = (4, 5, 26, 164)
-"""Scans of three stretches; the first two are neighbours."""
+INDICES = (4, 5, 26, 144, 164)
+"""Scans of four stretches; the first two are neighbours."""
 
 
 @pytest.fixture(scope="module")
