@@ -108,16 +108,14 @@ class Bank:
             self.sensor, self.fields = self._sources[0]["sensor"], tuple(self._sources[0]["fields"])
             self.shape = _shape(self.sensor)
             self._directions = _directions(self.sensor, self.shape)
-            lasers = "elevations" in self.sensor and "beams" not in self.sensor  # the rays of a row start at its laser
-            heights = self.sensor.get("heights") if lasers else None
-            self._starts = np.asarray(heights or [0.0] * self.shape[0], np.float32)
+            lasers = {"elevations", "heights"} <= set(self.sensor) and "beams" not in self.sensor  # rays start there
+            self._starts = np.asarray(self.sensor["heights"] if lasers else [0.0] * self.shape[0], np.float32)
             self._names = [name for name in TYPES if name in {"range", *self.fields}]
             self._scale = self.sensor["range_max"] / 65535
             for facts in self._sources:
                 self._check_facts(facts)
             self._ends = np.cumsum([self._check_entry(entry) for entry in self._shards]).tolist()
-            found = self._ends[-1]
-            _require(values["scans"] == found, f"{values['scans']} scans, but the shards have {found}")
+            _require(values["scans"] == self._ends[-1], f"{values['scans']} scans, in shards {self._ends[-1]}")
         self._open: OrderedDict[int, _Shard] = OrderedDict()
         self._process = os.getpid()
 
@@ -129,11 +127,10 @@ class Bank:
         images, (_, entry, position) = self.image(number), self._place(number)
         seen = images["range"] > 0
         points = images["range"][seen][:, None] * self._directions[seen]
-        points[:, 2] += self._starts[np.nonzero(seen)[0]]
-        fields = {field: images[field][seen] for field in self._names[1:]}
-        reflectance = fields.get("reflectance", np.zeros(len(points), np.float32))
+        points[:, 2] += self._starts[seen.nonzero()[0]]
+        fields = {"reflectance": np.zeros(len(points), np.float32), **{n: images[n][seen] for n in self._names[1:]}}
         name = f"{self._sources[entry['source']]['model']}/{entry['seed']}/{entry['first'] + position}"
-        return Scan(points, reflectance, fields.get("label"), fields.get("confidence"), name)
+        return Scan(points, fields["reflectance"], fields.get("label"), fields.get("confidence"), name)
 
     def image(self, number: int) -> dict[str, NDArray[Any]]:
         """The range image, {name: (rows, columns)}: ``range`` float32 metres, 0 = no return, and the fields."""
