@@ -13,9 +13,10 @@ from lidar_synth.generate.codec import Latent
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models.surface_codec.autoencoder import PATCH, SurfaceAutoencoder
-from lidar_synth.models.surface_codec.blocks import from_patches, split, to_patches
-from lidar_synth.models.surface_codec.measure_noise import measure_noise
+from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
+from lidar_synth.models.surface_codec.blocks import PATCH, from_patches, split, to_patches
+from lidar_synth.models.surface_codec.measure_noise import PLANTS, measure_noise
+from lidar_synth.models.surface_codec.relief import SPANS, correlation, relief_fields
 from lidar_synth.models.surface_codec.surfaces import (
     DRAWS,
     NUMBERS,
@@ -94,8 +95,9 @@ def test_samples_have_the_predicted_frequencies() -> None:
         *(_repeat(part, 4000) for part in surfaces.reflectance)), *(_repeat(part, 4000) for part in surfaces[4:]),
     )  # fmt: skip
     noise = uniform(0, [0], (4000, DRAWS, CELLS))[0]
-    alike = Noise(torch.zeros(CODES), torch.full((CODES,), 0.5), torch.tensor(0.5))
-    distance, value, code, likely = many.sample(noise, alike, SCALE).unbind(1)
+    alike = Noise(torch.zeros(CODES), torch.zeros(CODES, len(SPANS)), torch.full((CODES,), 0.5), torch.tensor(0.5))
+    relief = torch.zeros(4000, len(SPANS), CELLS)
+    distance, value, code, likely = many.sample(noise, relief, alike, SCALE).unbind(1)
     shares = surfaces.weights.exp()
     returned = (shares * surfaces.returned.sigmoid()).sum(1)
     assert torch.allclose((distance > -1).float().mean(0), returned[0], atol=0.03)
@@ -200,12 +202,55 @@ def test_the_noise_of_scans_is_measured() -> None:
     assert network.returned_alike.item() == pytest.approx(0.4, abs=0.15)
 
 
+@pytest.mark.parametrize("merged", [1, 2])
+def test_the_fields_of_relief_are_standard_normal_and_correlated_along_rows(merged: int) -> None:
+    fields = relief_fields(uniform(0, [0], (64, 4096 // merged)), merged)[0]
+    assert fields.mean((1, 2)).abs().max() < 0.06
+    for field, span in zip(fields, SPANS, strict=True):
+        assert field.square().mean(0).view(-1, span // merged).mean(0) == pytest.approx(1, abs=0.12)  # at every column
+        for lag in range(0, 2 * span + 1, 2):
+            found = (field * field.roll(-lag // merged, 1)).mean()
+            assert found == pytest.approx(correlation(span // merged, lag // merged), abs=0.06)
+        assert torch.equal(field[::2], field[1::2]) and (field[::2] * field[::2].roll(1, 0)).mean().abs() < 0.06
+    assert (fields[0] * fields[1]).mean().abs() < 0.04
+
+
+def test_the_relief_of_plants_is_measured() -> None:
+    """Images with a relief that is known; other classes have none."""
+    network = small().eval()
+    relief = torch.zeros(CODES, 2)
+    relief[PLANTS[0]], relief[PLANTS[1]] = torch.tensor([1.0, 0.5]), torch.tensor([0.3, 1.0])
+    with torch.no_grad():
+        numbers = network.head.bias[: K * (NUMBERS + CODES)].view(K, -1)
+        numbers[:, 0] = torch.tensor([1.0, 2.3, 3.6])
+        numbers[:, 3], numbers[:, 4] = -4.5, 6
+        for k, plant in enumerate((*PLANTS, 13)):  # 13 is a building
+            numbers[k, NUMBERS + plant] = 12
+        network.roughness.fill_(0.2)
+        network.relief.copy_(relief)
+    z = torch.randn(4, *network.latent_shape, generator=torch.Generator().manual_seed(1))
+    images = [network.decode(z[i : i + 1], uniform(0, [i], (network.draws, *COARSE.shape))) for i in range(4)]
+    latents = iter(network.bounded(z).split(1))
+    network.squeeze = lambda x: next(latents)  # type: ignore[method-assign]
+    measure_noise(network, ((x, _codes(x)) for x in images), noise=0.0)
+    assert torch.allclose(network.relief[list(PLANTS)], relief[list(PLANTS)], atol=0.25)
+    assert not network.relief[[c for c in range(CODES) if c not in PLANTS]].any()
+
+
 def _codes(x: Tensor) -> Tensor:
     return sum(((x[:, -1 - b] > 0).long() << b for b in range(5)), torch.zeros_like(x[:, 0]).long())
 
 
 @pytest.mark.parametrize(
-    "changes", [{"resolution": (16, 250)}, {"bits": 4}, {"normalisation": "other"}, {"channels": 6}, {"reaches": [17]}]
+    "changes",
+    [
+        {"resolution": (16, 250)},
+        {"bits": 4},
+        {"normalisation": "other"},
+        {"channels": 6},
+        {"reaches": [17]},
+        {"surfaces": 4},
+    ],
 )
 def test_arguments_that_do_not_fit_are_refused(changes: dict[str, object]) -> None:
     with pytest.raises(ConfigError):

@@ -204,3 +204,23 @@ class TimeEmbedding(nn.Module):
         """Times (B,) to (B, E)."""
         out: Tensor = self.mapping(self.linear(self.features(t).to(self.linear.weight.dtype)))
         return out
+
+
+class StepEmbedding(nn.Module):
+    """The length of a step, to be added to the embedding of its time; zero at first, as if no length was given.
+
+    Args:
+        dim: E, channels of the embedding, even.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.features = TimeFeatures(dim)
+        self.hidden, self.out = nn.Linear(dim, dim), nn.Linear(dim, dim, bias=False)
+        nn.init.zeros_(self.out.weight)
+
+    def forward(self, length: Tensor) -> Tensor:
+        """Lengths (B,) in (0, 1] to (B, E)."""
+        hidden = F.silu(self.hidden(self.features(length).to(self.hidden.weight.dtype)))
+        out: Tensor = self.out(hidden)
+        return out

@@ -35,6 +35,7 @@ from lidar_synth.models.positions import (
     LearnedPosition,
     RayAngles,
     Rotary,
+    StepEmbedding,
     TimeEmbedding,
 )
 
@@ -59,6 +60,7 @@ class HDiT(Network):
         ratio: hidden channels per channel of the feed-forward layers.
         mapping_depth: layers of the mapping networks of time and position.
         position: one of ``POSITIONS``, the encoding that is added to the tokens.
+        ends: whether it can be told the end of a step, and then predicts the mean velocity over it.
         angles: (2, H, W) elevation and azimuth of every cell, radians (``Sensor.ray_angles``); None if a
             checkpoint will be loaded.
 
@@ -83,12 +85,15 @@ class HDiT(Network):
         ratio: float = 3.0,
         mapping_depth: int = 2,
         position: str = LEARNED,
+        ends: bool = False,
         angles: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.resolution, self.patch, self.window = _pair(resolution), _pair(patch), _pair(window)
         self.channels, self.condition_channels, self.context_channels = channels, condition_channels, context_channels
         self.grids = _grids(self.resolution, self.patch, len(depths))
+        self.ends = ends
+        """Whether it takes the end of a step."""
         self.gradient_checkpointing = False
         """Recompute the activations of the blocks in the backward pass instead of storing them."""
         _check(self.grids, width, heads, position)
@@ -104,6 +109,8 @@ class HDiT(Network):
             else AnglePosition(position, self.grids[0], width, ratio, mapping_depth)
         )
         self.time = TimeEmbedding(time_width, ratio, mapping_depth)
+        if ends:
+            self.step = StepEmbedding(time_width)
         self.rotary = nn.ModuleList(Rotary(g, h, w // h) for g, h, w in zip(self.grids, heads, widths, strict=True))
         self.near = nn.ModuleList(NeighbourhoodAttention(grid, self.window) for grid in self.grids[:-1])
         self.tokenize = nn.Linear(cells * channels, width, bias=False)
@@ -124,27 +131,30 @@ class HDiT(Network):
         self.detokenize = nn.Linear(width, cells * channels, bias=False)
         nn.init.zeros_(self.detokenize.weight)
 
-    def forward(self, y: Tensor, t: Tensor | float, cond: Tensor | None = None) -> Tensor:
-        """The velocity dy/dt at y and t.
+    def forward(
+        self, y: Tensor, t: Tensor | float, cond: Tensor | None = None, end: Tensor | float | None = None
+    ) -> Tensor:
+        """The velocity dy/dt at y and t, or its mean from t to ``end``.
 
         Args:
             y: (B, C, H, W) state.
             t: (B,) times, or one for all states, in [0, 1]; 1 = noise.
             cond: (B, condition_channels, H, W) maps or (B, M, context_channels) tokens, as the network takes.
+            end: (B,) times below t, or one for all; None = the velocity at t itself.
 
         Returns:
             (B, C, H, W).
 
         Raises:
-            DataError: on a state, times or a condition of another shape.
+            DataError: on a state, times or a condition of another shape, or on ends for a network without them.
         """
         self._check(y, cond)
-        t = torch.as_tensor(t, dtype=torch.float32, device=y.device)
-        if t.shape not in ((), (1,), (len(y),)):
-            raise DataError(
-                f"times of shape {tuple(t.shape)} for {len(y)} states", "one time per state, or one for all"
-            )
-        time = self.time(t.expand(len(y)))
+        t = _times(t, y)
+        time = self.time(t)
+        if end is not None:
+            if not self.ends:
+                raise DataError("the end of a step, for a network that was built without ends", "a network with ends")
+            time = time + self.step(t - _times(end, y))
         angles = self.angles(self.patch, len(self.grids))
         levels = [self._level(i, angle, self.tokenize.weight.dtype) for i, angle in enumerate(angles)]
         place = self.position(angles[0]).flatten(0, 1)
@@ -187,6 +197,14 @@ class HDiT(Network):
         if y.shape[1:] != shape:
             raise DataError(f"a state of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, shape))})")
         check_condition(cond, len(y), (self.condition_channels, *self.resolution), self.context_channels)
+
+
+def _times(t: Tensor | float, y: Tensor) -> Tensor:
+    """(B,) float32 times of the states y (B, ...)."""
+    t = torch.as_tensor(t, dtype=torch.float32, device=y.device)
+    if t.shape not in ((), (1,), (len(y),)):
+        raise DataError(f"times of shape {tuple(t.shape)} for {len(y)} states", "one time per state, or one for all")
+    return t.expand(len(y))
 
 
 def _pair(values: Sequence[int]) -> Grid:

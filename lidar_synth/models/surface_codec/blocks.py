@@ -6,6 +6,9 @@ from torch import Tensor, nn
 from lidar_synth.models.convolution import WrapConv
 from lidar_synth.models.layers import EPS
 
+PATCH = (2, 8)
+"""Rows and columns of a patch."""
+
 
 class Block(nn.Module):
     """x + linear(silu(conv(norm(x)))), where the norm is over the channels of one cell.

@@ -3,7 +3,8 @@
 The decoder predicts the distribution of every cell by itself. Neighbouring cells of a wall have the same error of the
 range and similar reflectances, leaves do not. Both follow from pairs of neighbouring cells of real images that show one
 surface: of Laplace distributed errors e, mean |e1 - e2| = 1.5 b, where b is the scale of what differs; the correlation
-of reflectances is that of their normal scores.
+of reflectances is that of their normal scores. The relief of plants follows from the correlation of errors at two
+distances along a row: at the longer one, only the wider field is correlated.
 """
 
 import math
@@ -12,12 +13,18 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from lidar_synth.models.surface_codec.autoencoder import PATCH, SurfaceAutoencoder
-from lidar_synth.models.surface_codec.blocks import to_patches
+from lidar_synth.datasets.classes import TRAIN_ID
+from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
+from lidar_synth.models.surface_codec.blocks import PATCH, from_patches, to_patches
+from lidar_synth.models.surface_codec.relief import SPANS, correlation
 from lidar_synth.models.surface_codec.surfaces import Surfaces, normalised
 
 LEAST = 200
 """Pairs of cells that a class needs; others keep the mean of all classes."""
+PLANTS = TRAIN_ID["vegetation"], TRAIN_ID["terrain"]
+"""Classes with relief: what does not fit a plane is part of them. Walls have doubt in its place."""
+LAGS = SPANS[0] // 2, SPANS[1] // 2
+"""Columns between the pairs of cells by which relief is measured."""
 _LARGEST = 4.0  # error of a range in scales: beyond it, the cell shows another surface
 _SURE = 1e-4
 
@@ -33,11 +40,12 @@ def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Te
     """
     codes = len(network.roughness)
     sums = torch.zeros(codes, 4, dtype=torch.float64)  # pairs, |e1 - e2|, products and squares of scores
+    relief = torch.zeros(codes, 1 + len(LAGS), 2, dtype=torch.float64)
     returns = torch.zeros(2, dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     for x, code in images:
         z = network.squeeze(x)
-        surfaces = network.expand(z + noise * torch.randn(z.shape, generator=generator))
+        surfaces = network.describe(z + noise * torch.randn(z.shape, generator=generator))
         distance, value = to_patches(x[:, :2], PATCH).unbind(1)
         kinds = to_patches(code[:, None], PATCH)[:, 0]
         error, score, surface = _scores(surfaces, distance, value, kinds, network, generator)
@@ -50,9 +58,12 @@ def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Te
         for column, term in enumerate(terms):
             sums[:, column] += torch.bincount(left[3][same], term[same].double(), codes)
         returns += _return_scores(surfaces, distance, generator)
+        whole = from_patches(torch.stack([error, kinds.float(), distance], 1), PATCH, network.resolution)
+        relief += _products(*whole.unbind(1), codes)
     total, known = sums.sum(0), sums[:, 0] >= LEAST
     network.roughness.copy_(torch.where(known, sums[:, 1] / sums[:, 0], total[1] / total[0]) / 1.5)
     network.alike.copy_(torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95))
+    network.relief.copy_(_relief(relief))
     # Scores that are random but for their sign have 2 / pi of the correlation of signs, which is 2 / pi asin(rho).
     signs = (returns[0] / returns[1] * math.pi / 2).clamp(0, 0.8)
     network.returned_alike.copy_((signs * math.pi / 2).sin())
@@ -91,6 +102,29 @@ def _return_scores(surfaces: Surfaces, distance: Tensor, generator: torch.Genera
     left = ((likely > 0.1) & (likely < 0.9)).view(-1, *PATCH)[..., :-1]
     pair = score[..., :-1][left], score[..., 1:][left]
     return torch.stack([(pair[0] * pair[1]).sum(), (pair[0] ** 2).sum()]).double()
+
+
+def _products(error: Tensor, kinds: Tensor, distance: Tensor, codes: int) -> Tensor:
+    """(C, 1 + lags, 2) sums of products of the errors (B, H, W) of two cells of a row that show one class, and their
+    number; the first lag is 0."""
+    sums = []
+    inside = (error.abs() < _LARGEST) & (distance > -1)
+    for lag in (0, *LAGS):
+        same = inside & inside.roll(-lag, -1) & (kinds == kinds.roll(-lag, -1))
+        products, of = (error * error.roll(-lag, -1))[same].double(), kinds[same].long()
+        sums.append(torch.stack([torch.bincount(of, products, codes), torch.bincount(of, minlength=codes)], 1))
+    return torch.stack(sums, 1)
+
+
+def _relief(sums: Tensor) -> Tensor:
+    """(C, 2) factors of the fields, from the sums of ``_products``."""
+    square, near, far = (sums[..., 0] / sums[..., 1].clamp_min(1)).unbind(1)
+    wide = torch.minimum((far / correlation(SPANS[1], LAGS[1])).clamp_min(0), square)
+    narrow = (near - wide * correlation(SPANS[1], LAGS[0])) / correlation(SPANS[0], LAGS[0])
+    factors = torch.stack([torch.minimum(narrow.clamp_min(0), square - wide), wide], 1).sqrt()
+    plants = torch.zeros(len(factors), 1, dtype=torch.float64)
+    plants[list(PLANTS)] = 1
+    return factors * plants * (sums[:, :1, 1] >= LEAST)
 
 
 def _normal(share: Tensor) -> Tensor:

@@ -47,11 +47,13 @@ class Noise(NamedTuple):
 
     Args:
         roughness: (C,) share of a range's scale that differs from cell to cell; the rest is doubt about the surface.
+        relief: (C, F) factors of the fields of relief, in a range's scale; 0 for what is flat.
         reflectance: (C,) correlation of the reflectances of cells that show one surface of a patch.
         returned: () correlation of the returns of a patch.
     """
 
     roughness: Tensor
+    relief: Tensor
     reflectance: Tensor
     returned: Tensor
 
@@ -95,11 +97,12 @@ class Surfaces(NamedTuple):
         seen = F.logsigmoid(self.returned) + temper[0] * distance + temper[1] * shown + self.classes.gather(2, index)
         return torch.logsumexp(self.weights + torch.where(x > -1, seen, F.logsigmoid(-self.returned)), 1)
 
-    def sample(self, uniform_noise: Tensor, noise: Noise, normalisation: Normalisation) -> Tensor:
+    def sample(self, uniform_noise: Tensor, relief: Tensor, noise: Noise, normalisation: Normalisation) -> Tensor:
         """(N, 4, P) range, -1 without a return, reflectance, class and its probability, of sampled cells.
 
         Args:
             uniform_noise: (N, DRAWS, P) numbers in (0, 1), P > K.
+            relief: (N, F, P) fields of relief.
             noise: of the cells.
             normalisation: of the ranges.
         """
@@ -112,6 +115,9 @@ class Surfaces(NamedTuple):
         values = ZeroInflatedLogistic(*(_pick(part, chosen) for part in self.reflectance)).sample(_mixed(dim, *alike))
         distance = normalised(_pick(self.inverse, chosen), normalisation)
         distance = distance + _pick(noise.roughness[code] * self.scale, chosen) * laplace_noise(near)
+        bumps = noise.relief[code[..., 0]] * self.scale  # (N, K, F)
+        for field, factor in zip(relief.unbind(1), bumps.unbind(2), strict=True):
+            distance = distance + _pick(factor[..., None], chosen) * field
         back = _mixed(back, noise.returned, shared[:, count : count + 1])
         returned = _pick(self.returned, chosen) + torch.logit(back) > 0
         distance = torch.where(returned, distance, -1.0)

@@ -1,9 +1,7 @@
 """Autoencoder of range images that two CPU cores can train.
 
 An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 8) in (-1, 1), the size of LiDM's (Ran et al., "Towards
-Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024). In place of a codebook, the latent is bounded and
-the decoder is trained on noisy latents, so that it tolerates the errors of a flow. Every norm is over the channels of
-one cell, so that crops (in training) and full turns (in use) give the same result.
+Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024).
 
 No latent can hold what is random about a sensor: whether a ray returns, the speckle of a reflectance. The decoder
 therefore predicts distributions, and an image is sampled from them: the mean would be smoother than any real scan, and
@@ -20,10 +18,8 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.normalize import NORMALISATIONS
-from lidar_synth.models.codebook import follow
+from lidar_synth.models.bounded_latent import BoundedAutoencoder, Residual, row_bias
 from lidar_synth.models.convolution import WrapConv, check_shape, pair, reduced
-from lidar_synth.models.layers import EPS
-from lidar_synth.models.network import Network
 from lidar_synth.models.town_codec.distributions import CellDistributions
 from lidar_synth.models.town_codec.multiscale import LATTICES, LatticeRefinement, at_lattice, step_ratio
 from lidar_synth.models.town_codec.plane_fit import PlaneFit
@@ -46,27 +42,7 @@ Observe = Callable[[CellDistributions, Grid], Tensor]
 """(predicted distributions, lattice) to the values of its cells: sampled, or those of a given image."""
 
 
-class Residual(nn.Module):
-    """x + conv(silu(conv(norm(x)))).
-
-    Args:
-        channels: C.
-        reach: dilation of the second convolution, in columns.
-    """
-
-    def __init__(self, channels: int, reach: int = 1) -> None:
-        super().__init__()
-        self.first, self.second = WrapConv(channels, channels), WrapConv(channels, channels, dilation=(1, reach))
-        nn.init.zeros_(self.second.weight)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to the same shape."""
-        normed = F.rms_norm(x.movedim(1, -1), x.shape[1:2], eps=EPS).movedim(-1, 1)
-        out: Tensor = x + self.second(F.silu(self.first(normed)))
-        return out
-
-
-class Autoencoder(Network):
+class Autoencoder(BoundedAutoencoder):
     """Images to latents and back; a codec like ``VQVAE``.
 
     Args:
@@ -89,10 +65,6 @@ class Autoencoder(Network):
 
     derived_arguments: ClassVar[tuple[str, ...]] = ("resolution", "channels", "normalisation")
     needs_ray_angles: ClassVar[bool] = True
-    is_autoencoder: ClassVar[bool] = True
-
-    shift: Tensor
-    scale: Tensor
 
     def __init__(
         self,
@@ -128,16 +100,11 @@ class Autoencoder(Network):
         """Random numbers per cell that sampling an image takes."""
         self.latent_shape = (latent_channels, *reduced(self.resolution, [DOWN], "an image"))
         """Channels, rows and columns of a latent."""
-        # Learned biases by row: on a road, a beam's elevation gives its range.
-        self.place_stem = _rows(outer, rows // DETAIL[0])
-        self.place_latent = _rows(inner, rows // DOWN[0])
-        self.place_outer = _rows(outer, rows // DETAIL[0])
-        self.place_fine = _rows(fine, rows)
-        self.stem = nn.Conv2d(self.channels + 1, outer, DETAIL, DETAIL)
-        self.encode_outer = Residual(outer)
-        self.merge = nn.Conv2d(outer, inner, 2, 2)
-        self.encode_inner = _blocks(inner, depth - 1)
-        self.to_latent = nn.Conv2d(inner, latent_channels, 1)
+        stem = nn.Conv2d(self.channels + 1, outer, DETAIL, DETAIL)
+        self.add_encoder(stem, widths, rows // DETAIL[0], depth - 1, latent_channels)
+        self.place_latent = row_bias(inner, rows // DOWN[0])
+        self.place_outer = row_bias(outer, rows // DETAIL[0])
+        self.place_fine = row_bias(fine, rows)
         self.from_latent = nn.Conv2d(latent_channels, inner, 1)
         self.decode_inner = _blocks(inner, depth, wide)
         self.split = nn.Conv2d(inner, 4 * outer, 1)
@@ -153,31 +120,6 @@ class Autoencoder(Network):
         self.neighbours = nn.ModuleList(
             LatticeRefinement(fine, 1 + 2 * self.values, 2 * fine, step_ratio(a, b)) for a, b in pairwise(LATTICES)
         )
-        # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise needs.
-        self.register_buffer("shift", torch.zeros(latent_channels))
-        self.register_buffer("scale", torch.ones(latent_channels))
-
-    def forward(self, x: Tensor, noise: Tensor) -> CellDistributions:
-        """Encodes images (B, C, H, W) and decodes them with ``noise`` (B, *latent_shape) added to the bounded latents;
-        in training mode, updates the running statistics of the latents."""
-        z = self.squeeze(x)
-        if self.training:
-            follow(z.detach(), self.shift, self.scale)
-        return self.expand(z + noise, x)
-
-    def encoder(self) -> list[nn.Parameter]:
-        """The weights of the encoder; all others belong to the decoder."""
-        parts = self.stem, self.encode_outer, self.merge, self.encode_inner, self.to_latent
-        return [self.place_stem, *(weight for part in parts for weight in part.parameters())]
-
-    def bounded(self, z: Tensor) -> Tensor:
-        """Normalised latents (B, *latent_shape) back to the bounded ones of ``squeeze``."""
-        return z * _channel(self.scale) + _channel(self.shift)
-
-    def encode(self, x: Tensor) -> Tensor:
-        """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of mean 0 and variance 1
-        per channel."""
-        return (self.squeeze(x) - _channel(self.shift)) / _channel(self.scale)
 
     def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         """Latents to images.
@@ -204,14 +146,10 @@ class Autoencoder(Network):
             parts += [self._corners(code) * (2 * torch.atanh(likely.clamp(max=0.9999)))[:, None]]
         return torch.cat(parts, 1)
 
-    def squeeze(self, x: Tensor) -> Tensor:
-        """Images (B, C, H, W) to bounded latents in (-1, 1), float32."""
-        check_shape(x, (self.channels, *self.resolution), "an image")
-        x = x.to(self.stem.weight.dtype)
-        returned = (x[:, :1] > -1).to(x.dtype)
-        h = self.stem(torch.cat([x, returned], 1).contiguous(memory_format=torch.channels_last))
-        h = self.encode_outer(h + self.place_stem)
-        return torch.tanh(self.to_latent(self.encode_inner(self.merge(h))).float())
+    def embed(self, x: Tensor) -> Tensor:
+        """Images with a channel of their returns, (B, C + 1, H, W), to patches of 2 x 4 cells."""
+        patches: Tensor = self.stem(x.contiguous(memory_format=torch.channels_last))
+        return patches
 
     def expand(self, z: Tensor, image: Tensor) -> CellDistributions:
         """Bounded latents to the distributions of every cell, given its neighbours on coarser ``LATTICES`` of an image
@@ -249,16 +187,6 @@ class Autoencoder(Network):
 
 def _blocks(channels: int, depth: int, wide: Sequence[int] = ()) -> nn.Sequential:
     return nn.Sequential(*(Residual(channels, reach) for reach in (*[1] * depth, *wide)))
-
-
-def _rows(channels: int, rows: int) -> nn.Parameter:
-    """(1, C, rows, 1), the same in all columns."""
-    return nn.Parameter(torch.zeros(1, channels, rows, 1))
-
-
-def _channel(x: Tensor) -> Tensor:
-    """(Z,) as (1, Z, 1, 1)."""
-    return x.view(1, -1, 1, 1)
 
 
 def _unpatch(x: Tensor, channels: int) -> Tensor:
