@@ -97,10 +97,17 @@ def test_an_unknown_sampling_option_is_refused(generator: Generator) -> None:
 
 def test_steps_and_solver_replace_the_checkpoints_own_grid(generator: Generator) -> None:
     noise = gaussian(0, [0], (generator.tensors.size, *SENSOR.shape))
-    for steps, solver in ((2, "euler"), (3, "heun")):
-        [tensor] = generator.samples(0, [0], steps=steps, solver=solver)
+    known = (1.0, 0.3, 0.0)
+    trained = replace(generator, header=replace(generator.header, other_grids=(known,)))
+    own = len(GRID) - 1
+    assert own == 3
+    for made_by, steps, solver, grid in (
+        (generator, 2, "euler", uniform_grid(2)), (generator, 5, "heun", uniform_grid(5)),
+        (generator, own, "euler", GRID), (trained, 2, "euler", known), (trained, 5, "euler", uniform_grid(5)),
+    ):  # fmt: skip
+        [tensor] = made_by.samples(0, [0], steps=steps, solver=solver)
         with torch.inference_mode():
-            assert torch.allclose(tensor, solve(generator.network, noise, uniform_grid(steps), solver), atol=1e-5)
+            assert torch.allclose(tensor, solve(generator.network, noise, grid, solver), atol=1e-5)
     with pytest.raises(ConfigError, match="0 steps"):
         generator.scans(0, [0], steps=0)
     with pytest.raises(ConfigError, match="solver 'rk4'"):

@@ -56,6 +56,18 @@ def by_definition(q: Tensor, k: Tensor, v: Tensor, grid: tuple[int, int], window
     return out
 
 
+def test_a_network_is_told_where_its_step_ends() -> None:
+    fresh = HDiT(**SMALL, ends=True, angles=angles(*SMALL["resolution"])).eval()
+    trained, y = network(ends=True), torch.randn(2, 2, 8, 64)
+    with torch.no_grad():
+        assert torch.equal(fresh.step(torch.rand(2)), torch.zeros(2, 16))  # at first the end makes no difference
+        ends = [trained(y, 0.8, None, end) for end in (0.0, 0.5, torch.tensor([0.0, 0.5]))]
+        assert distance(ends[0], ends[1]) > 0.01
+        assert torch.allclose(ends[2][0], ends[0][0], atol=1e-4) and torch.allclose(ends[2][1], ends[1][1], atol=1e-4)
+        with pytest.raises(DataError, match="built without ends"):
+            network()(y, 0.8, None, 0.0)
+
+
 @settings(max_examples=40)
 @given(
     grid=st.tuples(st.integers(3, 9), st.integers(4, 24)),

@@ -12,7 +12,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.flow.solvers import SOLVERS, solve, trajectory, uniform_grid
+from lidar_synth.flow.path import per_sample
+from lidar_synth.flow.solvers import SOLVERS, solve, towards, trajectory, uniform_grid
 from lidar_synth.noise import gaussian
 
 NOISE = gaussian(0, range(4), (2, 5), dtype=torch.float64)
@@ -37,6 +38,22 @@ def test_one_step_solves_a_straight_flow(name: str) -> None:
     direction = gaussian(1, range(4), (2, 5), dtype=torch.float64)
     straight = solve(lambda y, t, c: direction, NOISE, (1.0, 0.0), name)
     assert torch.allclose(straight, NOISE - direction)
+
+
+def test_a_network_is_told_where_its_step_ends() -> None:
+    class Exact:
+        """The mean velocity of the Gaussian flow, with which one step is exact."""
+
+        ends = True
+
+        def __call__(self, y: Tensor, t: Tensor, cond: Any, end: Tensor) -> Tensor:
+            return (gaussian_flow(y, t, end) - y) / per_sample(end - t, y)
+
+    for grid in ((1.0, 0.0), (1.0, 0.7, 0.0), (1.0, 0.86, 0.58, 0.22, 0.0)):
+        assert torch.allclose(solve(towards(Exact(), grid), NOISE, grid), DATA)
+    assert towards(gaussian_velocity, (1.0, 0.0)) is gaussian_velocity
+    with pytest.raises(ConfigError, match="time grid"):
+        towards(Exact(), (0.0, 1.0))
 
 
 @pytest.mark.parametrize("name", SOLVERS)

@@ -17,10 +17,12 @@ ICLR 2023 (reflow and k-step distillation); Nakashima et al., "Fast LiDAR Data G
 Flows", ICRA 2025. R2Flow generates its pairs of noise and data once, before training, and distils the timesteps of
 its 2-RF model. Here the pairs are generated during training, from any teacher.
 
-To add a strategy: write its function and enter it in ``STRATEGIES``; the tests run over the dictionary.
+To add a strategy: write its function and enter it in ``STRATEGIES``; the tests run over the dictionary. One student for
+several numbers of steps is trained by ``every_piece``.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -98,6 +100,38 @@ def timestep_distillation(
     _check_uniform(grid)
     start, _ = _bounds(interval_of(u, grid), grid, u)
     return _straight(teacher, y1, start, steps, cond)
+
+
+def every_piece(
+    teacher: Velocity, y1: Tensor, grids: Sequence[Sequence[float]], steps: int, cond: Any = None
+) -> Example:
+    """A student of several numbers of steps, which is told where a step ends: every interval of all grids on the
+    teacher's trajectories from noise. One trajectory serves all of them.
+
+    Args:
+        teacher: the velocity to distil.
+        y1: (B, ...) noise.
+        grids: the time grids.
+        steps: Euler steps of the teacher between two neighbouring times of all grids.
+        cond: (B, ...) conditions, passed to the teacher.
+
+    Returns:
+        An example of P B samples, P intervals in the order of the grids. Its condition is repeated, too.
+    """
+    if steps < 1:
+        raise ConfigError(f"{steps} steps of the teacher", "at least 1")
+    times = sorted({float(t) for grid in grids for t in checked_grid(grid)}, reverse=True)
+    states = {times[0]: y1}
+    with torch.no_grad():
+        for a, b in pairwise(times):
+            states[b] = solve(teacher, states[a], uniform_grid(steps, a, b), "euler", cond)
+    pieces = [(float(a), float(b)) for grid in grids for a, b in pairwise(checked_grid(grid))]
+    start, end = (torch.cat([y1.new_full((len(y1),), t) for t in side]) for side in zip(*pieces, strict=True))
+    y, y_end = (torch.cat([states[t] for t in side]) for side in zip(*pieces, strict=True))
+    return Example(
+        y, start, (y_end - y) / per_sample(end - start, y), steps * (len(times) - 1) * len(y1),
+        None if cond is None else torch.cat([cond] * len(pieces)), end,
+    )  # fmt: skip
 
 
 STRATEGIES: dict[str, Strategy] = {

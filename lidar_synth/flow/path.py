@@ -25,7 +25,8 @@ from lidar_synth.errors import DataError
 
 Velocity = Callable[[Tensor, Tensor, Any], Tensor]
 """``v(y, t, cond)``: y (B, ...), t (B,) float32 in [0, 1], cond as the network takes it (None =
-unconditional) -> dy/dt, of y's shape. Guidance wraps one velocity in another."""
+unconditional) -> dy/dt, of y's shape. Guidance wraps one velocity in another. A network with the attribute ``ends`` can
+also be told (B,) times where the step ends, v(y, t, cond, end), and gives the mean velocity until then."""
 
 Metric = Callable[[Tensor, Tensor], Tensor]
 """The paper's m: two (B, ...) tensors of the same shape -> (B,) means over the elements of each sample."""
@@ -44,6 +45,7 @@ class Example:
         velocity: (B, ...) targets.
         teacher_evaluations: number of teacher evaluations for the batch, one per sample and step.
         cond: the condition, (B, ...) or None.
+        end: (B,) times up to which the target is the mean velocity, for a network that is told; None otherwise.
     """
 
     y: Tensor
@@ -51,6 +53,7 @@ class Example:
     velocity: Tensor
     teacher_evaluations: int = 0
     cond: Any = None
+    end: Tensor | None = None
 
 
 def per_sample(t: Tensor, y: Tensor) -> Tensor:
@@ -77,7 +80,20 @@ def flow_matching(y0: Tensor, y1: Tensor, t: Tensor) -> Example:
 
 def velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
     """E m(v_theta(y_t, t, c), v), the scalar loss of teachers and students."""
-    return metric(velocity(example.y, example.t, example.cond), example.velocity).mean()
+    return _errors(velocity, example, metric).mean()
+
+
+def balanced_velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
+    """``velocity_loss`` with each sample divided by its own error, so that long steps, whose errors are a hundred times
+    larger, do not outweigh short ones (Geng et al., "Mean Flows for One-step Generative Modeling", NeurIPS 2025: p = 1,
+    c = 0.001)."""
+    errors = _errors(velocity, example, metric)
+    return (errors / (errors.detach() + 1e-3)).mean()
+
+
+def _errors(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
+    given = (example.cond,) if example.end is None else (example.cond, example.end)
+    return metric(velocity(example.y, example.t, *given), example.velocity)
 
 
 def guided(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:

@@ -121,6 +121,24 @@ def solve(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond
     return y
 
 
+def towards(velocity: Velocity, grid: Sequence[float]) -> Velocity:
+    """A network with ``ends`` as a v(y, t, cond) for the steps of a grid: its mean velocity until the next time.
+    Other velocities are returned as they are.
+
+    Raises:
+        ConfigError: on a grid that does not descend within [0, 1].
+    """
+    if not getattr(velocity, "ends", False):
+        return velocity
+    ascending = checked_grid(grid).flip(0)
+
+    def mean_velocity(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
+        times = ascending.to(t.device, t.dtype)
+        return velocity(y, t, cond, times[(torch.searchsorted(times, t.contiguous()) - 1).clamp_min(0)])  # type: ignore[call-arg]
+
+    return mean_velocity
+
+
 def checked_grid(grid: Sequence[float] | Tensor) -> Tensor:
     """(S + 1,) float64 times on the CPU.
 

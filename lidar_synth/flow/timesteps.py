@@ -55,6 +55,10 @@ class Selection:
     costs: Costs = field(repr=False)
     per_trajectory: NDArray[np.float64] = field(repr=False)
 
+    def grid_of(self, intervals: int) -> tuple[float, ...]:
+        """The best time grid of another number of intervals on the same trajectories."""
+        return tuple(self.candidates[i] for i in best_path(self.costs, intervals))
+
 
 def select_timesteps(
     velocity: Velocity,

@@ -13,6 +13,7 @@ The header is stored in the file's metadata under ``lidar_synth`` and contains e
     conditioning    {key of conditions.CONDITIONS: its options}; empty = unconditional. Options: ``dropout``, share of
                     blank conditions in training; ``image``, rows and columns of the camera's images
     time_grid       times descending from 1 to 0: the steps that the weights were trained for
+    other_grids     those for other numbers of steps, if there are any
     provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher, recipe, metrics
     weights         sha256 of all tensors
     checksum        sha256 of all other keys, as JSON with sorted keys
@@ -37,6 +38,7 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import write_file
+from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned
 from lidar_synth.generate.devices import checked_device
 from lidar_synth.geometry.normalize import LABEL_BITS, Normalisation, TensorFormat
@@ -76,13 +78,14 @@ class Header:
     time_grid: tuple[float, ...]
     provenance: dict[str, Any]
     conditioning: dict[str, Any] = field(default_factory=dict)
+    other_grids: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if not {VELOCITY, CODEC} & set(self.networks):
             raise ConfigError(f"networks {sorted(self.networks)}", f"{VELOCITY!r} or {CODEC!r} among them")
-        grid = self.time_grid
-        if len(grid) < 2 or (grid[0], grid[-1]) != (1, 0) or any(a <= b for a, b in pairwise(grid)):
-            raise ConfigError(f"time grid {grid}", "at least two times descending from 1 (noise) to 0 (data)")
+        for grid in (self.time_grid, *self.other_grids):
+            if len(grid) < 2 or (grid[0], grid[-1]) != (1, 0) or any(a <= b for a, b in pairwise(grid)):
+                raise ConfigError(f"time grid {grid}", "at least two times descending from 1 (noise) to 0 (data)")
         if missing := [k for k in ("data", "data_licence", "licence") if not self.provenance.get(k)]:
             raise ConfigError(f"a provenance without {', '.join(missing)}", "data, data_licence and licence")
         if unknown := sorted(set(self.conditioning) - set(CONDITIONS)):
@@ -102,9 +105,18 @@ class Header:
         """The format of the network's tensors."""
         return TensorFormat(self.channels, self.normalisation)
 
+    def grid(self, steps: int | None) -> tuple[float, ...]:
+        """The time grid of a number of steps, None = ``time_grid``; uniform where the weights know none.
+
+        Raises:
+            ConfigError: on fewer than one step.
+        """
+        known = {len(grid) - 1: grid for grid in (*self.other_grids, self.time_grid)}
+        return self.time_grid if steps is None else known.get(steps) or uniform_grid(steps)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as the file stores them, without ``weights`` and ``checksum``."""
-        return {
+        values = {
             "format": FORMAT,
             "convention": CONVENTION,
             "networks": {name: part._asdict() for name, part in self.networks.items()},
@@ -116,6 +128,7 @@ class Header:
             "time_grid": list(self.time_grid),
             "provenance": self.provenance,
         }
+        return values | ({"other_grids": [list(grid) for grid in self.other_grids]} if self.other_grids else {})
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Header":
@@ -136,6 +149,7 @@ class Header:
                 time_grid=tuple(map(float, values["time_grid"])),
                 provenance=dict(values["provenance"]),
                 conditioning=dict(values["conditioning"]),
+                other_grids=tuple(tuple(map(float, grid)) for grid in values.get("other_grids", ())),
             )
         except KeyError as error:
             raise ConfigError(f"a header without {error}", "all keys of the format") from error

@@ -154,9 +154,14 @@ class Conditioned(nn.Module):
         super().__init__()
         self.velocity, self.encoder = velocity, encoder
 
-    def forward(self, y: Tensor, t: Tensor, cond: Tensor) -> Tensor:
-        """(B, ...) states, times and conditions to velocities (B, ...)."""
-        out: Tensor = self.velocity(y, t, self.encoder(cond))
+    @property
+    def ends(self) -> bool:
+        """Whether the velocity network takes the end of a step."""
+        return bool(getattr(self.velocity, "ends", False))
+
+    def forward(self, y: Tensor, t: Tensor, cond: Tensor, *end: Tensor) -> Tensor:
+        """(B, ...) states, times and conditions, and ends of steps if it takes them, to velocities (B, ...)."""
+        out: Tensor = self.velocity(y, t, self.encoder(cond), *end)
         return out
 
 

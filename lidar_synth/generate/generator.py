@@ -19,7 +19,7 @@ from typing_extensions import Unpack
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow.path import Velocity, guided
-from lidar_synth.flow.solvers import solve, uniform_grid
+from lidar_synth.flow.solvers import solve, towards
 from lidar_synth.generate.checkpoint import CODEC, VELOCITY, Header, has_checksum, join, load_checkpoint, read_header
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, blank
@@ -45,7 +45,8 @@ class SamplingOptions(TypedDict, total=False):
     """Options of ``Generator.range_images``, ``scans`` and ``samples``.
 
     Attributes:
-        steps: number of steps of a uniform time grid; None, the default, uses the checkpoint's own grid.
+        steps: number of steps, on the times that the checkpoint has for it, else on a uniform grid; None, the default,
+            uses the checkpoint's own number.
         solver: a key of ``SOLVERS``, by default "euler".
         guidance: scale of classifier-free guidance; 1, the default, is no guidance. A larger scale follows the
             condition more closely; any scale but 1 doubles the computation.
@@ -195,17 +196,19 @@ class Generator:
         given = self._condition(condition, len(indices))
         codec = self.codec
         noise_shape = (codec.draws, *self.sensor.shape)
-        grid = self.header.time_grid if steps is None else uniform_grid(steps)
+        grid = self.header.grid(steps)
+        if solver != "euler" and getattr(self.network, "ends", False):
+            raise ConfigError(f"solver {solver!r} for {self.name!r}", "'euler': it predicts mean velocities of steps")
         for first in range(0, len(indices), self.batch):
             part = slice(first, first + self.batch)
             noise = gaussian(seed, indices[part], codec.shape, self.device)
             uniform_noise = uniform(seed, indices[part], noise_shape, self.device) if codec.draws else None
             with torch.inference_mode():
-                velocity, cond = self._flow(None if given is None else given[part], guidance)
+                velocity, cond = self._flow(None if given is None else given[part], guidance, grid)
                 yield codec.decode(solve(velocity, noise, grid, solver, cond), uniform_noise)
 
-    def _flow(self, condition: Tensor | None, guidance: float) -> tuple[Velocity, Tensor | None]:
-        """The velocity to solve, and its encoded condition: a condition is encoded once, not at every step."""
+    def _flow(self, condition: Tensor | None, guidance: float, grid: Sequence[float]) -> tuple[Velocity, Tensor | None]:
+        """The velocity to solve on a grid, and its encoded condition: it is encoded once, not at every step."""
         options = self.header.conditioning.get(str(self.condition), {})
         if guidance != 1 and (condition is None or not options.get("dropout")):
             raise ConfigError(
@@ -214,10 +217,10 @@ class Generator:
                 "Train it with condition.dropout=0.1.",
             )
         if condition is None or not isinstance(self.network, Conditioned):
-            return self.network, condition
+            return towards(self.network, grid), condition
         encode: Callable[[Tensor], Tensor] = self.network.encoder
         unconditional = encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
-        return guided(self.network.velocity, guidance, unconditional), encode(condition)
+        return guided(towards(self.network.velocity, grid), guidance, unconditional), encode(condition)
 
     def _condition(self, given: Any, count: int) -> Tensor | None:
         """The conditions (B, ...) as the network takes them, on its device."""

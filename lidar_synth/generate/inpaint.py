@@ -16,7 +16,7 @@ from torch.nn.functional import adaptive_max_pool2d
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow.solvers import solve
+from lidar_synth.flow.solvers import solve, towards
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.normalize import CHANNELS
 from lidar_synth.geometry.scan import RangeImage
@@ -121,9 +121,9 @@ def _sample(generator: Generator, known: Tensor, noise: Tensor, inside: Tensor, 
     grid = [t for t in generator.header.time_grid if t <= start]
     if len(grid) < 2:
         raise ConfigError(f"start={start} for the time grid {tuple(generator.header.time_grid)}", "a later time in it")
-    y = (1 - grid[0]) * known + grid[0] * noise
+    y, velocity = (1 - grid[0]) * known + grid[0] * noise, towards(generator.network, grid)
     for t, t_next in pairwise(grid):
-        y = solve(generator.network, y, (t, t_next))
+        y = solve(velocity, y, (t, t_next))
         y = torch.where(inside, y, (1 - t_next) * known + t_next * noise)
     return y
 

@@ -34,8 +34,8 @@ from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models.convolution import Norm, WrapConv
 from lidar_synth.models.lidm.vqvae import VQVAE, Encoding
-from lidar_synth.models.surface_codec.autoencoder import PATCH, SurfaceAutoencoder
-from lidar_synth.models.surface_codec.blocks import to_patches
+from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
+from lidar_synth.models.surface_codec.blocks import PATCH, to_patches
 from lidar_synth.models.surface_codec.measure_noise import measure_noise
 from lidar_synth.models.surface_codec.surfaces import Surfaces
 from lidar_synth.models.town_codec.autoencoder import Autoencoder

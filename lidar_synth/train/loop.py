@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from torch import Tensor, nn
 
 from lidar_synth.errors import DataError
-from lidar_synth.flow.distill import STRATEGIES
+from lidar_synth.flow.distill import STRATEGIES, every_piece
 from lidar_synth.flow.path import METRICS, TIMESTEPS, Example, Metric, Velocity, flow_matching, velocity_loss
 from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
 from lidar_synth.train.data import Batch, Batches, micro_batches
@@ -44,6 +44,11 @@ def student_task(strategy: str, teacher: Velocity, grid: Sequence[float], steps:
         return replace(example, cond=batch.cond)
 
     return task
+
+
+def several_steps_task(teacher: Velocity, grids: Sequence[Sequence[float]], steps: int) -> Task:
+    """Distillation of ``teacher`` for several numbers of steps (``every_piece``)."""
+    return lambda batch: every_piece(teacher, batch.y1, grids, steps, batch.cond)
 
 
 class Record(NamedTuple):

@@ -9,8 +9,8 @@ from torch import nn
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.flow.path import METRICS, velocity_loss
-from lidar_synth.flow.solvers import uniform_grid
+from lidar_synth.flow.path import METRICS, balanced_velocity_loss, velocity_loss
+from lidar_synth.flow.solvers import towards, uniform_grid
 from lidar_synth.flow.timesteps import Selection, select_timesteps
 from lidar_synth.generate.checkpoint import (
     CODEC,
@@ -24,6 +24,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS
+from lidar_synth.models import build_network
 from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
 from lidar_synth.train.autoencoder import Autoencoding, autoencoder_loss, reconstruction_task
@@ -31,7 +32,7 @@ from lidar_synth.train.cache import Other, cache_latents, cache_scans
 from lidar_synth.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.train.data import Batches, Conditioning
 from lidar_synth.train.decoding import Decoding, decoding_loss, decoding_task
-from lidar_synth.train.loop import Loss, Task, student_task, teacher_task
+from lidar_synth.train.loop import Loss, Task, several_steps_task, student_task, teacher_task
 from lidar_synth.train.selection import load_selection, save_selection, selection_settings
 from lidar_synth.train.start import fresh_networks, provenance_of, start_networks, with_recordings
 from lidar_synth.train.teaching import target_flow
@@ -124,7 +125,8 @@ def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> TrainingPla
         weight.requires_grad_(False)
     recipe = config.recipe
     trained = Decoding(network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights)
-    task = decoding_task(network, join(frozen), header.time_grid[-2], config.losses.noise)
+    velocity = towards(join(frozen), header.time_grid)
+    task = decoding_task(network, velocity, header.time_grid[-2], config.losses.noise)
     return TrainingPlan(trained, task, header, decoding_loss, frozen)
 
 
@@ -144,8 +146,27 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
         with accelerator.main_process_first():
             found = _selection(config, flow, plan, accelerator)
         provenance |= {"selection": {"cost": found.cost, "uniform_cost": found.uniform_cost}}
-        header = replace(header, time_grid=found.grid, provenance=provenance)
+        others = tuple(found.grid_of(intervals) for intervals in config.also)
+        header = replace(header, time_grid=found.grid, other_grids=others, provenance=provenance)
+    if config.also:
+        return _student_of_several_steps(config, plan, flow, header)
     return replace(plan, task=student_task(config.strategy, flow, header.time_grid, config.steps), header=header)
+
+
+def _student_of_several_steps(config: DistillConfig, plan: TrainingPlan, flow: Any, header: Header) -> TrainingPlan:
+    """The student is told where a step ends; before training, it is the teacher nevertheless."""
+    networks = split(plan.network)
+    held = header.networks[VELOCITY]
+    if held.architecture != "hdit" or config.strategy != "adaptive_piecewise":
+        raise ConfigError(
+            f"also={list(config.also)} for a {held.architecture} by {config.strategy}", "an hdit, adaptive_piecewise"
+        )
+    part = held._replace(arguments=held.arguments | {"ends": True})
+    networks[VELOCITY] = build_network(*part)
+    networks[VELOCITY].load_state_dict(split(plan.network)[VELOCITY].state_dict(), strict=False)
+    header = replace(header, networks=header.networks | {VELOCITY: part})
+    task = several_steps_task(flow, (header.time_grid, *header.other_grids), config.steps)
+    return replace(plan, network=join(networks), task=task, header=header, loss=balanced_velocity_loss)
 
 
 def _codec_of(networks: Mapping[str, nn.Module]) -> dict[str, nn.Module]:

@@ -37,9 +37,11 @@ class Denoiser(HDiT):
             raise ConfigError(f"detail {detail}", "0 < detail <= 1")
         self.detail = detail
 
-    def forward(self, y: Tensor, t: Tensor | float, cond: Tensor | None = None) -> Tensor:
+    def forward(
+        self, y: Tensor, t: Tensor | float, cond: Tensor | None = None, end: Tensor | float | None = None
+    ) -> Tensor:
         """The velocity dy/dt at y and t; arguments and result are those of ``HDiT``."""
-        output = super().forward(y, t, cond)
+        output = super().forward(y, t, cond, end)
         t = torch.as_tensor(t, device=y.device, dtype=torch.float32).reshape(-1, 1, 1, 1)
         data = (1 - t) * self.detail**2
         spread = (1 - t) * data + t**2

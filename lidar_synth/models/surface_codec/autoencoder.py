@@ -112,7 +112,7 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         """Images with a channel of their returns, (B, C + 1, H, W), to patches of 2 x 8 cells."""
         rows, columns = self.resolution[0] // PATCH[0], self.resolution[1] // PATCH[1]
         patches: Tensor = self.stem(to_patches(x, PATCH).flatten(1))
-        return patches.unflatten(0, (-1, rows, columns)).movedim(-1, 1)
+        return patches.view(len(x), rows, columns, -1).movedim(-1, 1)
 
     def expand(self, z: Tensor, image: Tensor) -> Surfaces:
         """The surfaces of bounded latents (B, *latent_shape); they do not depend on the image."""

@@ -59,7 +59,7 @@ def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Te
             sums[:, column] += torch.bincount(left[3][same], term[same].double(), codes)
         returns += _return_scores(surfaces, distance, generator)
         whole = from_patches(torch.stack([error, kinds.float(), distance], 1), PATCH, network.resolution)
-        relief += _products(*whole.unbind(1), codes)
+        relief += _products(whole[:, 0], whole[:, 1], whole[:, 2], codes)
     total, known = sums.sum(0), sums[:, 0] >= LEAST
     network.roughness.copy_(torch.where(known, sums[:, 1] / sums[:, 0], total[1] / total[0]) / 1.5)
     network.alike.copy_(torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95))

@@ -129,6 +129,7 @@ class DistillConfig(Run):
         intervals: N, the number of steps of the student.
         grid: N + 1 descending times from 1 to 0; without it, ``adaptive_piecewise`` selects them and the other
             strategies take uniform ones.
+        also: other numbers of steps that the student learns as well, such as [2, 1]; it is then told where a step ends.
         selection: the selection of these times.
     """
 
@@ -142,4 +143,5 @@ class DistillConfig(Run):
     within: tuple[float, float] = (0.0, 1.0)
     intervals: Count = 4
     grid: tuple[float, ...] | None = None
+    also: tuple[Count, ...] = ()
     selection: SelectionSettings = SelectionSettings()
