@@ -144,15 +144,18 @@ def decode_labels(bits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         (B, H, W) uint8 train ids, 255 = ignore, and (B, H, W) float32 confidence: 1 on the code, falling
         with the distance (in the maximum norm) to 0 where a bit is no nearer to its value than to the other.
     """
-    powers = torch.tensor([1 << b for b in reversed(range(LABEL_BITS))], device=bits.device)
-    nearest = ((bits > 0) * powers.view(1, -1, 1, 1)).sum(1)
+    nearest = torch.zeros_like(bits[:, 0], dtype=torch.uint8)
+    for bit in bits.unbind(1):
+        nearest = 2 * nearest + (bit > 0)
+    gap = (bits.abs() - 1).abs().amax(1)
     if bool((unused := nearest > NO_LABEL).any()):  # all codes have the same norm: the nearest has the largest product
-        codes = torch.arange(NO_LABEL + 1, device=bits.device)
-        corners = (codes[:, None] & powers).sign() * 2.0 - 1.0
-        nearest[unused] = (bits.movedim(1, -1)[unused].float() @ corners.T).argmax(1)
-    corner = (nearest[:, None] & powers.view(1, -1, 1, 1)).sign() * 2.0 - 1.0
-    gap = (bits - corner).abs().amax(1)
-    label = torch.where(nearest == NO_LABEL, IGNORE, nearest).to(torch.uint8)
+        powers = 1 << torch.arange(LABEL_BITS, device=bits.device).flip(0)
+        corners = (torch.arange(NO_LABEL + 1, device=bits.device)[:, None] & powers).sign() * 2.0 - 1.0
+        those = bits.movedim(1, -1)[unused].float()
+        code = (those @ corners.T).argmax(1)
+        nearest[unused] = code.to(torch.uint8)
+        gap[unused] = (those - corners[code]).abs().amax(1).to(gap.dtype)
+    label = torch.where(nearest == NO_LABEL, IGNORE, nearest)
     return label, (1 - gap).clamp(0, 1).float()
 
 
@@ -224,7 +227,7 @@ class TensorFormat:
         """
         if x.ndim != 4 or x.shape[1] != self.size:
             raise DataError(f"a tensor of shape {tuple(x.shape)}", f"(B, {self.size}, H, W) for {self.channels}")
-        if not bool(x.isfinite().all()):
+        if not bool(x.abs().amax().isfinite()):
             raise DataError(f"a tensor for {self.channels} with NaN or infinity", "finite values")
         part = dict(
             zip(self.channels, torch.split(x.float(), [CHANNELS[name] for name in self.channels], 1), strict=True)

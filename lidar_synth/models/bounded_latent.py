@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from lidar_synth.models.codebook import follow
 from lidar_synth.models.convolution import WrapConv, check_shape
-from lidar_synth.models.layers import EPS
+from lidar_synth.models.layers import rms_norm
 from lidar_synth.models.network import Network
 
 
@@ -33,7 +33,7 @@ class Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) to the same shape."""
-        normed = F.rms_norm(x.movedim(1, -1), x.shape[1:2], eps=EPS).movedim(-1, 1)
+        normed = rms_norm(x.movedim(1, -1)).movedim(-1, 1)
         out: Tensor = x + self.second(F.silu(self.first(normed)))
         return out
 

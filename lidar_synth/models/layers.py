@@ -34,6 +34,15 @@ def piece_length(x: Tensor, items: int, floats: int) -> int:
     return -(-items // pieces)
 
 
+def rms_norm(x: Tensor, eps: float = EPS) -> Tensor:
+    """x / rms(x) over the last dimension (..., C)."""
+    if x.device.type != "cpu" or x.dtype != torch.float32 or torch.is_grad_enabled() or torch.compiler.is_compiling():
+        return F.rms_norm(x, x.shape[-1:], eps=eps)
+    # Half as many passes over memory as torch's own on a CPU.
+    square = torch.linalg.vector_norm(x, dim=-1, keepdim=True).square_()
+    return x * square.div_(x.shape[-1]).add_(eps).rsqrt_()
+
+
 class Exact(nn.Module):
     """A module whose buffers stay float32 when the network is cast to half precision.
 
@@ -59,7 +68,7 @@ class RMSNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., C) to (..., C)."""
-        return F.rms_norm(x, x.shape[-1:], eps=EPS) * self.weight
+        return rms_norm(x) * self.weight
 
 
 class AdaRMSNorm(nn.Module):
@@ -77,7 +86,7 @@ class AdaRMSNorm(nn.Module):
 
     def forward(self, x: Tensor, time: Tensor) -> Tensor:
         """x (B, N, C) and time (B, E) to (B, N, C)."""
-        out: Tensor = F.rms_norm(x, x.shape[-1:], eps=EPS) * (1 + self.gain(time))[:, None]
+        out: Tensor = rms_norm(x) * (1 + self.gain(time))[:, None]
         return out
 
 

@@ -4,12 +4,11 @@ import math
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lidar_synth.models.attention import Grid, NeighbourhoodAttention, attention
 from lidar_synth.models.convolution import attend
-from lidar_synth.models.layers import EPS, AdaRMSNorm, GatedFeedForward, RMSNorm, piece_length
+from lidar_synth.models.layers import EPS, AdaRMSNorm, GatedFeedForward, RMSNorm, piece_length, rms_norm
 from lidar_synth.models.positions import rotate
 
 
@@ -65,7 +64,7 @@ class SelfAttention(nn.Module):
         q, k, v = self.qkv(self.norm(x, time)).reshape(*x.shape[:2], 3, self.heads, -1).unbind(2)
         # A vector of root mean square 1 has the length sqrt(D).
         scale = self.temperature.clamp(max=math.log(100.0)).exp() / q.shape[-1]
-        q, k = (F.rms_norm(z, z.shape[-1:], eps=EPS**2) for z in (q, k))
+        q, k = rms_norm(q, EPS**2), rms_norm(k, EPS**2)
         return rotate(q * scale, cosine, sine).to(v.dtype), rotate(k, cosine, sine).to(v.dtype), v
 
 

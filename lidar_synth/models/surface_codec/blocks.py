@@ -4,7 +4,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lidar_synth.models.convolution import WrapConv
-from lidar_synth.models.layers import EPS
+from lidar_synth.models.layers import rms_norm
 
 PATCH = (2, 8)
 """Rows and columns of a patch."""
@@ -33,7 +33,7 @@ class Block(nn.Module):
 
 def cell_norm(x: Tensor) -> Tensor:
     """RMS norm over the channels of each cell of (B, C, H, W)."""
-    return F.rms_norm(x.movedim(1, -1), x.shape[1:2], eps=EPS).movedim(-1, 1)
+    return rms_norm(x.movedim(1, -1)).movedim(-1, 1)
 
 
 def split(x: Tensor, patch: tuple[int, int]) -> Tensor:

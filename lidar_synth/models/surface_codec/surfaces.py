@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lidar_synth.geometry.normalize import Normalisation
+from lidar_synth.models.surface_codec.relief import normal
 from lidar_synth.models.town_codec.planes import laplace_noise
 from lidar_synth.models.town_codec.reflectance import ZeroInflatedLogistic
 
@@ -108,35 +109,38 @@ class Surfaces(NamedTuple):
         """
         which, back, near, dim, shared = uniform_noise.unbind(1)
         count = self.weights.shape[1]
-        shares = self.weights.softmax(1).cumsum(1)
-        chosen = (which[:, None] > shares[:, :-1]).sum(1, keepdim=True)
-        likely, code = self.classes.exp().max(2, keepdim=True)
-        alike = _pick(noise.reflectance[code], chosen), _pick(shared[:, :count, None], chosen)
-        values = ZeroInflatedLogistic(*(_pick(part, chosen) for part in self.reflectance)).sample(_mixed(dim, *alike))
-        distance = normalised(_pick(self.inverse, chosen), normalisation)
-        distance = distance + _pick(noise.roughness[code] * self.scale, chosen) * laplace_noise(near)
-        bumps = noise.relief[code[..., 0]] * self.scale  # (N, K, F)
-        for field, factor in zip(relief.unbind(1), bumps.unbind(2), strict=True):
-            distance = distance + _pick(factor[..., None], chosen) * field
-        back = _mixed(back, noise.returned, shared[:, count : count + 1])
-        returned = _pick(self.returned, chosen) + torch.logit(back) > 0
-        distance = torch.where(returned, distance, -1.0)
-        return torch.stack([distance, values, _pick(code, chosen).float(), _pick(likely, chosen)], 1)
+        chosen = _choose(self.weights.exp(), which)[:, None]
+        distance, median, returned = (
+            part.gather(1, chosen)[:, 0] for part in (self.inverse, self.reflectance.middles, self.returned)
+        )
+        likely, code = self.classes.max(2)
+        # What all cells of a surface have in common.
+        common = [self.scale[..., 0], *(part[..., 0] for part in self.reflectance[1:]), likely.exp(), code.float()]
+        common += [noise.reflectance[code], normal(shared[:, :count]), noise.roughness[code]]
+        common = torch.cat([torch.stack(common, 2), noise.relief[code]], 2)
+        common = common.gather(1, chosen.mT.expand(-1, -1, common.shape[2]))
+        scale, dull, blank, likely, kind, alike, patch, rough, *bumps = common.unbind(2)
+        values = ZeroInflatedLogistic(median, dull, blank).sample(_mixed(dim, alike, patch))
+        error = rough * laplace_noise(near) + sum(a * b for a, b in zip(bumps, relief.unbind(1), strict=True))
+        distance = normalised(distance, normalisation) + scale * error
+        back = _mixed(back, noise.returned, normal(shared[:, count : count + 1]))
+        distance = torch.where(returned + torch.logit(back) > 0, distance, -1.0)
+        return torch.stack([distance, values, kind, likely], 1)
+
+
+def _choose(shares: Tensor, which: Tensor) -> Tensor:
+    """(N, P) int64 surfaces of shares (N, K, P) by uniform numbers (N, P)."""
+    chosen, below = torch.zeros_like(which, dtype=torch.int64), torch.zeros_like(which)
+    for share in shares.unbind(1)[:-1]:
+        below = below + share
+        chosen += which > below
+    return chosen
 
 
 def _mixed(own: Tensor, correlation: Tensor, shared: Tensor) -> Tensor:
-    """Uniform numbers of cells, correlated by what they share (a Gaussian copula)."""
-    normal = correlation.sqrt() * torch.special.ndtri(shared) + (1 - correlation).sqrt() * torch.special.ndtri(own)
-    mixed: Tensor = torch.special.ndtr(normal)
+    """Uniform numbers of cells, correlated by the standard normal numbers that they share (a Gaussian copula)."""
+    mixed: Tensor = torch.special.ndtr(correlation.sqrt() * shared + (1 - correlation).sqrt() * normal(own))
     return mixed.clamp(_SURE, 1 - _SURE)
-
-
-def _pick(x: Tensor, chosen: Tensor) -> Tensor:
-    """(N, P) of (N, K, P or 1), the surface that each cell (N, 1, P) shows."""
-    out = x[:, 0]
-    for k in range(1, x.shape[1]):
-        out = torch.where(chosen[:, 0] == k, x[:, k], out)
-    return out
 
 
 def normalised(inverse: Tensor, normalisation: Normalisation) -> Tensor:
@@ -159,7 +163,8 @@ def surfaces_of(x: Tensor, surfaces: int, classes: int, patch: tuple[int, int], 
     rows, columns = patch
     whole, each = torch.split(x.float(), [surfaces * (NUMBERS + classes), rows * columns * (surfaces + PER_CELL)], 1)
     numbers, kinds = torch.split(whole.reshape(len(x), surfaces, -1), [NUMBERS, classes], 2)
-    each = each.reshape(len(x), surfaces + PER_CELL, -1, merged).mean(3)
+    parts = each.reshape(len(x), surfaces + PER_CELL, -1, merged).unbind(3)
+    each = torch.stack(parts).mean(0) if merged > 1 else parts[0]
     choice, offsets = torch.split(each, [surfaces, PER_CELL], 1)
     distance, down, across, spread, returned, median, dim, blank = numbers[..., None].unbind(2)
     cell = torch.arange(each.shape[2], device=x.device)
