@@ -3,10 +3,11 @@ student, decoder.
 
     python tools/make_town_weights.py WORK [--model town] [--codec 60] [--teacher 180] [--weaker 10] [--student 30]
         [--decoder 30] [--set RUN.KEY=VALUE ...]
-    python tools/make_town_weights.py WORK --model town-semantic --teacher 60      # after the first, in the same folder
+    python tools/make_town_weights.py WORK --model town-dense --codec 60 --teacher 90 --student 45
+    python tools/make_town_weights.py WORK --model town-semantic --teacher 60      # after town, in the same folder
     python tools/make_town_weights.py WORK --model town-camera --teacher 60
 
-The conditional models start from the teacher of the first model. The numbers are minutes: every run has a budget of
+The conditional models start from the teacher of "town". The numbers are minutes: every run has a budget of
 time instead of iterations. The learning rate is constant for three quarters of the budget, then falls to zero over a
 third of the steps done so far (the schedule "trapezoid"). The same command resumes a run that was stopped or killed,
 with a new budget. --set changes the recipes (town_codec, town_teacher, town_semantic_student ...), such as
@@ -61,30 +62,36 @@ STAGES = {
     "student": Stage(DistillConfig, 30, {"teacher": "teacher", "weaker": "weaker"}),
     "decoder": Stage(TrainConfig, 30, {"init": "student"}),
 }
+DENSE = {
+    "codec": Stage(TrainConfig, 60),
+    "teacher": Stage(TrainConfig, 180, {"codec": "codec"}),
+    "student": Stage(DistillConfig, 45, {"teacher": "teacher"}),
+}
 CONDITIONAL = {
     "teacher": Stage(TrainConfig, 180, {"init": "unconditional"}),
     "student": Stage(DistillConfig, 30, {"teacher": "teacher"}),
 }
+MODELS = {"town": STAGES, "town-dense": DENSE, "town-semantic": CONDITIONAL, "town-camera": CONDITIONAL}
+"""Stages of the shipped models."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path, help="folder of the runs")
-    parser.add_argument("--model", choices=("town", "town-semantic", "town-camera"), default="town")
+    parser.add_argument("--model", choices=MODELS, default="town")
     for name, stage in STAGES.items():
         parser.add_argument(f"--{name}", type=float, default=stage.minutes, metavar="MINUTES")
     parser.add_argument("--set", nargs="*", default=[], metavar="RUN.KEY=VALUE")
     parser.add_argument("--out", type=Path, help="file to write [default: the package's weights]")
     given = parser.parse_args()
 
-    data = [f"data.cache={given.work / 'cache'}"]
+    data = [f"data.cache={given.work / ('dense_cache' if given.model == 'town-dense' else 'cache')}"]
     if given.model == "town-camera":
         data = [f"data.cache={given.work / 'camera_cache'}", f"data.path={given.work / 'town_camera'}"]
         town = Town(0, scans=CAMERA_SCANS, interval=CAMERA_INTERVAL)
         export_town(town, given.work / "town_camera", "kitti360", jobs=os.cpu_count() or 1)
-    stages = STAGES if given.model == "town" else CONDITIONAL
     made = {"unconditional": given.work / "town_teacher" / "town_teacher.safetensors"}
-    for name, stage in stages.items():
+    for name, stage in MODELS[given.model].items():
         folder = given.work / f"{given.model.replace('-', '_')}_{name}"
         needs = [f"{key}={made[other]}" for key, other in stage.needs.items()]
         changes = [change.partition(".")[2] for change in given.set if change.startswith(f"{name}.")]

@@ -6,7 +6,7 @@
         "teacher, 4 steps=RUN/town_teacher.safetensors:4" --pictures docs/models
 
 Every model generates scans from the same noise. They are compared with scans of a town that no model was trained on
-(seed 1). The first row is a third town (seed 2): real against real, the lower bound. With STEPS = 0 a row has the third
+(seed 1), on the grid of its sensor; a denser scan is projected to it. The first row is a third town (seed 2): real against real, the lower bound. With STEPS = 0 a row has the third
 town's scans, encoded and decoded by the model's autoencoder: the lower bound for its flow. With the checkpoint of a
 WEAKER model the flow is autoguided from t = HIGH to LOW, as the teacher of a student is.
 
@@ -34,6 +34,7 @@ from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.generator import find_model, load_generator
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
+from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.noise import uniform
 from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.viz import write_view
@@ -62,13 +63,13 @@ class Autoguided(nn.Module):
 
 
 def generate(model: str, steps: int | None, count: int, weaker: str = "", *how: str) -> list[Scan]:
-    """Scans of one model; all models get the same noise."""
+    """Scans of one model, measured on the town's grid; all models get the same noise."""
     generator = load_generator(model)
     if weaker:
         guided = Autoguided(generator.network, load_generator(weaker).network, *map(float, how))
         generator = replace(generator, network=guided)
     indices = tqdm(range(count), desc=Path(model).stem, unit="scan")
-    return [generator.scans(SEED, [i], steps=steps)[0] for i in indices]
+    return [replace(generator.scans(SEED, [i], steps=steps)[0], sensor=load_sensor("town")) for i in indices]
 
 
 def open_codec(model: str) -> Latent:
