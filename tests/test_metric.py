@@ -15,6 +15,7 @@ from project import ROOT
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.evaluate import PROTOCOLS, Metric, Score, evaluate, lidm
 from lidar_synth.evaluate.cache import Cached, extract_all, scan_hash, weights_hash
+from lidar_synth.evaluate.extractors import EXTRACTORS
 from lidar_synth.evaluate.leaderboard import beside, leaderboard
 from lidar_synth.evaluate.measures import KINDS
 from lidar_synth.evaluate.protocols import FEATURES, alike, parse_protocol
@@ -220,7 +221,6 @@ def test_processes_extract_the_features_of_one(tmp_path: Path) -> None:
 
 
 def test_published_weights_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("lidar_synth.evaluate.extractors")
     monkeypatch.syspath_prepend(str(ROOT / "tools" / "extractors"))
     from random_archives import write
 
@@ -255,10 +255,9 @@ def test_a_protocol_says_where_it_was_read(name: str) -> None:
 
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_every_extractor_of_a_protocol_exists(name: str) -> None:
-    extractors = pytest.importorskip("lidar_synth.evaluate.extractors")
     for measure in PROTOCOLS[name].measures.values():
         if measure.extractor is not None:
-            spec = extractors.EXTRACTORS[measure.extractor]
+            spec = EXTRACTORS[measure.extractor]
             assert spec.measure == measure.table or not measure.table
 
 

@@ -17,6 +17,7 @@ from lidar_synth.bank import Bank
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.cli.bake import bake
 from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.generator import Generator, shipped_models
 from lidar_synth.geometry.projection import project
@@ -103,3 +104,10 @@ def test_every_source_and_label_policy_mixes_with_real_scans(
             else:
                 assert known > 0.5
     assert seen == {0: SCANS, 1: SCANS}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["generator", "bank", "rolling", "list"])
+def test_no_source_has_boxes_for_detectors(kind: str, sources: dict[str, Any], real: Source) -> None:
+    with pytest.raises(ConfigError, match="labels='boxes'"):
+        MixedScans(real, sources[kind], 0.5, labels="boxes", unlabelled="allow")

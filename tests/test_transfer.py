@@ -113,12 +113,12 @@ def test_the_same_sensor_in_the_same_place_changes_nearly_nothing(scan: Scan) ->
 
 def test_a_real_street_of_the_town_too() -> None:
     """A scan of a range image has no ring, and rows without a return."""
-    town = Town(seed=0, scans=1, motion=False)[0]
+    town = Town(seed=5, scans=1, motion=False)[0]  # few leaves, whose returns have random depths
     for scan in (town, unproject(project(replace(town, boxes=None, pose=None)))):
         found = Transfer(scan.sensor)(replace(scan, ring=scan.ring))
         ranges = [project(s).range for s in (scan, found)]
         both = (ranges[0] > 0) & (ranges[1] > 0)
-        assert both.sum() > 0.87 * (ranges[0] > 0).sum()
+        assert both.sum() > 0.9 * (ranges[0] > 0).sum()
         assert np.median(np.abs(ranges[0] - ranges[1])[both]) < 0.05
 
 

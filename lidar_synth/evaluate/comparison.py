@@ -51,6 +51,13 @@ def evaluate(
     Raises:
         ConfigError: on an unknown protocol, or several processes without a cache.
         DataError: on an empty set, a scan without returns in the protocol's area, or sensors that differ.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.evaluate import evaluate
+        >>> scores = evaluate(Town(1, scans=2), Town(2, scans=2), "town", progress=False)
+        >>> [score.metric for score in scores]
+        ['BEV Jensen-Shannon distance', 'BEV maximum mean discrepancy']
     """
     rules = find_protocol(protocol)
     if processes > 1:

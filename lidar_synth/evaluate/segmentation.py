@@ -133,6 +133,12 @@ def load_judge(path: Path | None = None) -> Judge:
     Raises:
         FileError: if it cannot be read.
         DataError: if the file is not a segmenter, or of another version.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.evaluate.segmentation import load_judge
+        >>> load_judge().features([Town(seed=1, scans=1)[0]]).shape
+        (1, 64)
     """
     path = path or Path(str(files("lidar_synth.evaluate"))) / "segmenter.safetensors"
     content = read_file(path)

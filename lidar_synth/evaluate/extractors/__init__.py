@@ -1,6 +1,6 @@
 """Feature extractors of the field in plain PyTorch. They load the archives that their authors publish; none ships.
 
-To add an extractor, write a module with a function ``load`` and add an entry to ``EXTRACTORS``.
+To add an extractor, write a module with a function that loads it and add an entry to ``EXTRACTORS``.
 """
 
 from functools import partial
@@ -26,15 +26,15 @@ _CHECKPOINT = ("config.yaml", "model.ckpt")
 EXTRACTORS: dict[str, ExtractorSpec] = {
     "rangenet53": ExtractorSpec(
         "FRD", "range image", 4096, ("darknet53-1024",), _SEGMENTER, _BONNETAL, _SEMANTIC_KITTI,
-        partial(bonnetal.load, pool="subsample"), "r2flow",
+        partial(bonnetal.load_bonnetal, pool="subsample"), "r2flow",
     ),
     "rangenet21": ExtractorSpec(
         "FRD", "range image", 4096, ("darknet21",), _SEGMENTER, _BONNETAL, _SEMANTIC_KITTI,
-        partial(bonnetal.load, pool="subsample"), bonnetal.OWN_GRID,
+        partial(bonnetal.load_bonnetal, pool="subsample"), bonnetal.OWN_GRID,
     ),
     "squeezeseg": ExtractorSpec(
         "FRD", "range image", 64, ("squeezeseg",), _SEGMENTER, _BONNETAL, _SEMANTIC_KITTI,
-        partial(bonnetal.load, pool="returns"), bonnetal.OWN_GRID,
+        partial(bonnetal.load_bonnetal, pool="returns"), bonnetal.OWN_GRID,
     ),
     "lidm_rangenet": ExtractorSpec(
         "FRID", "range image", 512, ("rangenet",), ("config.yaml", "backbone", "segmentation_decoder"), _LIDM,
@@ -42,29 +42,29 @@ EXTRACTORS: dict[str, ExtractorSpec] = {
     ),
     "r2flow_rangenet": ExtractorSpec(
         "FRID", "range image", 512, ("rangenet21_lidm",), _SEGMENTER, _R2FLOW, _UNSTATED,
-        partial(bonnetal.load, pool="bands", project="R2Flow"), "r2flow",
+        partial(bonnetal.load_bonnetal, pool="bands", project="R2Flow"), "r2flow",
     ),
     "r3dpa_rangevit": ExtractorSpec(
-        "FRID", "range image", 1024, ("rangevit_wo_i",), _CHECKPOINT, _R3DPA, _UNSTATED, rangevit.load, "r3dpa"
+        "FRID", "range image", 1024, ("rangevit_wo_i",), _CHECKPOINT, _R3DPA, _UNSTATED, rangevit.load_rangevit, "r3dpa"
     ),
     "r3dpa_rangevit_remission": ExtractorSpec(
-        "FRD", "range image", 1024, ("rangevit_w_i",), _CHECKPOINT, _R3DPA, _UNSTATED, rangevit.load, "r3dpa"
+        "FRD", "range image", 1024, ("rangevit_w_i",), _CHECKPOINT, _R3DPA, _UNSTATED, rangevit.load_rangevit, "r3dpa"
     ),
     "sparenet_pointnet": ExtractorSpec(
         "FPD", "cloud", 1808, ("cls_model_39.pth",), ("cls_model_39.pth",),
-        "https://github.com/microsoft/SpareNet, Frechet/cls_model_39.pth", "MIT; trained on ShapeNet", pointnet.load,
-        "r2flow", git_blob="c9e80093a093d5667e9aa705d87d923df50f1c25",
+        "https://github.com/microsoft/SpareNet, Frechet/cls_model_39.pth", "MIT; trained on ShapeNet",
+        pointnet.load_pointnet, "r2flow", git_blob="c9e80093a093d5667e9aa705d87d923df50f1c25",
     ),
     "lidm_minkowski": ExtractorSpec(
         "FSVD", "cloud", 768, ("minkowskinet", "minkowskinet_lidm"), _CHECKPOINT, f"{_LIDM}; or {_R2FLOW}", _UNSTATED,
-        partial(voxel_networks.load, network="minkowski"), "lidm",
+        partial(voxel_networks.load_voxel_network, network="minkowski"), "lidm",
     ),
     "lidm_spvcnn": ExtractorSpec(
         "FPVD", "cloud", 768, ("spvcnn", "spvcnn_lidm"), _CHECKPOINT, f"{_LIDM}; or {_R2FLOW}", _UNSTATED,
-        partial(voxel_networks.load, network="spvcnn"), "lidm",
+        partial(voxel_networks.load_voxel_network, network="spvcnn"), "lidm",
     ),
     "liploc": ExtractorSpec(
-        "FLD", "range image", 2048, ("liploc",), _CHECKPOINT, _R3DPA, _UNSTATED, liploc.load, "r3dpa"
+        "FLD", "range image", 2048, ("liploc",), _CHECKPOINT, _R3DPA, _UNSTATED, liploc.load_liploc, "r3dpa"
     ),
 }  # fmt: skip
 """Extractors by name."""

@@ -148,7 +148,7 @@ POOLS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 """``(features (C, H, W), input (C, H, W)) -> (D,)``."""
 
 
-def load(path: Path, prepared: str, pool: str, project: str = "lidar-bonnetal") -> PerScan:
+def load_bonnetal(path: Path, prepared: str, pool: str, project: str = "lidar-bonnetal") -> PerScan:
     """An extractor from an archive; see ``load_extractor``.
 
     Args:

@@ -35,7 +35,7 @@ def picture(depth: Tensor) -> Tensor:
     return (resized - torch.tensor(MEAN)[:, None, None]) / torch.tensor(DEVIATION)[:, None, None]
 
 
-def load(path: Path, prepared: str) -> PerScan:
+def load_liploc(path: Path, prepared: str) -> PerScan:
     """An extractor from R3DPA's archive, with ``config.yaml`` and ``model.ckpt``; see ``load_extractor``.
 
     Raises:

@@ -98,7 +98,7 @@ class PointNet(nn.Module):
         return torch.cat([pooled, first, second, self.fc3(second)], 1)
 
 
-def load(path: Path, prepared: str) -> PerScan:
+def load_pointnet(path: Path, prepared: str) -> PerScan:
     """The published network as an extractor; see ``load_extractor``."""
     network = PointNet()
     load_weights(network, load_pickle(path, "SpareNet"), str(path))

@@ -214,7 +214,7 @@ def build(settings: Mapping[str, Any]) -> RangeViT:
         raise ConfigError(f"config.yaml lacks or misstates {error}", "the settings of R3DPA's RangeViT") from error
 
 
-def load(path: Path, prepared: str) -> PerScan:
+def load_rangevit(path: Path, prepared: str) -> PerScan:
     """An extractor from R3DPA's archive, with ``config.yaml`` and ``model.ckpt``; see ``load_extractor``."""
     archive = Archive(path, "R3DPA")
     network = build(archive.yaml("config.yaml"))

@@ -177,7 +177,7 @@ NETWORKS = {"minkowski": MinkowskiNet, "spvcnn": SPVCNN}
 """Networks by name."""
 
 
-def load(path: Path, prepared: str, network: str) -> PerScan:
+def load_voxel_network(path: Path, prepared: str, network: str) -> PerScan:
     """An extractor from the archive of LiDM or of R2Flow; see ``load_extractor``.
 
     Args:

@@ -3,7 +3,8 @@
 A ring is continued over the hole from both sides. If both are one surface, its horizontal distance rho is interpolated:
 on the ground 1 / rho linearly in azimuth, else as on a plane wall, 1 / rho = a cos(azimuth) + b sin(azimuth). Otherwise
 each side is continued to the middle. Deviations from it, lost returns, reflectance and labels are copied from the rays
-beside the hole, mirrored at its edge.
+beside the hole, mirrored at its edge. Nothing but ground can be where the object stood; an estimate there is moved to
+where the ray leaves that place.
 """
 
 import numba
@@ -24,6 +25,9 @@ FRONT = 0.5
 SAME = 0.2
 """Relative difference of distance below which both sides of a hole are one surface."""
 
+WIDE = 1.5
+"""Radians from which on a hole is too wide for a wall that only one of its sides shows."""
+
 _BASE = 12  # rays between the two places that give the direction of a wall
 _SMOOTH = 2  # rays to either side over which a distance is averaged
 
@@ -32,6 +36,7 @@ def continued(
     rays: ScanRays,
     hole: NDArray[np.bool_],
     near: NDArray[np.float64],
+    far: NDArray[np.float64],
     ground: NDArray[np.bool_],
     thing: NDArray[np.bool_],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -41,6 +46,7 @@ def continued(
         rays: E rays.
         hole: (E,) True for rays of the hole.
         near: (E,) horizontal distance of the removed object at rays of the hole, metres.
+        far: (E,) horizontal distance at which the ray leaves the place of the object, 0 = it does not pass through it.
         ground: (E,) True for returns of the ground, which may lie in front of the object.
         thing: (E,) True for returns of other objects, which do not continue behind it.
 
@@ -53,14 +59,14 @@ def continued(
     for first, stop in zip(rays.start[:-1].tolist(), rays.start[1:].tolist(), strict=True):
         part = slice(first, stop)
         if hole[part].any() and not hole[part].all():
-            given = hole[part], known[part], rays.rho[part], near[part], ground[part], thing[part]
+            given = hole[part], known[part], rays.rho[part], near[part], far[part], ground[part], thing[part]
             _ring(rays.step, *given, donor[part], rho[part])
             donor[part] += first * (donor[part] >= 0)
     return donor, rho
 
 
 @numba.njit(cache=True)
-def _ring(step, hole, known, rho, near, ground, thing, donor, out):  # type: ignore[no-untyped-def]
+def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type: ignore[no-untyped-def]
     """Fill the holes of one ring, whose last ray is followed by its first."""
     count = len(hole)
     left, right = np.empty(SIDE, np.int64), np.empty(SIDE, np.int64)
@@ -75,9 +81,10 @@ def _ring(step, hole, known, rho, near, ground, thing, donor, out):  # type: ign
         m = _side(hole, known, rho, ground, thing, (i + length) % count, 1, limit, right)
         a, b = _edge(known, rho, left, n), _edge(known, rho, right, m)
         turn = (length + 1 + 2 * _SMOOTH) * step  # from the middle to the middle of the averaged rays
-        flat = ground[left[0]] and ground[right[0]] if n > 0 and m > 0 else False
-        same = min(a, b) > 0 and abs(a - b) < SAME * max(a, b)
-        if min(a, b) > 0 and not same and turn < 1.5:
+        levels = _level(known, ground, left, n), _level(known, ground, right, m)
+        flat, mixed = levels[0] and levels[1], levels[0] != levels[1]
+        same = min(a, b) > 0 and abs(a - b) < SAME * max(a, b) and (turn < WIDE or not mixed)
+        if min(a, b) > 0 and not same and turn < WIDE:
             same = abs(_ahead(known, rho, left, n, step, turn) - b) < SAME * b
             same |= abs(_ahead(known, rho, right, m, step, turn) - a) < SAME * a
         for k in range(length):
@@ -101,6 +108,8 @@ def _ring(step, hole, known, rho, near, ground, thing, donor, out):  # type: ign
             smooth = _edge(known, rho, side[at - around : at + around + 1], -1)
             jump = abs(smooth - edge) > SAME * edge  # the source is of another surface than the edge
             out[j] = rho[source] if jump else base * rho[source] / smooth
+            if mixed or not ground[source]:  # ground continued towards a wall rises
+                out[j] = max(out[j], far[j])
 
 
 @numba.njit(cache=True)
@@ -142,3 +151,12 @@ def _edge(known, rho, side, size):  # type: ignore[no-untyped-def]
             if size >= 0 and found == 2 * _SMOOTH + 1:
                 break
     return np.median(values[:found]) if found else 0.0
+
+
+@numba.njit(cache=True)
+def _level(known, ground, side, size):  # type: ignore[no-untyped-def]
+    """Whether the first return on a side is one of the ground."""
+    for i in side[:size]:
+        if known[i]:
+            return ground[i]
+    return False

@@ -40,6 +40,10 @@ class ScanRays(NamedTuple):
 
     def through(self, box: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(E,) whether each ray passes through a box (7,)."""
+        return np.asarray(self.leaving(box) > 0)
+
+    def leaving(self, box: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(E,) horizontal distance at which each ray leaves a box (7,), metres; 0 = it does not pass through."""
         c, s = np.cos(float(box[6])), np.sin(float(box[6]))
         dx, dy = np.cos(self.azimuth), -np.sin(self.azimuth)
         origin = (-box[0] * c - box[1] * s, box[0] * s - box[1] * c, self.height - box[2])
@@ -49,7 +53,7 @@ class ScanRays(NamedTuple):
             d = np.where(np.abs(d) < 1e-9, 1e-9, d)
             a, b = (-size / 2 - o) / d, (size / 2 - o) / d
             enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
-        return np.asarray(enter <= leave)
+        return np.where(enter <= leave, leave, 0.0)
 
 
 def rays_of_scan(scan: Scan) -> ScanRays:

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.labels.boxes import grown, widened
 from lidar_synth.labels.edit.compose import composed
 from lidar_synth.labels.edit.fill import continued
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
 from lidar_synth.labels.edit.redraw import Model, open_model, redrawn
-from lidar_synth.labels.ground import FLOOR, GROUND, ground_under, standing
+from lidar_synth.labels.ground import CLEARANCE, FLOOR, GROUND, ground_under, standing
 from lidar_synth.labels.objects import NOISE, THINGS, belonging
 
 if TYPE_CHECKING:
@@ -144,15 +145,16 @@ def without(
         return scan
     rays = rays_of_scan(scan)
     there = rays.point >= 0
-    hole, near = there & removed[rays.point], np.full(len(there), np.inf)
+    hole, near, far = there & removed[rays.point], np.full(len(there), np.inf), np.zeros(len(there))
     near[hole] = rays.rho[hole]
     for mine, box in parts:
         if mine.any():
-            grown = box + np.array([0, 0, 0, *3 * [2 * MARGIN], 0], np.float32)
-            absorbed = ~there & rays.through(grown)
+            absorbed = ~there & rays.through(box + np.array([0, 0, 0, *3 * [2 * MARGIN], 0], np.float32))
             near[absorbed] = np.minimum(near[absorbed], np.hypot(*scan.points[mine, :2].T).min())
             hole |= absorbed
-    donor, rho = continued(rays, hole, near, _ground(scan, rays), _things(scan, rays))
+            place = widened(grown(box, scan.points[mine]), CLEARANCE + MARGIN)
+            far = np.maximum(far, rays.leaving(place))
+    donor, rho = continued(rays, hole, near, far, _ground(scan, rays), _things(scan, rays))
     which = np.flatnonzero(hole & (donor >= 0))
     filled = _copies(scan, rays, which, donor[which], rho[which])
     if model is not None:
