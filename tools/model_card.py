@@ -6,9 +6,10 @@
         "teacher, 4 steps=RUN/town_teacher.safetensors:4" --pictures docs/models
 
 Every model generates scans from the same noise. They are compared with scans of a town that no model was trained on
-(seed 1), on the grid of its sensor; a denser scan is projected to it. The first row is a third town (seed 2): real against real, the lower bound. With STEPS = 0 a row has the third
-town's scans, encoded and decoded by the model's autoencoder: the lower bound for its flow. With the checkpoint of a
-WEAKER model the flow is autoguided from t = HIGH to LOW, as the teacher of a student is.
+(seed 1), on the grid of its sensor; a denser scan is projected to it. The first row is a third town (seed 2): real
+against real, the lower bound. With STEPS = 0 a row has the third town's scans, encoded and decoded by the model's
+autoencoder: the lower bound for its flow. With the checkpoint of a WEAKER model the flow is autoguided from t = HIGH to
+LOW, as the teacher of a student is.
 
 tools/condition_card.py is for conditional models.
 """
