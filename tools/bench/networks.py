@@ -3,8 +3,7 @@
     python tools/bench/networks.py [--rounds N] [--threads N] [--model FILE.safetensors]
 
 On a CPU: seconds of one evaluation, its rate relative to the product's, a profile by kind of operation, peak memory. On
-    a
-GPU: scans per second by batch, latency of one scan, rate relative to the product's, the errors of bfloat16 and TF32.
+a GPU: scans per second by batch, latency of one scan, rate relative to the product's, the errors of bfloat16 and TF32.
 Rates count the operations that the network needs, not those of an implementation. The weights are random unless a
 checkpoint of the same size is given; errors in metres are meaningful only with trained ones.
 """
