@@ -212,6 +212,7 @@ class RangeImage:
         sensor: the sensor that defines the rows and columns.
         channels: {name: (H, W)}, further values of each cell. Channels named in ``POINT_FIELDS`` become fields of the
             scan when the image is unprojected. A cell without a return holds 0, and 255 (ignore) in ``label``.
+        boxes: of the objects, which become those of the scan.
 
     Raises:
         DataError: on a shape that is not the sensor's.
@@ -229,6 +230,7 @@ class RangeImage:
     range: NDArray[np.float32]
     sensor: Sensor
     channels: dict[str, NDArray[Any]] = field(default_factory=dict)
+    boxes: Boxes | None = None
 
     def __post_init__(self) -> None:
         for name, values in {"range": self.range, **self.channels}.items():

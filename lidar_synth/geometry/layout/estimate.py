@@ -43,10 +43,10 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
     labelled = scan.label is not None and bool((scan.label != IGNORE).any())
     ground = _plane(scan.points[np.isin(scan.label, _GROUND)] if labelled else _lowest(scan.points), scan.id)
     outlines = list(_labelled(scan) if labelled else _unlabelled(scan, ground))
-    return Layout(_known(scan.boxes), ground, outlines, reach or scan.sensor.range_max, scan.id)
+    return Layout(known_boxes(scan.boxes), ground, outlines, reach or scan.sensor.range_max, scan.id)
 
 
-def _known(boxes: Boxes) -> Boxes:
+def known_boxes(boxes: Boxes) -> Boxes:
     """The boxes of known classes; of overlapping ones the first, and none around the sensor."""
     keep = np.isin(np.array(boxes.names, "U32"), CLASSES) & ~boxes.contain(np.zeros((1, 3), np.float32)).any(1)
     boxes = boxes[keep]
