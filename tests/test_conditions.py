@@ -20,7 +20,7 @@ from lidar_synth.flow.path import guided
 from lidar_synth.generate.conditions import CONDITIONS, batch_of, blank, one_view
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.models import NETWORKS, build_network, encoders_of
 from lidar_synth.models.encoders.calibrated_camera import SightEncoder
@@ -46,7 +46,10 @@ def picture(path: Path, size: tuple[int, int] = (40, 80), seed: int = 0) -> Path
 
 
 def some_scan(tmp_path: Path, seed: int = 0) -> Scan:
-    return replace(random_scan(SENSOR, 400, seed), image_path=picture(tmp_path / f"{seed}.png", seed=seed))
+    scan = random_scan(SENSOR, 400, seed)
+    scan.points[:100, 2], scan.label[:100] = -1.7, 8  # some of it is a road
+    boxes = Boxes(np.float32([[12, 3, -0.9, 4, 2, 1.6, 0.4]]), ("Car",))
+    return replace(scan, boxes=boxes, image_path=picture(tmp_path / f"{seed}.png", seed=seed))
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
@@ -55,6 +58,7 @@ def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_p
     encoder = {
         "semantic": lambda: build_network("semantic_map", {"resolution": (8, 32), "target": (4, 16)}),
         "camera": lambda: build_network("views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)}),
+        "layout": lambda: build_network("layout", {"resolution": (8, 32), "target": (4, 16), "channels": 7}),
     }[name]()
     shape = condition.shape(encoder)
     values = condition.read(scan, SENSOR, shape, OPTIONS)
@@ -62,7 +66,7 @@ def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_p
     given = batch_of(name, scan, 3, SENSOR, shape, OPTIONS)
     assert torch.equal(given, torch.from_numpy(values).expand(3, *shape))
     encoded = encoder(given)
-    assert encoded.shape == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5)}[name]
+    assert encoded.shape == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5), "layout": (3, 7, 4, 16)}[name]
     assert (blank(name, given) == condition.blank).all()
     assert set(encoders_of(name)) <= set(NETWORKS)
 

@@ -7,13 +7,14 @@ file of a bank, ``layout`` validates what such a file declares, ``storage`` read
 """
 
 from lidar_synth.bank.encoding import Encoding
-from lidar_synth.bank.index import FORMAT, INDEX, Entry, Facts, Index
+from lidar_synth.bank.index import BOXED_FORMAT, FORMAT, INDEX, Entry, Facts, Index
 from lidar_synth.bank.reader import Bank, is_bank
 from lidar_synth.bank.shard import ShardReader
 from lidar_synth.bank.storage import is_url
 from lidar_synth.bank.writer import ShardWriter
 
 __all__ = [
+    "BOXED_FORMAT",
     "FORMAT",
     "INDEX",
     "Bank",

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.layout.layout import CLASSES, Layout, Outline, overlaps
+from lidar_synth.geometry.layout.layout import CLASSES, Layout, Outline, around_sensor, overlaps
 from lidar_synth.geometry.scan import Boxes, Scan
 
 KINDS = {"building": ("building",), "vegetation": ("vegetation", "trunk"), "fence": ("fence",)}
@@ -48,7 +48,7 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
 
 def known_boxes(boxes: Boxes) -> Boxes:
     """The boxes of known classes; of overlapping ones the first, and none around the sensor."""
-    keep = np.isin(np.array(boxes.names, "U32"), CLASSES) & ~boxes.contain(np.zeros((1, 3), np.float32)).any(1)
+    keep = np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)
     boxes = boxes[keep]
     later = {j for _, j in overlaps(boxes)}
     return boxes[[i for i in range(len(boxes)) if i not in later]] if later else boxes

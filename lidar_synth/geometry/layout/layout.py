@@ -5,7 +5,7 @@ of it, and its boxes are the boxes of that scan.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,8 +113,8 @@ class Layout:
             raise self._error(f"ground {tuple(self.ground)}", "-10 to -0.2 m, and a rise of at most 0.3 per metre")
         if not 0 < self.reach < _FAR:
             raise self._error(f"ground up to {self.reach} m", "metres above 0")
-        if len(self.boxes) and (around := self.boxes.contain(np.zeros((1, 3), np.float32)).any(1)).any():
-            raise self._error(f"box {int(np.flatnonzero(around)[0])} around the sensor", "boxes beside the sensor")
+        if (around := around_sensor(self.boxes)).any():
+            raise self._error(f"box {int(around.argmax())} around the sensor", "boxes beside the sensor")
         for i, j in overlaps(self.boxes):
             names = f"{self.boxes.names[i]} and {self.boxes.names[j]}"
             raise self._error(
@@ -129,6 +129,12 @@ class Layout:
         narrow = self.boxes.values[:, 4] < NARROW
         names = ["Motorcyclist" if n == "Misc" and s else n for n, s in zip(self.boxes.names, narrow, strict=True)]
         return np.array([CODES[name] for name in names], np.uint8)
+
+
+def around_sensor(boxes: Boxes) -> NDArray[np.bool_]:
+    """(M,) whether the sensor is in, above or below a box."""
+    level = replace(boxes, values=boxes.values * np.float32([1, 1, 0, 1, 1, 1, 1]))
+    return level.contain(np.zeros((1, 3), np.float32))[:, 0]
 
 
 def overlaps(boxes: Boxes, margin: float = OVERLAP) -> list[tuple[int, int]]:
