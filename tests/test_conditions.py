@@ -1,7 +1,7 @@
 """Conditions: from users and from real scans, their encoders, training, and invalid input."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import random_scan
+from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
 
@@ -224,8 +225,13 @@ def test_an_invalid_calibration_is_refused() -> None:
 
 def conditioned_batches(tmp_path: Path, name: str, **options: Any) -> Batches:
     scans = [some_scan(tmp_path, seed) for seed in range(4)]
-    others = {"camera": Other(CAMERA_SHAPE, lambda s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS))}
-    about = {key: options.pop(key) for key in ("dropout", "view_dropout") if key in options}
+    shapes = {"camera": CAMERA_SHAPE, "layout": (5, *SENSOR.shape)}
+
+    def reader(kind: str) -> Callable[[Scan], NDArray[np.uint8]]:
+        return lambda scan: CONDITIONS[kind].read(scan, SENSOR, shapes[kind], OPTIONS)
+
+    others = {kind: Other(shape, reader(kind)) for kind, shape in shapes.items()}
+    about = {key: options.pop(key) for key in ("dropout", "reduction") if key in options}
     cache = cache_scans(scans, SENSOR, ["range", "label"], progress=False, others=others)
     return Batches(cache, TENSORS, 3, conditioning=Conditioning(name, views=2, **about), **options)
 
@@ -266,8 +272,8 @@ def test_dropout_blanks_only_its_share_of_the_conditions(name: str, tmp_path: Pa
     assert torch.equal(a.cond[~is_blank], b.cond[~is_blank])
 
 
-def test_view_dropout_keeps_one_view(tmp_path: Path) -> None:
-    cond = conditioned_batches(tmp_path, "camera", view_dropout=0.5)(range(60)).cond
+def test_a_reduced_camera_image_keeps_one_view(tmp_path: Path) -> None:
+    cond = conditioned_batches(tmp_path, "camera", reduction=0.5)(range(60)).cond
     assert cond is not None
     left, right = (cond[..., :32] == 0).flatten(1).all(1), (cond[..., 32:] == 0).flatten(1).all(1)
     assert 15 <= int(left.sum()) <= 45

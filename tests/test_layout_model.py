@@ -9,6 +9,7 @@ import pytest
 import torch
 from bakes import COUNT, files, plan_in
 from small_models import SENSOR, write
+from test_conditions import conditioned_batches
 from torch.utils.data import DataLoader
 from typer.testing import CliRunner
 
@@ -142,7 +143,9 @@ def test_banks_with_boxes_are_split_merged_and_repaired(bank: Path, model: Path,
             assert again[i].boxes.names == opened[i].boxes.names  # type: ignore[union-attr]
             assert np.array_equal(again[i].boxes.values, opened[i].boxes.values)  # type: ignore[union-attr]
     before, damaged = files(tmp_path / "both"), tmp_path / "both" / "shard-00000.h5"
-    damaged.write_bytes(damaged.read_bytes()[:-100])
+    content = damaged.read_bytes()
+    damaged.unlink()  # a link to the shard of the first bank
+    damaged.write_bytes(content[:-100])
     assert verify(tmp_path / "both", progress=False)
     repair(tmp_path / "both", str(model), progress=False)
     assert files(tmp_path / "both") == before
@@ -156,8 +159,7 @@ def test_banks_with_boxes_are_split_merged_and_repaired(bank: Path, model: Path,
 def test_a_detector_gets_boxes_from_the_bank_and_from_the_generator(bank: Path, model: Path, folder: Path) -> None:
     generator, layouts = generated(model, folder)
     for source in (Bank(bank), Generated(generator, seed=4, condition=layouts)):
-        policy = make_policy("boxes", fields=source.fields)
-        mixed = MixedScans([], source, ratio=1.0, labels=policy, epoch_size=6, unboxed="keep", compare=False)
+        mixed = MixedScans(None, source, 1.0, labels="boxes", epoch_size=6, unboxed="keep", compare=False)
         batches = list(DataLoader(mixed, batch_size=3, collate_fn=mixed.collate))
         assert sum(len(batch["boxes"]) for batch in batches) > 0
         assert {name for batch in batches for names in batch["names"] for name in names} <= {"Truck", "Car", "Tram"}
@@ -216,3 +218,14 @@ def test_ground_in_a_box_belongs_to_no_object() -> None:
     scan = unproject(made)
     assert scan.boxes is not None and len(scan.boxes) == 1 and scan.instance is not None
     assert (scan.instance > 0).any() and (scan.label[scan.instance > 0] == 0).all()  # type: ignore[index]
+
+
+def test_a_reduced_layout_keeps_its_boxes_and_stays_with_its_scan(tmp_path: Path) -> None:
+    plain, less = (conditioned_batches(tmp_path, "layout", reduction=r, flip=True, roll=True) for r in (0.0, 0.5))
+    a, b = plain(range(60)).cond, less(range(60)).cond
+    assert a is not None and b is not None
+    boxed = a[:, 0] > 4
+    assert boxed.any() and torch.equal(boxed, b[:, 0] > 4)
+    changed = (a != b).flatten(1).any(1)
+    assert 15 <= int(changed.sum()) <= 45
+    assert (b[changed] <= a[changed]).all()

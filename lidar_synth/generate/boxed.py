@@ -17,7 +17,8 @@ TOLERANCE = 0.1
 FIELDS = frozenset(("boxes", "instance"))
 """What the scans of a layout have besides those of other models."""
 
-_GROUND = [TRAIN_ID[name] for name in ("road", "parking", "sidewalk", "other-ground", "terrain")]
+GROUND = [TRAIN_ID[name] for name in ("road", "parking", "sidewalk", "other-ground", "terrain")]
+"""Train ids of returns that belong to no box."""
 
 
 def boxes_of(given: Any, count: int) -> list[Boxes] | None:
@@ -42,7 +43,7 @@ def with_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
     wide = replace(boxes, values=boxes.values + np.float32([0, 0, 0, *3 * [2 * TOLERANCE], 0]))
     inside = wide.contain(scan.points)
     if scan.label is not None:
-        inside &= ~np.isin(scan.label, _GROUND)
+        inside &= ~np.isin(scan.label, GROUND)
     held = inside.any(1)
     kept, inside = boxes[held], inside[held]
     kept = replace(kept, instance=np.arange(1, len(kept) + 1, dtype=np.int32))
