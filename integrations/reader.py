@@ -129,7 +129,7 @@ class Bank:
         points = metres[seen][:, None] * self._directions[seen]
         points[:, 2] += self._starts[seen.nonzero()[0]]
         rows = images.pop("boxes", None)
-        fields = {"reflectance": np.zeros(len(points), np.float32), **{n: v[seen] for n, v in images.items()}}
+        fields: Any = {"reflectance": np.zeros(len(points), np.float32), **{n: v[seen] for n, v in images.items()}}
         fields["id"] = f"{self._sources[entry['source']]['model']}/{entry['seed']}/{entry['first'] + position}"
         if rows is not None:
             fields["boxes"] = (rows[:, 2:] * np.array([*6 * [1e-4], 1e-5])).astype(np.float32)

@@ -32,13 +32,14 @@ LIMITS = {
     "docs/how-to/measure.md": 270,
     "docs/how-to/train-a-generator.md": 380,
     "docs/how-to/edit.md": 160,
+    "docs/how-to/layouts.md": 150,
     "docs/how-to/bake.md": 320,
     "docs/how-to/look.md": 130,
     "docs/how-to/prove.md": 180,
     "docs/reference/api.md": 40,
     "docs/reference/command-line.md": 30,
     "docs/reference/recipes.md": 80,
-    "docs/bank-format.md": 320,
+    "docs/bank-format.md": 350,
     "docs/reference/descriptions.md": 230,
     "docs/reliability.md": 220,
     "docs/explanation/method.md": 320,
@@ -53,7 +54,7 @@ LIMITS = {
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 8000
+MAIN_PATH = 8170
 """Words of all pages of docs/ on the main path."""
 
 PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if not {"research", "notebooks"} & set(p.parts)]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lidar_synth import Layout, Town, layout_of, load_layout, load_sensor
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.evaluate.layouts import layout_agreement, rays_of_boxes
 from lidar_synth.geometry.layout import CODES, Outline, layout_image
 from lidar_synth.geometry.layout.layout import overlaps
 from lidar_synth.geometry.layout.raster import depth_of
@@ -173,6 +174,20 @@ def test_a_scan_without_labels_has_ground_and_outlines(town: Any) -> None:
         layout_of(replace(town, boxes=None))
     with pytest.raises(DataError, match="returns of the ground"):
         layout_of(town[town.points[:, 2] > 0])
+
+
+def test_a_scan_agrees_with_its_own_layout_and_not_with_another(town: Any) -> None:
+    layout = layout_of(town)
+    found = layout_agreement([town], [layout], [town])
+    assert found.inside_share > 0.99 and found.kept_share == 1 and found.points > 100
+    assert 0.5 < found.filled_share <= 1 and 0 < found.seen <= found.boxes <= len(layout.boxes)
+    turned_away = replace(layout, boxes=turned(layout.boxes, np.pi / 2))
+    other = layout_agreement([town], [turned_away], [town])
+    assert other.inside_share < 0.5 and other.points == found.points
+    with pytest.raises(DataError, match="has no labels"):
+        layout_agreement([replace(town, label=None)], [layout], [town])
+    image = layout_image(layout, town.sensor)
+    assert abs(rays_of_boxes(layout, town.sensor).sum() / (image[0] >= CODES["Car"]).sum() - 1) < 0.05
 
 
 GOOD = """

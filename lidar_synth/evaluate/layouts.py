@@ -2,7 +2,6 @@
 nothing of their classes lie elsewhere?"""
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ from lidar_synth.labels.edit.unboxed import BOXED
 LEAST_RAYS, LEAST_POINTS = 20, 10
 """A box that so many rays meet first should hold so many points."""
 
-_SURFACE = np.float32([0, 0, 0, 0.01, 0.01, 0.01, 0])  # metres; the depth of an image has steps of 2 mm
+_SURFACE = 0.005  # metres; the depth of an image has steps of 2 mm
 
 
 class LayoutAgreement(NamedTuple):
@@ -64,7 +63,7 @@ def rays_of_boxes(layout: Layout, sensor: Sensor) -> NDArray[np.int64]:
     points = depth_of(image)[seen][:, None] * sensor.ray_directions()[seen]
     if len(sensor.starts):
         points[:, 2] += sensor.starts[np.nonzero(seen)[0]]
-    near = replace(layout.boxes, values=layout.boxes.values + _SURFACE).contain(points)
+    near = layout.boxes.enlarged(_SURFACE).contain(points)
     return np.asarray(near.sum(1), np.int64)
 
 
@@ -80,18 +79,20 @@ def layout_agreement(scans: Iterable[Scan], layouts: Iterable[Layout], own: Iter
     """
     total = np.zeros(6, np.int64)
     for scan, layout, real in zip(scans, layouts, own, strict=True):
-        inside, boxed = _inside(layout, scan), np.isin(scan.label, BOXED)
-        full = (inside & ~np.isin(scan.label, GROUND)).sum(1) >= LEAST_POINTS
+        inside, boxed, points = _inside(layout, scan)
+        full = points >= LEAST_POINTS
         visible = rays_of_boxes(layout, scan.sensor) >= LEAST_RAYS
-        seen = (_inside(layout, real) & ~np.isin(real.label, GROUND)).sum(1) >= LEAST_RAYS
+        seen = _inside(layout, real)[2] >= LEAST_RAYS
         boxes = (visible.sum(), (visible & full).sum(), seen.sum(), (seen & full).sum())
-        total += (boxed.sum(), inside.any(0)[boxed].sum(), *boxes)
+        total += (boxed.sum(), inside[boxed].sum(), *boxes)
     return LayoutAgreement(*total.tolist())
 
 
-def _inside(layout: Layout, scan: Scan) -> NDArray[np.bool_]:
-    """(M, N) which points lie in each box, with the tolerance."""
+def _inside(layout: Layout, scan: Scan) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.int64]]:
+    """(N,) points in a box, with the tolerance; (N,) points of boxed classes; (M,) number of points in each box, without
+    those of the ground."""
     if scan.label is None:
         raise DataError(f"scan {scan.id!r} has no labels", "labels, to compare it with its layout")
-    wide = layout.boxes.values + np.float32([0, 0, 0, *3 * [2 * TOLERANCE], 0])
-    return replace(layout.boxes, values=wide).contain(scan.points)
+    inside = layout.boxes.enlarged(TOLERANCE).contain(scan.points)
+    points: NDArray[np.int64] = (inside & ~np.isin(scan.label, GROUND)[None]).sum(1)
+    return np.asarray(inside.any(0)), np.isin(scan.label, BOXED), points

@@ -40,8 +40,7 @@ def with_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
     """An image with those boxes that hold a return, and the channel ``instance``: 1 for the returns in the first of
     them, and so on; 0 = none. Returns of the ground belong to no box."""
     scan = unproject(image)
-    wide = replace(boxes, values=boxes.values + np.float32([0, 0, 0, *3 * [2 * TOLERANCE], 0]))
-    inside = wide.contain(scan.points)
+    inside = boxes.enlarged(TOLERANCE).contain(scan.points)
     if scan.label is not None:
         inside &= ~np.isin(scan.label, GROUND)
     held = inside.any(1)

@@ -87,6 +87,11 @@ class Boxes:
         picked = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name not in ("names", "dont_care")}
         return replace(self, names=tuple(self.names[i] for i in keep), **picked)
 
+    def enlarged(self, margin: float) -> "Boxes":
+        """The boxes with a margin in metres on all six sides."""
+        added = np.array([0, 0, 0, 2 * margin, 2 * margin, 2 * margin, 0], np.float32)
+        return replace(self, values=self.values + added)
+
     def corners(self) -> NDArray[np.float32]:
         """(M, 8, 3) corners in metres: the four of the bottom counter-clockwise from front left, then the top's."""
         unit = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2

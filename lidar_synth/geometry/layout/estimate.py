@@ -40,9 +40,9 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
     """
     if scan.boxes is None:
         raise DataError(f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects")
-    labelled = scan.label is not None and bool((scan.label != IGNORE).any())
-    ground = _plane(scan.points[np.isin(scan.label, _GROUND)] if labelled else _lowest(scan.points), scan.id)
-    outlines = list(_labelled(scan) if labelled else _unlabelled(scan, ground))
+    label = scan.label if scan.label is not None and (scan.label != IGNORE).any() else None
+    ground = _plane(_lowest(scan.points) if label is None else scan.points[np.isin(label, _GROUND)], scan.id)
+    outlines = list(_unlabelled(scan, ground) if label is None else _labelled(scan.points, label))
     return Layout(known_boxes(scan.boxes), ground, outlines, reach or scan.sensor.range_max, scan.id)
 
 
@@ -80,9 +80,9 @@ def _lowest(points: NDArray[np.float32]) -> NDArray[np.float32]:
     return below[order[first]]
 
 
-def _labelled(scan: Scan) -> Iterator[Outline]:
+def _labelled(points: NDArray[np.float32], label: NDArray[np.uint8]) -> Iterator[Outline]:
     for kind, classes in KINDS.items():
-        for profile in _profiles(scan.points[np.isin(scan.label, [TRAIN_ID[name] for name in classes])]):
+        for profile in _profiles(points[np.isin(label, [TRAIN_ID[name] for name in classes])]):
             yield Outline(kind, profile[:, :2], profile[:, 2], profile[:, 3])
 
 

@@ -88,7 +88,10 @@ def load_layout(path: str | Path) -> Layout:
         raise ConfigError(f"{path}: {where}: {first['msg']}", "ground, reach, objects and outlines") from error
     rows = [_box(one, given.ground, path) for one in given.objects]
     boxes = Boxes(np.array(rows, np.float32).reshape(-1, 7), tuple(NAMES.get(o.kind, o.kind) for o in given.objects))
-    walls = [Outline(w.kind, np.float32(w.line), given.ground + w.low, given.ground + w.height) for w in given.outlines]
+    walls = [
+        Outline(w.kind, np.array(w.line, np.float32), given.ground + w.low, given.ground + w.height)
+        for w in given.outlines
+    ]
     return Layout(boxes, (given.ground, 0.0, 0.0), walls, given.reach, path.stem)
 
 

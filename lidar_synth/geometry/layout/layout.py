@@ -108,8 +108,8 @@ class Layout:
         object.__setattr__(self, "outlines", tuple(self.outlines))
         if unknown := sorted(set(self.boxes.names) - set(CLASSES)):
             raise self._error(f"boxes of {', '.join(map(repr, unknown))}", f"classes of {', '.join(CLASSES)}")
-        height, *rise = map(float, self.ground)
-        if not -10 < height < -0.2 or not np.hypot(*rise) <= 0.3:
+        height, rise, across = map(float, self.ground)
+        if not -10 < height < -0.2 or not np.hypot(rise, across) <= 0.3:
             raise self._error(f"ground {tuple(self.ground)}", "-10 to -0.2 m, and a rise of at most 0.3 per metre")
         if not 0 < self.reach < _FAR:
             raise self._error(f"ground up to {self.reach} m", "metres above 0")
@@ -133,7 +133,7 @@ class Layout:
 
 def around_sensor(boxes: Boxes) -> NDArray[np.bool_]:
     """(M,) whether the sensor is in, above or below a box."""
-    level = replace(boxes, values=boxes.values * np.float32([1, 1, 0, 1, 1, 1, 1]))
+    level = replace(boxes, values=boxes.values * np.array([1, 1, 0, 1, 1, 1, 1], np.float32))
     return level.contain(np.zeros((1, 3), np.float32))[:, 0]
 
 

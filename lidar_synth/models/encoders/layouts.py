@@ -72,7 +72,7 @@ class LayoutEncoder(Encoder):
 
     def _features(self, image: Tensor) -> Tensor:
         """(B, F, H, W), channels last in memory."""
-        dtype = self.body[0].weight.dtype
+        dtype = next(self.body.parameters()).dtype
         codes = F.one_hot(image[:, 0].long(), len(CODES)).to(dtype)
         high, low, chord, along = image[:, 1:].float().unbind(1)
         depth = (256 * high + low) * DEPTH_STEP
