@@ -299,8 +299,9 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"labels": "mix"}, "labels='mix'.*generated, condition, none"),
+        ({"labels": "mix"}, "labels='mix'.*generated, condition, boxes, none"),
         ({"label_options": {"kind": "polar"}}, "no option but threshold"),
+        ({"labels": "boxes"}, "labels=.boxes. for a plan file; expected unboxed: keep"),
         ({"labels": "pseudo"}, "labels='pseudo'"),
         ({"synthetic": "town"}, "synthetic: town; expected a bank. lidar-synth bake OUT"),
         ({"unknown": 1}, "settings .'unknown'"),

@@ -89,8 +89,8 @@ def layout_agreement(scans: Iterable[Scan], layouts: Iterable[Layout], own: Iter
 
 
 def _inside(layout: Layout, scan: Scan) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.int64]]:
-    """(N,) points in a box, with the tolerance; (N,) points of boxed classes; (M,) number of points in each box, without
-    those of the ground."""
+    """(N,) points in a box, with the tolerance; (N,) points of boxed classes; (M,) number of points in each box,
+    without those of the ground."""
     if scan.label is None:
         raise DataError(f"scan {scan.id!r} has no labels", "labels, to compare it with its layout")
     inside = layout.boxes.enlarged(TOLERANCE).contain(scan.points)
