@@ -43,6 +43,7 @@ def some_layout(seed: int, count: int = 12, walls: bool = True) -> Layout:
         Outline("building", np.float32([(-40, 18), (5, 20), (40, 15)]), -1.9, np.float32([6, 4, 9])),
         Outline("vegetation", np.float32([(10, -12), (14, -9), (20, -12)]), 0.3, 4.0),
         Outline("fence", np.float32([(-15, -20), (-15, 5)]), -2.0, -0.7),
+        Outline("fence", np.float32([(-30, 10), (30, 11)]), -2.0, -1.2),  # lower than the building behind it
     ]
     names = tuple(rng.choice(NAMES, count).tolist())
     return Layout(Boxes(rows, names), (-1.7, 0.01, -0.02), outlines if walls else (), reach=60.0)
@@ -100,6 +101,13 @@ def test_the_image_is_that_of_walking_along_the_rays(seed: int, sensor: Sensor) 
     assert len(np.unique(code)) > 6
     steps = np.abs(depth_of(image) - depth)[same]
     assert np.quantile(steps, 0.99) < 0.06  # the walk stops after the surface, and grazes the ground later
+
+
+def test_the_ground_hides_no_box() -> None:
+    layout, sensor = some_layout(1, walls=False), load_sensor("hdl64e_lasers")
+    boxed = [layout_image(replace(layout, ground=(z, 0.0, 0.0)), sensor)[0] for z in (-2.5, -1.2)]
+    assert (boxed[0] >= CODES["Car"]).sum() > 5000
+    assert np.array_equal(boxed[0] >= CODES["Car"], boxed[1] >= CODES["Car"])
 
 
 @pytest.mark.parametrize("seed", range(4))
