@@ -23,7 +23,7 @@ from lidar_synth.errors import ConfigError, LidarSynthError
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.mixing.plan import VERSION
 
-POLICIES = ("generated", "condition", "none")
+POLICIES = ("generated", "condition", "boxes", "none")
 """Label policies that need no other scan than the bank's own."""
 
 
@@ -50,6 +50,12 @@ def write_plan(settings: Mapping[str, Any], out: str | Path, *, real: int, epoch
             f"labels={labels!r} with options {sorted(options)} for a plan file",
             f"{', '.join(POLICIES)}, and no option but threshold",
             "The reader takes a bank's own labels; other policies need the package in the trainer's environment.",
+        )
+    if labels == "boxes" and settings.get("unboxed") != "keep":
+        raise ConfigError(
+            "labels='boxes' for a plan file",
+            "unboxed: keep, too",
+            "The reader cannot remove objects without a box; MixedScans does, where the package is installed.",
         )
     if epochs < 1 or real < 1 or Path(out).suffix != ".npz":
         raise ConfigError(f"{real} real samples and {epochs} epochs in {out}", "at least one of each, in a .npz file")

@@ -1,16 +1,14 @@
 """Banks and planned epochs for environments that cannot hold the package: Python 3.8, numpy 1.23 and h5py are enough.
 
 Copy this one file into a trainer's tree; inside the package it is ``lidar_synth.integrations.reader``. Its scans are
-the package's own, bit for bit. The package plans the epochs, the trainer reads them::
+the package's own, bit for bit. The package plans the epochs, the trainer reads them with this file as ``reader``::
 
     python -m lidar_synth.integrations.plan mix.yaml plan.npz --real 19130 --epochs 50
-
-    from reader import Bank, MixedEpochs
 
     train = MixedEpochs("plan.npz", trainer_dataset, Bank("/data/bank"), to_sample=lambda scan: ...)
     train.set_epoch(3)  # before each epoch
 
-It reads banks of the format "lidar-synth-bank/1", curated ones included; those compressed with Blosc2 are refused.
+It reads banks of the formats "lidar-synth-bank/1" and /2 (with boxes); those compressed with Blosc2 are refused.
 """
 
 from __future__ import annotations
@@ -33,10 +31,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-FORMAT = "lidar-synth-bank/1"
+FORMATS = "lidar-synth-bank/1", "lidar-synth-bank/2"  # the second has boxes
 PLAN_FORMAT = "lidar-synth-epochs/1"
 IGNORE = 255  # label of points without a known class
-TYPES = {"range": "<u2", "reflectance": "|u1", "label": "|u1", "confidence": "|u1"}  # in the order of a scan's CRC
+TYPES = {"range": "<u2", "reflectance": "|u1", "label": "|u1", "confidence": "|u1", "instance": "<u2", "boxes": "<i4"}
+BOXES = (256, 9)  # of a scan: class + 1, instance, x, y, z, l, w, h in 0.1 mm, yaw in 10 microradians; 0 = unused
+CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "Motorcyclist")
 NUMBERS = {"seed": "<u8", "index": "<u8", "crc": "<u4"}  # one for each scan
 LEVELS = {"reflectance": 255, "confidence": 15}  # steps from 0 to 1
 FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
@@ -66,14 +66,15 @@ def _require(condition: object, otherwise: str) -> None:
 
 
 class Scan(NamedTuple):
-    """A synthetic scan of N points in the sensor's frame: x forward, y left, z up.
+    """A synthetic scan, ``<model>/<seed>/<index>``, of N points in the sensor's frame: x forward, y left, z up.
 
     Attributes:
         points: (N, 3) float32 metres.
         reflectance: (N,) float32 in [0, 1]; 0 if the bank has none.
         label: (N,) uint8, SemanticKITTI's train ids 0..18, 255 = ignore; None if the bank has none.
         confidence: (N,) float32 in [0, 1], the confidence of ``label``, or None.
-        id: ``<model>/<seed>/<index>``.
+        boxes: (M, 7) float32 x, y, z of the centre, length, width, height, yaw (radians), or None; names: M classes.
+        instance: (N,) int32, the number of each point's box, from 1 on; 0 = none; or None.
     """
 
     points: NDArray[Any]
@@ -81,22 +82,20 @@ class Scan(NamedTuple):
     label: NDArray[Any] | None
     confidence: NDArray[Any] | None
     id: str
+    boxes: NDArray[Any] | None = None
+    names: tuple[str, ...] | None = None
+    instance: NDArray[Any] | None = None
 
 
 class Bank:
-    """The scans of a bank, read on access; every scan is checked against its CRC.
+    """The scans of a bank in the folder ``root``, read on access; every scan is checked against its CRC.
 
-    Args:
-        root: the bank's folder.
+    A folder without a bank, or a damaged one, raises ``ReaderError``; the latter also when a scan is read.
 
     Attributes:
-        fields: what a scan has besides its points: some of "reflectance", "label", "confidence".
-        sensor: the sensor, with the keys of ``sensors.yaml``.
-        shape: (rows, columns) of the range images.
+        fields: what a scan has besides its points: "reflectance", "label", "confidence", "instance", "boxes".
+        sensor, shape: the sensor, with the keys of ``sensors.yaml``; (rows, columns) of the range images.
         identity: the checksum of the index, different for every bank.
-
-    Raises:
-        ReaderError: on a folder without a bank, or a damaged one; the latter also when a scan is read.
     """
 
     def __init__(self, root: Any) -> None:
@@ -125,12 +124,17 @@ class Bank:
     def __getitem__(self, number: int) -> Scan:
         """The returns of ``image(number)`` through the centres of their cells, row by row."""
         images, (_, entry, position) = self.image(number), self._place(number)
-        seen = images["range"] > 0
-        points = images["range"][seen][:, None] * self._directions[seen]
+        metres = images.pop("range")
+        seen = metres > 0
+        points = metres[seen][:, None] * self._directions[seen]
         points[:, 2] += self._starts[seen.nonzero()[0]]
-        fields = {"reflectance": np.zeros(len(points), np.float32), **{n: images[n][seen] for n in self._names[1:]}}
-        name = f"{self._sources[entry['source']]['model']}/{entry['seed']}/{entry['first'] + position}"
-        return Scan(points, fields["reflectance"], fields.get("label"), fields.get("confidence"), name)
+        rows = images.pop("boxes", None)
+        fields: Any = {"reflectance": np.zeros(len(points), np.float32), **{n: v[seen] for n, v in images.items()}}
+        fields["id"] = f"{self._sources[entry['source']]['model']}/{entry['seed']}/{entry['first'] + position}"
+        if rows is not None:
+            fields["boxes"] = (rows[:, 2:] * np.array([*6 * [1e-4], 1e-5])).astype(np.float32)
+            fields["names"] = tuple(CLASSES[code - 1] for code in rows[:, 0])
+        return Scan(points, **{"label": None, "confidence": None, **fields})
 
     def image(self, number: int) -> dict[str, NDArray[Any]]:
         """The range image, {name: (rows, columns)}: ``range`` float32 metres, 0 = no return, and the fields."""
@@ -144,6 +148,8 @@ class Bank:
         decoded = {**arrays, "range": np.where(arrays["range"] > 0, inside, np.float32(0))}
         for name in set(LEVELS) & set(arrays):
             decoded[name] = arrays[name].astype(np.float32) / np.float32(LEVELS[name])
+        if "instance" in arrays:
+            decoded["instance"] = arrays["instance"].astype(np.int32)
         return decoded
 
     def verify(self) -> None:
@@ -176,13 +182,11 @@ class Bank:
         return self._open[number]
 
     def _check_facts(self, facts: dict[str, Any]) -> None:
-        if facts["format"] != FORMAT:
-            raise ReaderError(f"{self.root} has scans of format {facts['format']!r}; this file reads {FORMAT!r}")
+        form = FORMATS[bool({"boxes", "instance"} & set(facts["fields"]))]
+        _require(facts["format"] == form, f"scans of format {facts['format']!r}, not {form!r}")
         if facts["compression"] != "gzip":
             raise ReaderError(f"{self.root} is compressed by {facts['compression']!r}; bake it with --compression gzip")
-        same = (
-            facts["sensor"] == self.sensor and tuple(facts["fields"]) == self.fields and facts["scale"] == self._scale
-        )
+        same = (facts["sensor"], tuple(facts["fields"]), facts["scale"]) == (self.sensor, self.fields, self._scale)
         _require(same, "several sensors or fields, or a scale that does not fit the sensor")
         _require(set(self.fields) <= set(TYPES), f"fields {self.fields}")
 
@@ -207,7 +211,7 @@ class _Shard:
     """An open shard. Everything that it declares is checked before memory is allocated for it."""
 
     def __init__(self, root: Path, entry: dict[str, Any], facts: dict[str, Any], names: list[str], shape: Any) -> None:
-        self.entry, self.names, self.shape = entry, names, shape
+        self.entry, self.shapes = entry, {name: BOXES if name == "boxes" else shape for name in names}
         with _reading(root / entry["file"], REPAIR):
             self.file = h5py.File(str(root / entry["file"]), "r")
             self._check_attributes(facts)
@@ -215,11 +219,11 @@ class _Shard:
             _require(set(self.file) == {*NUMBERS, *names, *extra}, f"it holds {sorted(self.file)[:9]}")
             self.numbers = {name: np.asarray(self._dataset(name, kind)[:]) for name, kind in NUMBERS.items()}
             self.conditions = self._dataset("condition", None)[:] if extra else None
-            self.datasets = {name: self._dataset(name, TYPES[name], shape) for name in names}
+            self.datasets = {name: self._dataset(name, TYPES[name], of) for name, of in self.shapes.items()}
 
     def read(self, position: int) -> dict[str, NDArray[Any]]:
         """The arrays of one scan, checked against its CRC."""
-        arrays = {name: self._inflate(name, position) for name in self.names}
+        arrays = {name: self._inflate(name, position) for name in self.shapes}
         seed, index, crc = (int(self.numbers[name][position]) for name in NUMBERS)
         condition = b"" if self.conditions is None else bytes(self.conditions[position])
         found = zlib.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
@@ -228,10 +232,11 @@ class _Shard:
         _require(found == crc, "its CRC does not match")
         own = (seed, index) == (self.entry["seed"], self.entry["first"] + position)
         _require(own, f"it is scan {index} of seed {seed}")
-        label, confidence = arrays.get("label", np.zeros(1)), arrays.get("confidence", np.zeros(1))
+        label, confidence, boxes = (arrays.get(n, np.zeros((1, 1))) for n in ("label", "confidence", "boxes"))
         _require(((label <= 18) | (label == IGNORE)).all(), "it has labels above 18")
         _require((confidence <= LEVELS["confidence"]).all(), "it has confidences above 1")
-        return arrays
+        _require(((boxes[:, 0] >= 0) & (boxes[:, 0] <= len(CLASSES))).all(), "it has boxes of unknown classes")
+        return {n: values[values[:, 0] > 0] if n == "boxes" else values for n, values in arrays.items()}
 
     def _inflate(self, name: str, position: int) -> NDArray[Any]:
         """One chunk, through the inverse of HDF5's filters fletcher32, deflate and shuffle."""
@@ -240,11 +245,12 @@ class _Shard:
         found = info.byte_offset is not None and info.byte_offset + info.size <= self.entry["bytes"]
         _require(found and not info.filter_mask, f"its {name} is missing")
         chunk, dtype = stored.read_direct_chunk(place)[1], np.dtype(TYPES[name])
-        size = self.shape[0] * self.shape[1] * dtype.itemsize
+        rows, columns = self.shapes[name]
+        size = rows * columns * dtype.itemsize
         plain = zlib.decompressobj().decompress(chunk[:-4], size + 1)  # the scan's CRC covers HDF5's own Fletcher-32
         _require(len(plain) == size, f"its {name} does not hold {size} bytes")
         planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
-        return np.ascontiguousarray(planes.T).view(dtype).reshape(self.shape)
+        return np.ascontiguousarray(planes.T).view(dtype).reshape(rows, columns)
 
     def _check_attributes(self, facts: dict[str, Any]) -> None:
         """The attributes repeat the index: text and numbers as such, everything else as JSON."""
@@ -252,7 +258,8 @@ class _Shard:
         _require(set(self.file.attrs) == set(expected), "its attributes are not those of the bank's index")
         for name, value in expected.items():
             attribute = self.file.attrs.get_id(name)
-            kind, text = attribute.get_type(), _is_text(attribute.get_type())
+            kind = attribute.get_type()
+            text = kind.get_class() == h5py.h5t.STRING and not kind.is_variable_str()
             number = kind.get_class() in (h5py.h5t.INTEGER, h5py.h5t.FLOAT)
             _require(attribute.shape == () and (text or number) and kind.get_size() <= 1 << 20, f"its attribute {name}")
             found = self.file.attrs[name]
@@ -270,7 +277,8 @@ class _Shard:
         properties, given = dataset.id.get_create_plist(), dataset.id.get_type()
         layout, outside = properties.get_layout(), properties.get_external_count()
         _require(layout != h5py.h5d.VIRTUAL and not outside, f"{name} is stored in another file")
-        fits = _is_text(given) if kind is None else given.equal(h5py.h5t.py_create(np.dtype(kind)))
+        text = given.get_class() == h5py.h5t.STRING and not given.is_variable_str()
+        fits = text if kind is None else given.equal(h5py.h5t.py_create(np.dtype(kind)))
         _require(fits and dataset.shape == (scans, *shape), f"{name} has another type or shape")
         filters = tuple(properties.get_filter(i)[0] for i in range(properties.get_nfilters()))
         contiguous = layout == h5py.h5d.CONTIGUOUS and dataset.id.get_storage_size() == scans * given.get_size()
@@ -284,22 +292,19 @@ class MixedEpochs:
     """A map-style dataset of a trainer's real samples and a bank's scans, in the order of a plan.
 
     The order is already shuffled; a sampler that shuffles again does no harm. ``set_epoch`` reaches the workers of a
-    ``DataLoader``, persistent ones included. The length may differ by one between epochs.
+    ``DataLoader``, persistent ones included. The length may differ by one between epochs. A damaged plan, or one of
+    another bank or number of real samples, raises ``ReaderError``.
 
     Args:
-        plan: file of ``python -m lidar_synth.integrations.plan``.
+        plan: file of ``python -m lidar_synth.integrations.plan``; bank: the bank with which it was made.
         real: the trainer's own dataset, or a function: number of a real sample -> sample.
-        bank: the bank with which the plan was made.
         to_sample: Scan -> sample in the trainer's form; by default the ``Scan``.
-
-    Raises:
-        ReaderError: on a damaged plan, or one of another bank or of another number of real samples.
     """
 
     def __init__(self, plan: Any, real: Any, bank: Bank, to_sample: Any = None) -> None:
         self.plan, self.real, self.bank, self.to_sample = str(plan), real, bank, to_sample
-        with _reading(plan, PLAN):
-            self.settings = json.loads(self._member("settings").tobytes().decode())
+        with _reading(plan, PLAN), np.load(self.plan, allow_pickle=False) as file:
+            self.settings = json.loads(file["settings"].tobytes().decode())
             form, planned = self.settings["format"], self.settings["real"]
             _require(form == PLAN_FORMAT, f"format {form!r}, expected {PLAN_FORMAT!r}")
             _require(self.settings["bank"] == bank.identity, f"it was made with another bank than {bank.root}")
@@ -310,8 +315,7 @@ class MixedEpochs:
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, before a ``DataLoader`` begins to iterate; raises ``ReaderError`` after the plan's last."""
-        planned = len(self.settings["lengths"])
-        if not 0 <= epoch < planned:
+        if not 0 <= epoch < (planned := len(self.settings["lengths"])):
             raise ReaderError(f"epoch {epoch} of a plan of {planned} epochs; make it again with more --epochs")
         self._epoch.value = epoch
 
@@ -332,11 +336,14 @@ class MixedEpochs:
         return int(self._order()[index, 0])
 
     def _labelled(self, scan: Scan) -> Scan:
-        """The scan with labels by the plan's label policy: ``generated``, ``condition`` or ``none``."""
-        label, confidence, threshold = scan.label, scan.confidence, self.settings["threshold"]
-        if self.settings["labels"] == "none" or label is None:
-            return scan._replace(label=None, confidence=None)
-        if self.settings["labels"] == "condition" or confidence is None:
+        """The scan with labels by the plan's label policy: ``generated``, ``condition``, ``boxes`` or ``none``."""
+        label, confidence = scan.label, scan.confidence
+        how, threshold = self.settings["labels"], self.settings["threshold"]
+        if how == "none":
+            return scan._replace(label=None, confidence=None, boxes=None, names=None, instance=None)
+        if how == "boxes" or label is None:
+            return scan
+        if how == "condition" or confidence is None:
             confidence = (label != IGNORE).astype(np.float32)
         if threshold > 0:
             label = np.where(confidence >= threshold, label, np.uint8(IGNORE))
@@ -346,17 +353,14 @@ class MixedEpochs:
         """(N, 2) of the current epoch: whether the sample is synthetic, and its number."""
         epoch = self._epoch.value
         if self._loaded[0] != epoch:
-            order = self._member(f"epoch-{epoch}")
-            with _reading(f"{self.plan}: epoch {epoch}", PLAN):
+            what = f"{self.plan}: epoch {epoch}"
+            with _reading(what, PLAN), np.load(self.plan, allow_pickle=False) as file:
+                order = np.asarray(file[f"epoch-{epoch}"])
                 _require(order.shape == (len(self), 2) and order.dtype == np.int64, f"{order.shape}, {order.dtype}")
                 lengths = np.array([self.settings["real"], len(self.bank)])[order[:, 0]]
                 _require(((order >= 0).all(1) & (order[:, 1] < lengths)).all(), "samples that do not exist")
             self._loaded = (epoch, order)
         return self._loaded[1]
-
-    def _member(self, name: str) -> NDArray[Any]:
-        with _reading(self.plan, PLAN), np.load(self.plan, allow_pickle=False) as file:
-            return np.asarray(file[name])
 
 
 def _read_index(path: Path) -> dict[str, Any]:
@@ -364,17 +368,13 @@ def _read_index(path: Path) -> dict[str, Any]:
     with _reading(path, f"expected the folder of a finished bank. {REPAIR}"):
         values: dict[str, Any] = json.loads(path.read_bytes().decode())
         given, form = values.pop("checksum", None), values.get("format")
-        _require(form == FORMAT, f"format {form!r}, expected {FORMAT!r}")
+        _require(form in FORMATS, f"format {form!r}, expected one of {FORMATS}")
         _require(given == _checksum(values), "it does not match its checksum: it was damaged or edited")
     return values
 
 
 def _checksum(values: Any) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def _is_text(kind: Any) -> bool:
-    return bool(kind.get_class() == h5py.h5t.STRING and not kind.is_variable_str())
 
 
 def _shape(sensor: dict[str, Any]) -> tuple[int, int]:

@@ -25,6 +25,7 @@ _HOME = {
     "KITTIObject": "formats",
     "KITTIRaw": "formats",
     "LidarSynthError": "errors",
+    "Layout": "geometry.layout",
     "Linear": "mixing",
     "MixedScans": "mixing",
     "MixedStream": "mixing",
@@ -47,7 +48,9 @@ _HOME = {
     "deskew": "geometry.fitting",
     "fit_sensor": "geometry.fitting",
     "fit_skin": "town",
+    "layout_of": "geometry.layout",
     "load_generator": "generate.generator",
+    "load_layout": "geometry.layout.files",
     "load_sensor": "geometry.sensor",
     "load_skin": "town",
     "make_policy": "labels",
@@ -79,6 +82,9 @@ if TYPE_CHECKING:
     from lidar_synth.geometry.fitting import deskew as deskew
     from lidar_synth.geometry.fitting import fit_sensor as fit_sensor
     from lidar_synth.geometry.fitting import reskew as reskew
+    from lidar_synth.geometry.layout import Layout as Layout
+    from lidar_synth.geometry.layout import layout_of as layout_of
+    from lidar_synth.geometry.layout.files import load_layout as load_layout
     from lidar_synth.geometry.projection import project as project
     from lidar_synth.geometry.projection import unfold as unfold
     from lidar_synth.geometry.projection import unproject as unproject

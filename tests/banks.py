@@ -15,7 +15,7 @@ from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry.scan import Boxes, RangeImage
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
@@ -40,7 +40,11 @@ def some_image(seed: int = 0, sensor: Sensor = SENSOR) -> RangeImage:
         "label": np.where(seen, rng.integers(0, 19, sensor.shape), IGNORE).astype(np.uint8),
         "confidence": (rng.random(sensor.shape) * seen).astype(np.float32),
     }
-    return RangeImage((metres * seen).astype(np.float32), sensor, channels)
+    values = rng.uniform((-40, -40, -2, 0.5, 0.5, 0.5, -3), (40, 40, 1, 9, 3, 3, 3), (seed % 4, 7)).astype(np.float32)
+    names = tuple(rng.choice(["Car", "Pedestrian", "Misc", "Motorcyclist"], len(values)).tolist())
+    boxes = Boxes(values, names, instance=np.arange(1, len(values) + 1, dtype=np.int32))
+    channels["instance"] = (rng.integers(0, len(values) + 1, sensor.shape) * seen).astype(np.int32)
+    return RangeImage((metres * seen).astype(np.float32), sensor, channels, boxes)
 
 
 def write_bank(root: Path, images: Sequence[RangeImage], shard_size: int = 2, **others: Any) -> list[Path]:

@@ -12,12 +12,15 @@ from lidar_synth.integrations.plan import write_plan
 from lidar_synth.bake.edit import drop, merge
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry, Index, ShardWriter
+from lidar_synth.bank.boxes import encode_boxes
 from lidar_synth.files.disk import sha256
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.labels import make_policy
 from lidar_synth.mixing import MixedScans
 
 ALL = ("reflectance", "label", "confidence")
+BOXED = (*ALL, "instance", "boxes")
 LASERS = Sensor("lasers", 48, 0.9, 120.0, elevations=(15.0, 7.5, 2.0, -1.0, -9.0, -24.5), heights=(0.1,) * 6)
 
 
@@ -64,6 +67,7 @@ BANKS: dict[str, Any] = {
     "reflectance": lambda root: write_bank(root, images(), fields=("reflectance",)),
     "labels": lambda root: write_bank(root, images(), fields=("label",)),
     "all fields": lambda root: write_bank(root, images(), fields=ALL),
+    "boxes": lambda root: write_bank(root, images(9), fields=BOXED),
     "one shard": lambda root: write_bank(root, images(), shard_size=5, fields=ALL),
     "many shards": lambda root: write_bank(root, images(40), shard_size=2, fields=ALL),
     "paged": lambda root: write_bank(root, images(), fields=ALL, layout="paged"),
@@ -83,6 +87,7 @@ MIXTURES: dict[str, tuple[str, int, dict[str, Any]]] = {
     "without confidence": ("labels", 7, {"ratio": 0.4, "reuse": 2, "epoch_size": "replace"}),
     "no labels": ("reflectance", 7, {"ratio": 0.5, "labels": "none", "epoch_size": 20}),
     "curated": ("curated", 4, {"ratio": 0.6}),
+    "boxes": ("boxes", 8, {"ratio": 0.5, "labels": "boxes", "unboxed": "keep"}),
 }
 """Bank, number of real samples, and settings of mixtures by name."""
 
@@ -97,7 +102,15 @@ def expected_scans(root: Path) -> dict[str, Any]:
         found |= {f"{number} image {name}": v for name, v in {"range": image.range, **image.channels}.items()}
         found |= {f"{number} {name}": v for name, v in {"points": scan.points, **scan.fields()}.items()}
         found[f"{number} id"] = np.array(scan.id)
+        if image.boxes is not None:
+            found[f"{number} image boxes"] = encode_boxes(image.boxes)[: len(image.boxes)]
+        found |= {f"{number} {name}": v for name, v in boxes_of(scan).items()}
     return found
+
+
+def boxes_of(scan: Scan) -> dict[str, Any]:
+    """The arrays of a scan's boxes."""
+    return {} if scan.boxes is None else {"boxes": scan.boxes.values, "names": np.array(scan.boxes.names)}
 
 
 def expected_samples(root: Path, real: int, settings: dict[str, Any]) -> dict[str, Any]:
@@ -115,7 +128,7 @@ def expected_samples(root: Path, real: int, settings: dict[str, Any]) -> dict[st
             if isinstance(sample, int):
                 found[f"{epoch} {position} real"] = np.array(sample)
                 continue
-            values = {"points": sample.points, **sample.fields(), "id": np.array(sample.id)}
+            values = {"points": sample.points, **sample.fields(), **boxes_of(sample), "id": np.array(sample.id)}
             found |= {f"{epoch} {position} {name}": value for name, value in values.items()}
     return found
 

@@ -22,8 +22,13 @@ SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 GRID = (1.0, 0.8, 0.5, 0.0)
 
 
-def write(path: Path, channels: tuple[str, ...] = tuple(CHANNELS), dropout: float | None = None) -> Path:
-    """Write a checkpoint with random weights; with a ``dropout``, it is conditioned on semantic maps."""
+def write(
+    path: Path,
+    channels: tuple[str, ...] = tuple(CHANNELS),
+    dropout: float | None = None,
+    condition: str = "semantic",
+) -> Path:
+    """Write a checkpoint with random weights; with a ``dropout``, it is conditioned on semantic maps or layouts."""
     condition_channels = 0 if dropout is None else 3
     arguments = {
         "resolution": SENSOR.shape, "channels": sum(CHANNELS[c] for c in channels), "width": 16, "time_width": 16,
@@ -39,10 +44,12 @@ def write(path: Path, channels: tuple[str, ...] = tuple(CHANNELS), dropout: floa
     )  # fmt: skip
     networks = {VELOCITY: network}
     if dropout is not None:
-        encoder = NetworkSpec("semantic_map", {"resolution": SENSOR.shape, "target": SENSOR.shape, "channels": 3})
+        kind = {"semantic": "semantic_map", "layout": "layout"}[condition]
+        encoder = NetworkSpec(kind, {"resolution": SENSOR.shape, "target": SENSOR.shape, "channels": 3})
         networks[ENCODER] = build_network(*encoder)
-        torch.nn.init.normal_(networks[ENCODER].mix.weight, std=2.0)
-        conditioning = {"semantic": {"dropout": dropout}}
+        if condition == "semantic":
+            torch.nn.init.normal_(networks[ENCODER].mix.weight, std=2.0)
+        conditioning = {condition: {"dropout": dropout}}
         header = replace(header, networks=header.networks | {ENCODER: encoder}, conditioning=conditioning)
     save_checkpoint(path, header, networks)
     return path

@@ -12,6 +12,7 @@ from project import ROOT
 
 from lidar_synth.bake import BakeJob
 from lidar_synth.errors import LibraryError
+from lidar_synth.geometry.layout.files import load_layout
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.train import DistillConfig, TrainConfig, load_config
 
@@ -48,7 +49,7 @@ def names_of(module: str) -> set[str]:
 
 
 def check_yaml(code: str, path: Path) -> None:
-    """Read settings as what they are: those of a mixture, a sensor, a recipe, or some keys of these.
+    """Read settings as what they are: those of a mixture, a sensor, a layout, a recipe, or some keys of these.
 
     Args:
         code: the settings.
@@ -59,6 +60,8 @@ def check_yaml(code: str, path: Path) -> None:
     path.write_text(code)
     if all(isinstance(entry, dict) and "range_max" in entry for entry in values.values()):
         assert load_sensor(path).name in values
+    elif "objects" in values:
+        assert load_layout(path).boxes.names
     elif set(values) & {"base", "network"}:
         load_config(DistillConfig if "teacher" in values else TrainConfig, path)
     else:

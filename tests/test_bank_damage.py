@@ -112,13 +112,16 @@ def test_scale_and_sensor_must_agree(root: Path) -> None:
 
 def test_another_version_is_refused(root: Path) -> None:
     text = (root / INDEX).read_text()
-    (root / INDEX).write_text(text.replace(FORMAT, "lidar-synth-bank/2"))
-    with pytest.raises(DataError, match=r"is of format 'lidar-synth-bank/2'; expected 'lidar-synth-bank/1'. Use the"):
+    (root / INDEX).write_text(text.replace(FORMAT, "lidar-synth-bank/3"))
+    with pytest.raises(
+        DataError,
+        match=r"is of format 'lidar-synth-bank/3'; expected 'lidar-synth-bank/1' or 'lidar-synth-bank/2'. Use the",
+    ):
         Bank(root)
     (root / INDEX).write_text(text)
     with h5py.File(root / "shard-00000.h5", "r+") as file:
-        file.attrs["format"] = np.bytes_(b"lidar-synth-bank/2")
-    with pytest.raises(DataError, match=r"shard-00000.h5 is of format 'lidar-synth-bank/2'"):
+        file.attrs["format"] = np.bytes_(b"lidar-synth-bank/3")
+    with pytest.raises(DataError, match=r"shard-00000.h5 is of format 'lidar-synth-bank/3'"):
         with_shard(root, root / "shard-00000.h5")[0]
 
 

@@ -1,7 +1,7 @@
 """Conditions: from users and from real scans, their encoders, training, and invalid input."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import random_scan
+from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
 
@@ -20,7 +21,7 @@ from lidar_synth.flow.path import guided
 from lidar_synth.generate.conditions import CONDITIONS, batch_of, blank, one_view
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.models import NETWORKS, build_network, encoders_of
 from lidar_synth.models.encoders.calibrated_camera import SightEncoder
@@ -46,7 +47,10 @@ def picture(path: Path, size: tuple[int, int] = (40, 80), seed: int = 0) -> Path
 
 
 def some_scan(tmp_path: Path, seed: int = 0) -> Scan:
-    return replace(random_scan(SENSOR, 400, seed), image_path=picture(tmp_path / f"{seed}.png", seed=seed))
+    scan = random_scan(SENSOR, 400, seed)
+    scan.points[:100, 2], scan.label[:100] = -1.7, 8  # some of it is a road
+    boxes = Boxes(np.float32([[12, 3, -0.9, 4, 2, 1.6, 0.4]]), ("Car",))
+    return replace(scan, boxes=boxes, image_path=picture(tmp_path / f"{seed}.png", seed=seed))
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
@@ -55,6 +59,7 @@ def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_p
     encoder = {
         "semantic": lambda: build_network("semantic_map", {"resolution": (8, 32), "target": (4, 16)}),
         "camera": lambda: build_network("views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)}),
+        "layout": lambda: build_network("layout", {"resolution": (8, 32), "target": (4, 16), "channels": 7}),
     }[name]()
     shape = condition.shape(encoder)
     values = condition.read(scan, SENSOR, shape, OPTIONS)
@@ -62,7 +67,7 @@ def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_p
     given = batch_of(name, scan, 3, SENSOR, shape, OPTIONS)
     assert torch.equal(given, torch.from_numpy(values).expand(3, *shape))
     encoded = encoder(given)
-    assert encoded.shape == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5)}[name]
+    assert encoded.shape == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5), "layout": (3, 7, 4, 16)}[name]
     assert (blank(name, given) == condition.blank).all()
     assert set(encoders_of(name)) <= set(NETWORKS)
 
@@ -220,8 +225,13 @@ def test_an_invalid_calibration_is_refused() -> None:
 
 def conditioned_batches(tmp_path: Path, name: str, **options: Any) -> Batches:
     scans = [some_scan(tmp_path, seed) for seed in range(4)]
-    others = {"camera": Other(CAMERA_SHAPE, lambda s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS))}
-    about = {key: options.pop(key) for key in ("dropout", "view_dropout") if key in options}
+    shapes = {"camera": CAMERA_SHAPE, "layout": (5, *SENSOR.shape)}
+
+    def reader(kind: str) -> Callable[[Scan], NDArray[np.uint8]]:
+        return lambda scan: CONDITIONS[kind].read(scan, SENSOR, shapes[kind], OPTIONS)
+
+    others = {kind: Other(shape, reader(kind)) for kind, shape in shapes.items()}
+    about = {key: options.pop(key) for key in ("dropout", "reduction") if key in options}
     cache = cache_scans(scans, SENSOR, ["range", "label"], progress=False, others=others)
     return Batches(cache, TENSORS, 3, conditioning=Conditioning(name, views=2, **about), **options)
 
@@ -262,8 +272,8 @@ def test_dropout_blanks_only_its_share_of_the_conditions(name: str, tmp_path: Pa
     assert torch.equal(a.cond[~is_blank], b.cond[~is_blank])
 
 
-def test_view_dropout_keeps_one_view(tmp_path: Path) -> None:
-    cond = conditioned_batches(tmp_path, "camera", view_dropout=0.5)(range(60)).cond
+def test_a_reduced_camera_image_keeps_one_view(tmp_path: Path) -> None:
+    cond = conditioned_batches(tmp_path, "camera", reduction=0.5)(range(60)).cond
     assert cond is not None
     left, right = (cond[..., :32] == 0).flatten(1).all(1), (cond[..., 32:] == 0).flatten(1).all(1)
     assert 15 <= int(left.sum()) <= 45

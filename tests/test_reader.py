@@ -185,7 +185,7 @@ def remove_index(root: Path) -> None:
 
 
 def newer(root: Path) -> None:
-    resealed(root, lambda values: values.update(format="lidar-synth-bank/2"))
+    resealed(root, lambda values: values.update(format="lidar-synth-bank/3"))
 
 
 def edited(root: Path) -> None:
@@ -200,7 +200,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no index": (remove_index, "index.json cannot be read .*No such file.*the folder of a finished bank"),
     "no shard": (lambda root: next(root.glob("*.h5")).unlink(), "is 0 bytes long, not .*copy it again"),
     "truncated": (lambda root: next(root.glob("*.h5")).write_bytes(b"1"), "is 1 bytes long, not .*copy it again"),
-    "newer": (newer, "format 'lidar-synth-bank/2', expected 'lidar-synth-bank/1'"),
+    "newer": (newer, "format .lidar-synth-bank/3., expected one of"),
     "blosc2": (blosc2, "compressed by 'blosc2'; bake it with --compression gzip"),
     "edited": (edited, "does not match its checksum"),
     "no JSON": (lambda root: (root / "index.json").write_text("["), "index.json cannot be read"),
@@ -299,8 +299,9 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"labels": "mix"}, "labels='mix'.*generated, condition, none"),
+        ({"labels": "mix"}, "labels='mix'.*generated, condition, boxes, none"),
         ({"label_options": {"kind": "polar"}}, "no option but threshold"),
+        ({"labels": "boxes"}, "labels=.boxes. for a plan file; expected unboxed: keep"),
         ({"labels": "pseudo"}, "labels='pseudo'"),
         ({"synthetic": "town"}, "synthetic: town; expected a bank. lidar-synth bake OUT"),
         ({"unknown": 1}, "settings .'unknown'"),

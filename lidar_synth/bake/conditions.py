@@ -1,19 +1,62 @@
-"""Conditions of generated scans: scan ``index`` is conditioned on scan ``index`` of a dataset, modulo its length."""
+"""Conditions of generated scans: scan ``index`` is conditioned on entry ``index`` of a dataset, modulo its length.
 
-from collections.abc import Iterable
+The dataset of a layout model may be a YAML file of a layout, or a folder of them.
+"""
+
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import ScanFiles, open_scans
 from lidar_synth.generate.generator import Generator
+from lidar_synth.geometry.layout import Layout
+from lidar_synth.geometry.layout.files import load_layout
 from lidar_synth.geometry.scan import Scan
 
 FOCAL_TOLERANCE = 0.02
 """Relative difference that is allowed between a camera's focal length and that of the training data."""
 
 
+class ConditionSource(Protocol):
+    """A dataset of conditions.
+
+    Attributes:
+        ids: names of its entries.
+    """
+
+    @property
+    def ids(self) -> Sequence[str]: ...
+
+    def __len__(self) -> int: ...
+
+    def read(self, index: int) -> Scan | Layout:
+        """One entry."""
+        ...
+
+
+class LayoutFiles:
+    """Layouts in YAML files.
+
+    Args:
+        path: a file, or a folder of them.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._files = [path] if path.is_file() else sorted(path.glob("*.y*ml"))
+        self.ids = [file.stem for file in self._files]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def read(self, index: int) -> Layout:
+        """The layout of one file; raises as ``load_layout``."""
+        return load_layout(self._files[index])
+
+
 @lru_cache(maxsize=1)
-def open_conditions(path: str | None, layout: str | None = None, split: str | None = None) -> ScanFiles | None:
+def open_conditions(path: str | None, layout: str | None = None, split: str | None = None) -> ConditionSource | None:
     """The dataset of the conditions, opened once per process; None without a path.
 
     Raises:
@@ -21,15 +64,22 @@ def open_conditions(path: str | None, layout: str | None = None, split: str | No
         FileError, DataError: as ``open_scans``.
     """
     if path is not None:
+        if layout is None and split is None and len(layouts := LayoutFiles(Path(path))) and _is_yaml(Path(path)):
+            return layouts
         return open_scans(path, layout=layout, split=split)
     if layout is not None or split is not None:
         raise ConfigError(f"conditions of layout {layout} and split {split}, but no dataset", "--condition PATH")
     return None
 
 
+def _is_yaml(path: Path) -> bool:
+    """Whether a path is a YAML file, or a folder with nothing else."""
+    return all(p.suffix in (".yaml", ".yml") for p in (path.iterdir() if path.is_dir() else [path]))
+
+
 def conditions_for(
     generator: Generator, path: str | None, layout: str | None = None, split: str | None = None
-) -> ScanFiles | None:
+) -> ConditionSource | None:
     """The dataset of a model's conditions, after a check that it fits the model.
 
     Raises:
@@ -46,7 +96,9 @@ def conditions_for(
             "a dataset whose scans have them" if generator.condition else "none",
         )
     source = open_conditions(path, layout, split)
-    if source is not None and generator.condition:
+    if isinstance(source, LayoutFiles) and generator.condition != "layout":
+        raise ConfigError(f"layouts for model {generator.name!r}", f"a dataset whose scans have {generator.condition}")
+    if isinstance(source, ScanFiles) and generator.condition:
         _check_camera(source, generator.header.conditioning[generator.condition].get("focal"))
     return source
 
@@ -66,8 +118,8 @@ def _check_camera(source: ScanFiles, focal: float | None) -> None:
         )
 
 
-def conditions(source: ScanFiles | None, indices: Iterable[int]) -> list[Scan] | None:
-    """The scans that condition the scans with these indices; None for an unconditional model.
+def conditions(source: ConditionSource | None, indices: Iterable[int]) -> list[Scan | Layout] | None:
+    """The entries that condition the scans with these indices; None for an unconditional model.
 
     Raises:
         FileError, DataError: if one cannot be read.
@@ -75,6 +127,6 @@ def conditions(source: ScanFiles | None, indices: Iterable[int]) -> list[Scan] |
     return None if source is None else [source.read(index % len(source)) for index in indices]
 
 
-def condition_names(source: ScanFiles | None, indices: Iterable[int]) -> list[str]:
+def condition_names(source: ConditionSource | None, indices: Iterable[int]) -> list[str]:
     """The names of these conditions; an empty list for an unconditional model."""
     return [] if source is None else [source.ids[index % len(source)] for index in indices]

@@ -31,7 +31,7 @@ class BakeJob(BaseModel):
     steps: Count | None = Field(None, description="steps of a uniform time grid [the model's own time grid]")
     solver: str = Field("euler", description="ODE solver: euler | heun")
     condition: str | None = Field(
-        None, description="dataset with the labels or camera images that a conditional model needs"
+        None, description="dataset with the labels, images or boxes that a conditional model needs, or a layout.yaml"
     )
     condition_layout: str | None = Field(None, description="layout of that dataset [detected]")
     condition_split: str | None = Field(None, description="split of that dataset, for instance r2flow/train")

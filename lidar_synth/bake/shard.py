@@ -9,14 +9,13 @@ from pathlib import Path
 
 import torch
 
-from lidar_synth.bake.conditions import condition_names, conditions, open_conditions
+from lidar_synth.bake.conditions import ConditionSource, condition_names, conditions, open_conditions
 from lidar_synth.bake.folder import at_work, finished, publish
 from lidar_synth.bake.job import DTYPES, BakePlan
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import part_of
-from lidar_synth.formats import ScanFiles
 from lidar_synth.generate.generator import BATCH, Generator, load_generator
 from lidar_synth.geometry.scan import RangeImage
 
@@ -93,7 +92,7 @@ def generate(generator: Generator, job: BakeJob, indices: Sequence[int]) -> list
     return generator.range_images(job.seed, indices, given, steps=job.steps, solver=job.solver, guidance=job.guidance)
 
 
-def _source(job: BakeJob) -> ScanFiles | None:
+def _source(job: BakeJob) -> ConditionSource | None:
     return open_conditions(job.condition, job.condition_layout, job.condition_split)
 
 

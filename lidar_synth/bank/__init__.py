@@ -1,19 +1,20 @@
-"""Banks: folders of generated scans as range images in HDF5, "lidar-synth-bank/1".
+"""Banks: folders of generated scans as range images in HDF5, "lidar-synth-bank/1", or /2 where they have boxes.
 
-``encoding`` converts range images to compact arrays and ``chunks`` compresses them. ``shard`` reads one file of a bank,
-``layout`` validates what such a file declares, ``storage`` reads byte ranges of files and URLs, ``writer`` writes a
-shard. ``index`` holds a bank's metadata, ``reader`` offers a bank as a source of scans, and ``card`` describes it to
-people and to data set tools.
+``encoding`` and ``boxes`` convert range images to compact arrays, and ``chunks`` compresses them. ``shard`` reads one
+file of a bank, ``layout`` validates what such a file declares, ``storage`` reads byte ranges of files and URLs,
+``writer`` writes a shard. ``index`` holds a bank's metadata, ``reader`` offers a bank as a source of scans, and
+``card`` describes it to people and to data set tools.
 """
 
 from lidar_synth.bank.encoding import Encoding
-from lidar_synth.bank.index import FORMAT, INDEX, Entry, Facts, Index
+from lidar_synth.bank.index import BOXED_FORMAT, FORMAT, INDEX, Entry, Facts, Index
 from lidar_synth.bank.reader import Bank, is_bank
 from lidar_synth.bank.shard import ShardReader
 from lidar_synth.bank.storage import is_url
 from lidar_synth.bank.writer import ShardWriter
 
 __all__ = [
+    "BOXED_FORMAT",
     "FORMAT",
     "INDEX",
     "Bank",

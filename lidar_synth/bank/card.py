@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-from lidar_synth.bank.index import FORMAT, Index
+from lidar_synth.bank.index import Index
 
 CARD, CROISSANT = "README.md", "croissant.json"
 
@@ -27,7 +27,7 @@ def summary(index: Index) -> dict[str, Any]:
     facts = index.sources[0]
     rows, columns = facts.sensor.shape
     return {
-        "format": FORMAT,
+        "format": facts.format,
         "scans": index.scans,
         "shards": len(index.shards),
         "bytes": index.size,

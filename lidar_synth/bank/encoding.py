@@ -7,6 +7,8 @@ range       uint16 metres = value * scale, scale = the sensor's range_max / 6553
 reflectance uint8  value / 255
 label       uint8  train ids 0..18, 255 = ignore
 confidence  uint8  value / 15: four bits are precise enough for a confidence
+instance    uint16 the instance of the point's box; 0 = none
+boxes       int32  (256, 9) for each scan, see ``boxes``
 =========== ====== ================================================================================================
 
 ``encode`` rounds by at most half a step, and ``encode(decode(x)) == x``. Every return stays a return: a range below
@@ -21,6 +23,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.bank.boxes import SHAPE, check_boxes, decode_boxes, encode_boxes
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import RangeImage
@@ -29,8 +32,9 @@ from lidar_synth.geometry.sensor import Sensor
 RANGE_STEPS = 65535
 """Steps of the range from 0 to the sensor's range_max."""
 
-TYPES: dict[str, type[np.unsignedinteger[Any]]] = {
-    "range": np.uint16, "reflectance": np.uint8, "label": np.uint8, "confidence": np.uint8,
+TYPES: dict[str, type[np.integer[Any]]] = {
+    "range": np.uint16, "reflectance": np.uint8, "label": np.uint8, "confidence": np.uint8, "instance": np.uint16,
+    "boxes": np.int32,
 }  # fmt: skip
 """Arrays and their types, in the order in which they are stored."""
 
@@ -66,27 +70,30 @@ class Encoding:
 
     def arrays(self) -> dict[str, tuple[tuple[int, int], np.dtype[Any]]]:
         """Shape and type of each array of one scan."""
-        return {name: (self.sensor.shape, np.dtype(TYPES[name])) for name in self.names}
+        return {name: (SHAPE if name == "boxes" else self.sensor.shape, np.dtype(TYPES[name])) for name in self.names}
 
     def encode(self, image: RangeImage, out: Mapping[str, NDArray[Any]] | None = None) -> dict[str, NDArray[Any]]:
         """The arrays of a range image.
 
         Args:
-            image: on the sensor's grid, with a channel for each field; further channels are ignored.
-            out: (H, W) arrays to write into, with the types of ``arrays``; new ones by default.
+            image: on the sensor's grid, with a channel (or boxes) for each field; further channels are ignored.
+            out: arrays to write into, with the types of ``arrays``; new ones by default.
 
         Returns:
-            {name: (H, W)}: ``out`` if given, otherwise new arrays.
+            {name: array}: ``out`` if given, otherwise new arrays.
 
         Raises:
             DataError: on another grid, a missing channel, or a value that has no code: a range outside the sensor's
-                limits, a reflectance or confidence outside [0, 1], an unknown train id, NaN.
+                limits, a reflectance or confidence outside [0, 1], an unknown train id or class of a box, NaN.
         """
         if image.sensor.shape != self.sensor.shape:
             raise DataError(f"a range image of {image.sensor.shape}", f"{self.sensor.shape} of {self.sensor.name!r}")
-        if missing := [name for name in self.names[1:] if name not in image.channels]:
+        given: dict[str, Any] = {**image.channels, "range": image.range}
+        if image.boxes is not None:
+            given["boxes"] = image.boxes
+        if missing := [name for name in self.names if name not in given]:
             raise DataError(f"a range image without {missing}", f"channels {list(self.names[1:])}")
-        codes = {n: self._code(n, image.range if n == "range" else image.channels[n]) for n in self.names}
+        codes = {n: encode_boxes(given[n]) if n == "boxes" else self._code(n, given[n]) for n in self.names}
         if out is None:
             return codes
         for name, code in codes.items():
@@ -96,13 +103,14 @@ class Encoding:
     def decode(self, arrays: Mapping[str, NDArray[Any]]) -> RangeImage:
         """The range image of encoded arrays, in new memory; float32 except for the labels."""
         channels: dict[str, NDArray[Any]] = {}
-        for name in self.names[1:]:
+        for name in (n for n in self.names[1:] if n != "boxes"):
             if name in LEVELS:
                 channels[name] = np.empty(self.sensor.shape, np.float32)
                 _decode_shares(arrays[name].ravel(), np.float32(LEVELS[name]), channels[name].reshape(-1))
             else:
-                channels[name] = arrays[name].copy()
-        return RangeImage(self.metres(arrays["range"]), self.sensor, channels)
+                channels[name] = arrays[name].astype(np.int32 if name == "instance" else np.uint8)
+        boxes = decode_boxes(arrays["boxes"]) if "boxes" in self.names else None
+        return RangeImage(self.metres(arrays["range"]), self.sensor, channels, boxes)
 
     def check(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Refuse codes that ``encode`` never writes.
@@ -115,6 +123,8 @@ class Encoding:
                 raise DataError(f"a {name} with the code {arrays[name].max()}", f"at most {LEVELS[name]}")
         if "label" in arrays:
             _train_ids(arrays["label"])
+        if "boxes" in arrays:
+            check_boxes(arrays["boxes"])
 
     def metres(self, codes: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Ranges in metres (any shape) from their codes; 0 = no return."""
@@ -127,6 +137,10 @@ class Encoding:
         """The codes of one channel."""
         if name == "label":
             return _train_ids(values)
+        if name == "instance":
+            if values.min(initial=0) < 0 or values.max(initial=0) > 65535:
+                raise DataError(f"instances from {values.min()} to {values.max()}", "0..65535")
+            return values.astype(np.uint16)
         codes = np.empty(values.shape, TYPES[name])
         if name == "range":
             near, far = self.sensor.range_min - self.scale / 2, self.sensor.range_max + self.scale / 2

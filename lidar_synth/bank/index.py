@@ -1,8 +1,9 @@
 """A bank's metadata: the facts that its scans have in common, and ``index.json`` with every shard's size and hash.
 
-``index.json`` of "lidar-synth-bank/1"::
+``index.json``::
 
-    format     "lidar-synth-bank/1"; readers refuse every other value
+    format     "lidar-synth-bank/1", or "lidar-synth-bank/2" where scans have boxes and instances; readers refuse
+               every other value
     scans      number of scans
     sources    the facts of each bake; more than one after a merge
     shards     in order: file, seed, first index, scans, source (a position in ``sources``), bytes, sha256; in a
@@ -16,7 +17,7 @@ The root attributes of each shard repeat the facts and have to agree with them; 
 everything else as JSON::
 
     sensor         as in sensors.yaml; scale = range_max / 65535, metres per step of ``range``
-    fields         what is stored beside the range: reflectance, label, confidence
+    fields         what is stored beside the range: reflectance, label, confidence; in /2 instance, boxes
     model          the checkpoint's name; checkpoint: its hash; provenance: its header's provenance
     settings       of the bake: everything else that determines the scans
     label_policy   "generated", or "none"
@@ -44,7 +45,9 @@ from lidar_synth.bank.encoding import RANGE_STEPS, Encoding
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.sensor import Sensor
 
-FORMAT = "lidar-synth-bank/1"
+FORMAT, BOXED_FORMAT = "lidar-synth-bank/1", "lidar-synth-bank/2"
+"""The format of banks without boxes, which is also that of all older banks, and of those with boxes."""
+
 LAYOUTS = ("plain", "paged")
 INDEX = "index.json"
 
@@ -84,6 +87,11 @@ class Facts:
         """The encoding of the scans."""
         return Encoding(self.sensor, self.fields)
 
+    @property
+    def format(self) -> str:
+        """The format of a bank with these fields."""
+        return BOXED_FORMAT if {"boxes", "instance"} & set(self.fields) else FORMAT
+
     @cached_property
     def text_size(self) -> int:
         """Size of the facts as JSON, in bytes."""
@@ -93,7 +101,7 @@ class Facts:
         """The facts as plain values, with format and scale."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values |= {"sensor": self.sensor.to_dict(), "fields": list(self.fields)}
-        return {"format": FORMAT, "scale": self.sensor.range_max / RANGE_STEPS, **values}
+        return {"format": self.format, "scale": self.sensor.range_max / RANGE_STEPS, **values}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], where: str) -> "Facts":
@@ -105,10 +113,13 @@ class Facts:
         """
         try:
             values = dict(values)
-            _check_format(values.pop("format", None), where)
+            given = values.pop("format", None)
+            _check_format(given, where)
             scale = values.pop("scale", None)
             facts = cls(**values | {"sensor": _sensor(values["sensor"]), "fields": tuple(values["fields"])})
             facts._check_kinds()
+            if given != facts.format:
+                raise ValueError(f"fields {facts.fields} in format {given!r}")
             expected = facts.encoding.scale
         except DataError:
             raise
@@ -301,6 +312,8 @@ class Index:
                 tuple(values.get("curation", ())),
                 {str(name): str(sha256) for name, sha256 in values.get("files", {}).items()},
             )
+            if values["format"] != index.sources[0].format:
+                raise ValueError(f"format {values['format']!r} of scans with {index.sources[0].fields}")
             if values["scans"] != index.scans:
                 raise ValueError(f"{values['scans']} scans, but its shards hold {index.scans}")
             for notes in (values["repairs"], values.get("curation", [])):
@@ -314,7 +327,7 @@ class Index:
 
     def _values(self) -> dict[str, Any]:
         values: dict[str, Any] = {
-            "format": FORMAT,
+            "format": self.sources[0].format,
             "scans": self.scans,
             "sources": [facts.to_dict() for facts in self.sources],
             "shards": [entry.to_dict() for entry in self.shards],
@@ -355,11 +368,13 @@ def _sum(values: Any) -> str:
 
 
 def _check_format(given: Any, where: str) -> None:
-    if given == FORMAT:
+    if given in (FORMAT, BOXED_FORMAT):
         return
     if str(given).startswith(FORMAT.rpartition("/")[0]):
         raise DataError(
-            f"{where} is of format {given!r}", repr(FORMAT), "Use the version of lidar_synth that wrote it."
+            f"{where} is of format {given!r}",
+            f"{FORMAT!r} or {BOXED_FORMAT!r}",
+            "Use the version of lidar_synth that wrote it.",
         )
     raise DataError(f"{where} is not part of a bank (format {given!r})", repr(FORMAT))
 

@@ -4,6 +4,8 @@ An HDF5 file. The root attributes are the bank's facts (see ``index``) and ``see
 The datasets are::
 
     range, reflectance, label, confidence   (scans, H, W), see ``encoding``; those in ``fields``
+    instance                                (scans, H, W), in "lidar-synth-bank/2"
+    boxes                                   (scans, 256, 9), see ``boxes``; in "lidar-synth-bank/2"
     seed, index                             (scans,) uint64: seed and index of the scan's noise
     condition                               (scans,) text, in conditional banks: name of the conditioning scan
     crc                                     (scans,) uint32: CRC-32 of a scan's seed, index, condition and arrays

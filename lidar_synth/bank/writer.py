@@ -180,8 +180,8 @@ class ShardWriter:
                 if ready:
                     self._datasets[name].id.write_direct_chunk((position, 0, 0), chunk)
                 else:
-                    shape, dtype = self.encoding.sensor.shape, self._types()[name]
-                    self._datasets[name][position] = np.frombuffer(chunk, dtype).reshape(shape)
+                    shape, _ = self.encoding.arrays()[name]
+                    self._datasets[name][position] = np.frombuffer(chunk, self._types()[name]).reshape(shape)
 
 
 def _create(name: str, facts: Facts, scans: int) -> h5py.File:

@@ -18,7 +18,8 @@ def sample(
     ] = None,
     solver: Annotated[str, typer.Option(help="ODE solver: euler | heun")] = "euler",
     condition: Annotated[
-        str | None, typer.Option(help="dataset with the labels or camera images that a conditional model needs")
+        str | None,
+        typer.Option(help="dataset with the labels, images or boxes that a conditional model needs, or a layout.yaml"),
     ] = None,
     condition_layout: Annotated[str | None, typer.Option(help="layout of that dataset [detected]")] = None,
     condition_split: Annotated[
@@ -45,6 +46,7 @@ def sample(
       lidar-synth sample out --count 100 --seed 7 --to semantic_kitti
       lidar-synth sample out --model runs/town_teacher/town_teacher.safetensors --steps 50
       lidar-synth sample out --model semantic.safetensors --condition SemanticKITTI --condition-split val
+      lidar-synth sample out --model town-layout --condition behind_a_van.yaml
     """
     import torch
     from tqdm import tqdm

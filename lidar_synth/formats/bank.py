@@ -1,4 +1,4 @@
-"""Reader of banks ("lidar-synth-bank/1"); ``lidar_synth.bank`` describes the format."""
+"""Reader of banks ("lidar-synth-bank/1" and /2); ``lidar_synth.bank`` describes the format."""
 
 from pathlib import Path
 

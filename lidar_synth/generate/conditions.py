@@ -1,10 +1,13 @@
-"""Conditions of generation: a label map or a camera image.
+"""Conditions of generation: a label map, a camera image or a layout.
 
-A condition is an array of integers, or a real ``Scan`` that provides it::
+A condition is an array of integers, a ``Layout``, or a real ``Scan`` that provides it::
 
     semantic   (H, W) uint8 train ids 0..18, 255 = unknown, on the model's sensor (``RangeImage.label``)
     camera     (3, h, w) uint8 red, green, blue, of the size that the model's encoder takes; or the image at
                ``Scan.image_path``, which is resized
+
+    layout     a ``Layout``, or (5, H, W) uint8, its image on the model's sensor (``layout_image``); a scan with boxes
+               provides its own layout
 
 An encoder (``models.encoders``), trained with the velocity network, encodes it as the ``cond`` of that network. A model
 that was also trained with blank conditions (``dropout``) can be guided: see ``flow.path.guided``.
@@ -23,9 +26,14 @@ from torch import Tensor, nn
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.parsing import read_picture
+from lidar_synth.geometry.layout import CHANNELS, CODES, Layout, layout_image, layout_of
+from lidar_synth.geometry.layout.layout import DEPTH_STEP, OUTLINES
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+
+HEIGHT_TOLERANCE = 0.35
+"""Metres between the heights of two sensors above the ground, up to which the layout of one suits the other."""
 
 
 class Condition(Protocol):
@@ -53,6 +61,10 @@ class Condition(Protocol):
 
     def check(self, values: Tensor) -> None:
         """Raise a DataError on invalid values."""
+        ...
+
+    def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
+        """Conditions (B, ...) that tell less, for training: u (B,) uniform numbers, ``views`` of a camera image."""
         ...
 
 
@@ -92,6 +104,10 @@ class SemanticMap:
                 "train ids 0..18, or 255 = unknown",
                 "lidar_synth.datasets.classes.SEMANTIC_KITTI.decode converts SemanticKITTI's file ids to train ids.",
             )
+
+    def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
+        """Unchanged."""
+        return values
 
 
 class CameraImage:
@@ -137,8 +153,68 @@ class CameraImage:
     def check(self, values: Tensor) -> None:
         """Accept all values, since every byte is a valid colour."""
 
+    def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
+        """One view of each image."""
+        return one_view(values, views)
 
-CONDITIONS: dict[str, Condition] = {"semantic": SemanticMap(), "camera": CameraImage()}
+
+class LayoutImage:
+    """The image of a layout on the model's grid."""
+
+    name = "layout"
+    field = "layout"
+    turns = True
+    blank = 0
+
+    def shape(self, encoder: nn.Module) -> tuple[int, ...]:
+        """(5, H, W)."""
+        return (len(CHANNELS), *encoder.resolution)  # type: ignore[misc]  # every encoder has a resolution
+
+    def read(
+        self, scan: Scan | Layout, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+    ) -> NDArray[np.uint8]:
+        """The image of a layout, or of the layout of a scan with boxes, on ``sensor``.
+
+        Raises:
+            DataError: on a scan without boxes, boxes out of the sensor's range, or the layout of a sensor that is
+                mounted at another height than that of the training, ``options["height"]`` (metres).
+        """
+        layout = layout_of(scan) if isinstance(scan, Scan) else scan
+        height = float(options.get("height") or -layout.ground[0])
+        if abs(layout.ground[0] + height) > HEIGHT_TOLERANCE:
+            raise DataError(
+                f"layout {layout.id!r} of a sensor {-layout.ground[0]:.2f} m above the ground",
+                f"{height:.2f} m, the height of the model's sensor",
+                "Raise or lower boxes, ground and outlines by the difference.",
+            )
+        distance = np.hypot(*layout.boxes.values[:, :2].T)
+        if isinstance(scan, Layout) and (far := distance > sensor.range_max).any():
+            raise DataError(
+                f"layout {layout.id!r}: box {int(far.argmax())} at {float(distance[far][0]):.1f} m",
+                f"boxes within the sensor's range of {sensor.range_max:g} m",
+            )
+        return layout_image(layout, sensor)
+
+    def check(self, values: Tensor) -> None:
+        """Check the codes of classes.
+
+        Raises:
+            DataError: on other codes.
+        """
+        codes = values[..., 0, :, :]
+        if len(wrong := codes[codes >= len(CODES)]):
+            raise DataError(f"a layout image with codes {sorted(set(wrong.tolist()))[:8]}", f"0..{len(CODES) - 1}")
+
+    def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
+        """Without outlines, and with the ground up to a distance that u tells, as most users' files are."""
+        code, ground = values[:, :1], CODES["ground"]
+        depth = (256 * values[:, 1:2].float() + values[:, 2:3]) * DEPTH_STEP
+        reach = 5 * 16 ** u.to(depth).view(-1, 1, 1, 1)  # 5 to 80 m
+        kept = (code > max(CODES[kind] for kind in OUTLINES)) | ((code == ground) & (depth < reach))
+        return torch.where(kept, values, 0)
+
+
+CONDITIONS: dict[str, Condition] = {"semantic": SemanticMap(), "camera": CameraImage(), "layout": LayoutImage()}
 """Conditions by name."""
 
 
@@ -185,8 +261,8 @@ def batch_of(
 
     Args:
         name: name of the model's condition.
-        given: a condition for all, or one for each: an array or tensor, a ``Scan`` or a sequence of them, or a
-            dictionary with one of these under ``name``, as a bank stores it.
+        given: a condition for all, or one for each: an array or tensor, a ``Scan`` or ``Layout`` or a sequence of them,
+            or a dictionary with one of these under ``name``, as a bank stores it.
         count: B.
         sensor: the model's sensor.
         shape: shape of one condition.
@@ -204,9 +280,10 @@ def batch_of(
         if name not in given:
             raise ConfigError(f"conditions {sorted(given)}", f"{name!r} among them")
         given = given[name]
-    if isinstance(given, Scan):
-        given = condition.read(given, sensor, shape, options)
-    elif isinstance(given, Sequence) and given and all(isinstance(scan, Scan) for scan in given):
+    readable = (Scan, Layout) if name == "layout" else Scan
+    if isinstance(given, readable):
+        given = condition.read(given, sensor, shape, options)  # type: ignore[arg-type]  # a layout for layouts only
+    elif isinstance(given, Sequence) and given and all(isinstance(scan, readable) for scan in given):
         given = np.stack([condition.read(scan, sensor, shape, options) for scan in given])
     if not isinstance(given, Tensor | np.ndarray):
         raise ConfigError(f"a condition of type {type(given).__name__}", "an array, a Scan, or a list of Scans")

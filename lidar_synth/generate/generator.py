@@ -20,6 +20,7 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow.path import Velocity, guided
 from lidar_synth.flow.solvers import solve, towards
+from lidar_synth.generate import boxed
 from lidar_synth.generate.checkpoint import CODEC, VELOCITY, Header, has_checksum, join, load_checkpoint, read_header
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, blank
@@ -117,9 +118,9 @@ class Generator:
 
     @property
     def fields(self) -> frozenset[str]:
-        """The fields of its scans: some of "reflectance", "label", "confidence"."""
+        """The fields of its scans: some of "reflectance", "label", "confidence", "instance" and "boxes"."""
         labelled = "label" in self.header.channels or self.condition == "semantic"
-        fields = set(self.header.channels) - {"range"}
+        fields = set(self.header.channels) - {"range"} | (boxed.FIELDS if self.condition == "layout" else set())
         return frozenset(fields | {"label", "confidence"} if labelled else fields)
 
     @property
@@ -137,16 +138,17 @@ class Generator:
             indices: indices of B scans, 0 <= index < 2^63, in any order.
             condition: one condition for all scans, or B of them; None for an unconditional model. A semantic map is a
                 (H, W) uint8 array of train ids, 255 = unknown, such as the ``label`` of a range image on the model's
-                sensor; a camera image is (3, h, w) uint8. A real ``Scan``, or a list of B, provides the condition
-                itself: its projected labels, or the image at its ``image_path``. In a dictionary of conditions, the
-                one with the condition's name is used. See ``conditions``.
+                sensor; a camera image is (3, h, w) uint8; a layout is a ``Layout``. A real ``Scan``, or a list of B,
+                provides the condition itself: its projected labels, the image at its ``image_path``, or its layout. In
+                a dictionary of conditions, the one with the condition's name is used. See ``conditions``.
             options: ``steps``, ``solver`` and ``guidance``; see ``SamplingOptions``.
 
         Returns:
             B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its ``confidence`` in
             [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0) where there is no return. If a
             model conditioned on semantic maps does not generate labels, ``label`` is the map's where there is a
-            return, with confidence 1 where the map's label is known.
+            return, with confidence 1 where the map's label is known. A model conditioned on a ``Layout`` or on the
+            layout of a scan gives the image the boxes that hold a return, and their numbers in ``instance``.
 
         Raises:
             ConfigError: on an invalid seed, index, number of steps or solver, a condition for an unconditional model,
@@ -161,7 +163,8 @@ class Generator:
             for image, labels in zip(images, given.cpu().numpy(), strict=True):
                 image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(np.uint8)
                 image.channels["confidence"] = (image.channels["label"] != IGNORE).astype(np.float32)
-        return images
+        boxes = boxed.boxes_of(condition, len(indices)) if self.condition == "layout" else None
+        return images if boxes is None else [boxed.with_boxes(*pair) for pair in zip(images, boxes, strict=True)]
 
     def scans(
         self, seed: int, indices: Sequence[int], condition: Any = None, **options: Unpack[SamplingOptions]

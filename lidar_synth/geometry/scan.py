@@ -87,6 +87,11 @@ class Boxes:
         picked = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name not in ("names", "dont_care")}
         return replace(self, names=tuple(self.names[i] for i in keep), **picked)
 
+    def enlarged(self, margin: float) -> "Boxes":
+        """The boxes with a margin in metres on all six sides."""
+        added = np.array([0, 0, 0, 2 * margin, 2 * margin, 2 * margin, 0], np.float32)
+        return replace(self, values=self.values + added)
+
     def corners(self) -> NDArray[np.float32]:
         """(M, 8, 3) corners in metres: the four of the bottom counter-clockwise from front left, then the top's."""
         unit = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
@@ -212,6 +217,7 @@ class RangeImage:
         sensor: the sensor that defines the rows and columns.
         channels: {name: (H, W)}, further values of each cell. Channels named in ``POINT_FIELDS`` become fields of the
             scan when the image is unprojected. A cell without a return holds 0, and 255 (ignore) in ``label``.
+        boxes: of the objects, which become those of the scan.
 
     Raises:
         DataError: on a shape that is not the sensor's.
@@ -229,6 +235,7 @@ class RangeImage:
     range: NDArray[np.float32]
     sensor: Sensor
     channels: dict[str, NDArray[Any]] = field(default_factory=dict)
+    boxes: Boxes | None = None
 
     def __post_init__(self) -> None:
         for name, values in {"range": self.range, **self.channels}.items():

@@ -94,8 +94,8 @@ def boxes(real: Source | None, fields: frozenset[str]) -> OwnBoxes:
     if "boxes" not in fields:
         raise ConfigError(
             f"labels='boxes', but besides points the synthetic scans only have {sorted(fields) or 'no fields'}",
-            "scans with boxes, such as the town's",
-            "Scans of a bank or a model have none: labels='mix' pastes objects with their boxes.",
+            "scans with boxes, such as the town's or those of a layout model",
+            "Other models generate none: labels='mix' pastes objects with their boxes.",
         )
     return OwnBoxes()
 

@@ -18,6 +18,7 @@ from lidar_synth.models.encoders.calibrated_camera import SightEncoder
 from lidar_synth.models.encoders.camera_views import ViewEncoder
 from lidar_synth.models.encoders.clip_views import ClipViewEncoder
 from lidar_synth.models.encoders.label_maps import SemanticMapEncoder
+from lidar_synth.models.encoders.layouts import LayoutEncoder
 from lidar_synth.models.hdit.denoiser import Denoiser
 from lidar_synth.models.hdit.hdit import HDiT
 from lidar_synth.models.lidm.diffusion import DiffusionUNet
@@ -36,6 +37,7 @@ NETWORKS: dict[str, type[Network]] = {
     "autoencoder": Autoencoder,
     "surfaces": SurfaceAutoencoder,
     "semantic_map": SemanticMapEncoder,
+    "layout": LayoutEncoder,
     "views": ViewEncoder,
     "clip_views": ClipViewEncoder,
     "sight": SightEncoder,

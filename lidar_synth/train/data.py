@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.codec import Codec
-from lidar_synth.generate.conditions import CONDITIONS, blank, one_view
+from lidar_synth.generate.conditions import CONDITIONS, blank
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.noise import gaussian, uniform
 from lidar_synth.train.cache import ImageCache
@@ -48,13 +48,13 @@ class Conditioning:
     Args:
         name: of ``CONDITIONS``.
         dropout: share of samples with a blank condition, so that the model can be guided.
-        view_dropout: share of camera images that keep only one view.
+        reduction: share of conditions that tell less: one view of a camera image, a layout without outlines.
         views: number of views of a camera image.
     """
 
     name: str
     dropout: float = 0.0
-    view_dropout: float = 0.0
+    reduction: float = 0.0
     views: int = 1
 
 
@@ -132,11 +132,12 @@ class Batches:
         return torch.from_numpy(values).to(self.device)
 
     def _dropped(self, cond: Tensor, draws: Tensor) -> Tensor:
-        """Conditions (B, ...) with dropout: some blank, some reduced to one view."""
+        """Conditions (B, ...) with dropout: some blank, some reduced."""
         assert self.conditioning is not None
         about = self.conditioning
-        if about.view_dropout:
-            cond = _where(draws[:, 4] < about.view_dropout, one_view(cond, about.views), cond)
+        if about.reduction:
+            less = CONDITIONS[about.name].reduced(cond, draws[:, 4] / about.reduction, about.views)
+            cond = _where(draws[:, 4] < about.reduction, less, cond)
         return _where(draws[:, 3] < about.dropout, blank(about.name, cond), cond) if about.dropout else cond
 
 

@@ -180,8 +180,8 @@ def open_data(config: Run, plan: TrainingPlan, device: torch.device) -> Batches:
     for name, options in plan.header.conditioning.items():
         condition, encoder = CONDITIONS[name], plan.parts(plan.network)[ENCODER]
         shape = condition.shape(encoder)
-        shares = {key: options.get(key, 0.0) for key in ("dropout", "view_dropout")}
-        conditioning = Conditioning(name, **shares, views=getattr(encoder, "views", 1))
+        less = options.get("view_dropout", 0.0) or options.get("outline_dropout", 0.0)
+        conditioning = Conditioning(name, options.get("dropout", 0.0), less, getattr(encoder, "views", 1))
         if condition.field == "label":  # a channel of the range image
             channels.add("label")
         else:

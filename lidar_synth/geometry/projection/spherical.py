@@ -178,7 +178,7 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
         pick_returns(flat, values, picked)
         fields[name] = picked[:count]
     fields.setdefault("reflectance", np.zeros(count, np.float32))
-    return Scan(points[:count], sensor=image.sensor, **fields)
+    return Scan(points[:count], sensor=image.sensor, boxes=image.boxes, **fields)
 
 
 def _checked(points: NDArray[Any]) -> NDArray[np.float32]:

@@ -132,20 +132,24 @@ class Condition(Section):
     """The condition of a model.
 
     Args:
-        kind: a name of ``CONDITIONS``: "semantic" or "camera".
+        kind: a name of ``CONDITIONS``: "semantic", "camera" or "layout".
         encoder: architecture of the encoder; by default the first one for this kind.
         arguments: arguments of the encoder, without sizes, which follow from the data.
         dropout: share of blank conditions in training; above 0, classifier-free guidance is possible.
         view_dropout: share of camera images of which only one view is kept.
+        outline_dropout: share of layouts without outlines, with the ground of a random surrounding only.
+        height: metres of the sensor above the ground, which a layout has to confirm.
         image: rows and columns of the camera's images.
         focal: focal length of the camera in pixels, which the dataset's calibration has to confirm.
     """
 
-    kind: Literal["semantic", "camera"]
+    kind: Literal["semantic", "camera", "layout"]
     encoder: str | None = None
     arguments: dict[str, Any] = {}
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
     view_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    outline_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    height: Annotated[float, Field(gt=0)] | None = None
     image: tuple[Count, Count] | None = None
     focal: Annotated[float, Field(gt=0)] | None = None
 
@@ -164,5 +168,7 @@ class Condition(Section):
 
     def options(self) -> dict[str, Any]:
         """What the checkpoint's header says about it."""
-        values = self.model_dump(mode="json", include={"dropout", "view_dropout", "image", "focal"})
+        values = self.model_dump(
+            mode="json", include={"dropout", "view_dropout", "outline_dropout", "height", "image", "focal"}
+        )
         return {key: value for key, value in values.items() if value}

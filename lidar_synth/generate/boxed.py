@@ -1,0 +1,52 @@
+"""Boxes of generated scans: those of the layout that conditioned a scan, and the instances of its points."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.datasets.classes import TRAIN_ID
+from lidar_synth.geometry.layout import Layout, known_boxes
+from lidar_synth.geometry.projection import unproject
+from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
+
+TOLERANCE = 0.1
+"""Metres outside a box within which a point belongs to it."""
+
+FIELDS = frozenset(("boxes", "instance"))
+"""What the scans of a layout have besides those of other models."""
+
+GROUND = [TRAIN_ID[name] for name in ("road", "parking", "sidewalk", "other-ground", "terrain")]
+"""Train ids of returns that belong to no box."""
+
+
+def boxes_of(given: Any, count: int) -> list[Boxes] | None:
+    """The boxes of the layouts of ``count`` scans; None where conditions are images, which do not tell them.
+
+    Args:
+        given: the argument ``condition`` of ``Generator.range_images``.
+        count: number of scans.
+    """
+    if isinstance(given, Mapping):
+        given = given.get("layout")
+    each = list(given) if isinstance(given, Sequence) else [given] * count
+    if not all(isinstance(one, Scan | Layout) and one.boxes is not None for one in each):
+        return None
+    return [one.boxes if isinstance(one, Layout) else known_boxes(one.boxes) for one in each]
+
+
+def with_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
+    """An image with those boxes that hold a return, and the channel ``instance``: 1 for the returns in the first of
+    them, and so on; 0 = none. Returns of the ground belong to no box."""
+    scan = unproject(image)
+    inside = boxes.enlarged(TOLERANCE).contain(scan.points)
+    if scan.label is not None:
+        inside &= ~np.isin(scan.label, GROUND)
+    held = inside.any(1)
+    kept, inside = boxes[held], inside[held]
+    kept = replace(kept, instance=np.arange(1, len(kept) + 1, dtype=np.int32))
+    instance = np.zeros(image.range.shape, np.int32)
+    if len(kept):
+        instance[image.mask] = np.where(inside.any(0), inside.argmax(0) + 1, 0)
+    return replace(image, channels={**image.channels, "instance": instance}, boxes=kept)

@@ -1,0 +1,136 @@
+"""The layout of a scan: its boxes, and the ground and the outlines that its points show."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.layout.layout import CLASSES, Layout, Outline, around_sensor, overlaps
+from lidar_synth.geometry.scan import Boxes, Scan
+
+KINDS = {"building": ("building",), "vegetation": ("vegetation", "trunk"), "fence": ("fence",)}
+"""The classes of points behind each kind of outline."""
+
+SECTORS = 512
+"""Directions in which an outline has a corner."""
+
+_GROUND = [TRAIN_ID[name] for name in ("road", "parking", "sidewalk", "other-ground", "terrain")]
+_LEAST = 3  # returns of an outline in a sector
+_GAP = 1.5  # metres between the first wall of a sector and what stands behind it; and between connected sectors
+_STEP = 0.5  # metres by which the edges of connected sectors may differ, before they are two outlines
+_EDGE = 0.05  # metres between the outermost return and the edge of an outline
+_FLAT = 0.3  # metres; the returns of a building in one sector differ less in their distance, without labels
+_CLEAR = 0.3  # metres above the ground of what stands on it, without labels
+_NEAR = 30.0  # metres around the sensor in which the ground is a plane
+_CUBE = 1.0  # metres; side of the columns whose lowest return may be ground, without labels
+
+
+def layout_of(scan: Scan, reach: float | None = None) -> Layout:
+    """The layout of a scan.
+
+    Args:
+        scan: N points and boxes. Ground and outlines are those of its labels; a scan without labels has the plane of
+            its lowest returns, and outlines of what stands on it.
+        reach: of the ground, metres; by default the sensor's range.
+
+    Raises:
+        DataError: on a scan without boxes, or with fewer than 20 returns of the ground.
+    """
+    if scan.boxes is None:
+        raise DataError(f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects")
+    label = scan.label if scan.label is not None and (scan.label != IGNORE).any() else None
+    ground = _plane(_lowest(scan.points) if label is None else scan.points[np.isin(label, _GROUND)], scan.id)
+    outlines = list(_unlabelled(scan, ground) if label is None else _labelled(scan.points, label))
+    return Layout(known_boxes(scan.boxes), ground, outlines, reach or scan.sensor.range_max, scan.id)
+
+
+def known_boxes(boxes: Boxes) -> Boxes:
+    """The boxes of known classes; of overlapping ones the first, and none around the sensor."""
+    keep = np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)
+    boxes = boxes[keep]
+    later = {j for _, j in overlaps(boxes)}
+    return boxes[[i for i in range(len(boxes)) if i not in later]] if later else boxes
+
+
+def _plane(points: NDArray[np.float32], name: str) -> tuple[float, float, float]:
+    """The plane z = a + b x + c y through ground returns near the sensor, by repeated least squares."""
+    near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR].astype(np.float64)
+    if len(near) < 20:
+        raise DataError(f"scan {name!r} with {len(near)} returns of the ground", "20 or more")
+    plane, kept = np.zeros(3), near
+    for limit in (0.5, 0.2):
+        design = np.c_[np.ones(len(kept)), kept[:, :2]]
+        # Returns crowd near the sensor; the weight makes the plane fit everywhere. A level plane is preferred.
+        weight = np.hypot(kept[:, 0], kept[:, 1])[:, None]
+        normal = design.T @ (weight * design) + np.diag([0.0, 1e3, 1e3])
+        plane = np.linalg.solve(normal, design.T @ (weight[:, 0] * kept[:, 2]))
+        distance = np.abs(near[:, 2] - np.c_[np.ones(len(near)), near[:, :2]] @ plane)
+        kept = near[distance < limit] if (distance < limit).sum() >= 20 else kept
+    return float(plane[0]), float(plane[1]), float(plane[2])
+
+
+def _lowest(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The lowest return of each column of 1 m x 1 m, where it lies below the sensor."""
+    below = points[points[:, 2] < -0.5]
+    cell = np.floor(below[:, :2] / _CUBE).astype(np.int64) @ (1 << 20, 1)
+    order = np.lexsort((below[:, 2], cell))
+    _, first = np.unique(cell[order], return_index=True)
+    return below[order[first]]
+
+
+def _labelled(points: NDArray[np.float32], label: NDArray[np.uint8]) -> Iterator[Outline]:
+    for kind, classes in KINDS.items():
+        for profile in _profiles(points[np.isin(label, [TRAIN_ID[name] for name in classes])]):
+            yield Outline(kind, profile[:, :2], profile[:, 2], profile[:, 3])
+
+
+def _unlabelled(scan: Scan, ground: tuple[float, float, float]) -> Iterator[Outline]:
+    """Outlines of what stands on the ground outside all boxes: flat things are buildings, others vegetation."""
+    height = scan.points[:, 2] - (ground[0] + scan.points[:, :2] @ np.array(ground[1:], np.float32))
+    assert scan.boxes is not None
+    for profile in _profiles(scan.points[(height > _CLEAR) & ~scan.boxes.contain(scan.points).any(0)]):
+        kind = "building" if np.median(profile[:, 4]) < _FLAT else "vegetation"
+        yield Outline(kind, profile[:, :2], profile[:, 2], profile[:, 3])
+
+
+def _profiles(points: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
+    """The first thing in each sector, connected to lines: (K, 5) x, y, lowest z, highest z, depth of its returns."""
+    rho, azimuth = np.hypot(points[:, 0], points[:, 1]), -np.arctan2(points[:, 1], points[:, 0])
+    sector = ((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
+    order = np.lexsort((rho, sector))
+    rho, sector, z = rho[order], sector[order], points[order, 2]
+    rows = []
+    for number, start, stop in _groups(sector):
+        # The first run of returns without a gap that has enough of them.
+        ends = np.append(np.flatnonzero(np.diff(rho[start:stop]) > _GAP) + 1, stop - start)
+        first, last = next(((a, b) for a, b in zip(np.r_[0, ends[:-1]], ends, strict=True) if b - a >= _LEAST), (0, 0))
+        if last:
+            part = slice(start + first, start + last)
+            near, far = np.quantile(rho[part], (0.1, 0.9))
+            middle = float(np.median(rho[part]))
+            rows.append((number, middle, z[part].min() - _EDGE, z[part].max() + _EDGE, far - near))
+    yield from _connected(np.array(rows, np.float64).reshape(-1, 5))
+
+
+def _groups(sector: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
+    """(sector, first, last + 1) of sorted sectors."""
+    numbers, starts = np.unique(sector, return_index=True)
+    yield from zip(numbers.tolist(), starts.tolist(), np.append(starts, len(sector))[1:].tolist(), strict=True)
+
+
+def _connected(rows: NDArray[np.float64]) -> Iterator[NDArray[np.float32]]:
+    """Lines of neighbouring sectors with similar distance and edges; a sector alone is a line across it."""
+    if not len(rows):
+        return
+    gap = np.abs(np.diff(rows, axis=0))
+    allowed = np.maximum(_GAP, 0.15 * rows[1:, 1])
+    breaks = (gap[:, 0] > 1) | (gap[:, 1] > allowed) | (gap[:, 2] > _STEP) | (gap[:, 3] > _STEP)
+    for line in np.split(rows, np.flatnonzero(breaks) + 1):
+        # Half a sector on both sides, so that lines of neighbouring sectors meet.
+        edges = np.r_[line[0, 0], line[:, 0] + 0.5, line[-1, 0] + 1]
+        padded = np.r_[line[:1], line, line[-1:]]
+        azimuth = (edges / SECTORS - 0.5) * 2 * np.pi
+        corners = np.c_[padded[:, 1] * np.cos(azimuth), -padded[:, 1] * np.sin(azimuth), padded[:, 2:]]
+        yield corners.astype(np.float32)
