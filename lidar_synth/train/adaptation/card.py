@@ -140,7 +140,7 @@ def write_card(path: Path, checkpoint: Path, work: Work, header: Header, found: 
         f"of training scans, to another one | {near['training']:.3f}",
         "",
         f"{near['closer']:.0%} of the generated scans are nearer to a training scan than 95 % of the held-out ones "
-        "are. About 5 % are expected of new scans; many more are copies, or scans more ordinary than the held-out ones.",
+        "are. About 5 % are expected of new scans; many more are copies, or scans that are more ordinary.",
         "",
     ]  # fmt: skip
     write_file(path, "\n".join(lines).encode())

@@ -21,6 +21,8 @@ ENDLESS = 10**9
 """Iterations of a stage: the limit of time or early stopping ends it."""
 TOWN_SEED, TOWN_HELD, TOWN_HELD_SCANS = 0, 7100, 16
 """Seeds of the towns to train on and to hold out, and the scans that are held out."""
+CODEC_SAMPLES, FLOW_SAMPLES = 12, 32
+"""Samples of a measurement on held-out scans."""
 INTERVAL = 2.0
 """Seconds between two scans of the town."""
 TOWN_LICENCE = "MIT (procedural, no one's data)"
@@ -152,12 +154,13 @@ class Work:
         stage = self.stages[name]
         data = self._town(TOWN_SEED, self.town) if stage.town else self._scans(TRAIN)
         held = self._town(TOWN_HELD, min(TOWN_HELD_SCANS, self.town)) if stage.town else self._scans(HELD)
-        latents = {"latents": self.latent and stage.recipe != "adapt_codec"}
+        codec = stage.recipe == "adapt_codec"
+        latents = {"latents": self.latent and not codec}
         values: dict[str, Any] = {
             "output": str(self.run_folder(name)),
             "licence": self.licence,
             "data": data | latents,
-            "held_out": {"data": held | latents | {"flip": True}},
+            "held_out": {"data": held | latents | {"flip": True}, "samples": CODEC_SAMPLES if codec else FLOW_SAMPLES},
             "recipe": {"iterations": ENDLESS},
         }
         if name == "student":

@@ -39,7 +39,7 @@ class Data(Section):
         cache: folder of the projected scans; by default ``cache`` in the output folder.
         flip: mirror every other sample.
         roll: rotate every sample by a random number of columns.
-        latents: cache the latents of the autoencoder too; not with ``roll``.
+        latents: cache the latents of the autoencoder too.
         seen: recordings behind the scans, where ``path`` has copies of them (``Recordings.to_list``); by default they
             follow from the layout.
     """
