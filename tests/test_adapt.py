@@ -40,6 +40,7 @@ from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, sensor_yaml
 from lidar_synth.models import build_network
+from lidar_synth.train.adaptation import card
 from lidar_synth.train.adaptation.scans import split
 from lidar_synth.train.held_out import read_history
 
@@ -52,11 +53,14 @@ QUICK = dict.fromkeys(STAGES, SHORT)
 
 
 @pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
+def short() -> Iterator[None]:
+    """One thread, and few scans to look for copies."""
+    threads, count = torch.get_num_threads(), card.GENERATED
     torch.set_num_threads(1)
+    card.GENERATED = 3
     yield
     torch.set_num_threads(threads)
+    card.GENERATED = count
     AcceleratorState._reset_state(True)
 
 

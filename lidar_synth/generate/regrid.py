@@ -82,7 +82,8 @@ def regrid(model: Checkpoint, sensor: Sensor) -> tuple[Header, dict[str, nn.Modu
             ``PLACED``.
     """
     check_movable(model.header)
-    networks, parts = {}, {}
+    networks: dict[str, nn.Module] = {}
+    parts: dict[str, NetworkSpec] = {}
     for name in sorted(model.networks):  # the autoencoder first: it gives the shape of the states
         part = model.header.networks[name]
         shape = sensor.shape

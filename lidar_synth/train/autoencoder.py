@@ -145,6 +145,7 @@ class Autoencoding(nn.Module):
         """The images (B, C, H, W), some of them without labels."""
         if not self.losses.unlabelled:
             return x
+        assert isinstance(self.network, Autoencoder | SurfaceAutoencoder)
         bits = self.network.bits
         blank = encode_labels(torch.full_like(x[:, 0], IGNORE, dtype=torch.uint8))
         chosen = torch.special.ndtr(noise[:, -1, -1, -1]) < self.losses.unlabelled
