@@ -3,6 +3,7 @@
 import json
 import os
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from lidar_synth import __version__
 from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.errors import ConfigError
 from lidar_synth.evaluate.leakage import inherited, recordings_of, town
@@ -173,5 +173,5 @@ def provenance_of(config: Run) -> dict[str, Any]:
         "data_licence": config.data.licence,
         "licence": config.licence,
         "recipe": config.model_dump(mode="json", exclude=beside),
-        "software": f"lidar_synth {__version__}, torch {torch.__version__}",
+        "software": f"lidar_synth {version('lidar_synth')}, torch {torch.__version__}",
     }

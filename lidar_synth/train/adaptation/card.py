@@ -5,6 +5,7 @@ those of held-out real scans, in the features of the shipped segmenter.
 """
 
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lidar_synth import __version__
 from lidar_synth.evaluate.leakage import seen_by
 from lidar_synth.evaluate.neighbours import nearest_training
 from lidar_synth.evaluate.segmentation import load_judge
@@ -100,7 +100,7 @@ def provenance_of(name: str, model: Checkpoint, work: Work, made: Checkpoint, fo
         "scans": {"train": list(work.scans.train), "held_out": list(work.scans.held_out)},
         "seen": seen_by(made.header.provenance).to_list(),
         "figures": found,
-        "software": f"lidar_synth {__version__}, torch {torch.__version__}",
+        "software": f"lidar_synth {version('lidar_synth')}, torch {torch.__version__}",
     }
 
 
