@@ -106,7 +106,7 @@ def measure(given: argparse.Namespace) -> None:
 
 
 def autoencoder_row(name: str, model: str, sensor: Sensor, scans: Sequence[Scan]) -> NDArray[np.float64]:
-    """Print a model's figures on encoded and decoded scans; return the IoU of each class, (19,).
+    """Print a model's figures on encoded and decoded scans; return the IoU of each class, (19,), NaN where it is not labelled.
 
     A model of another sensor is moved to the grid first; cells are sampled, as they are when scans are generated.
     """
@@ -129,7 +129,7 @@ def autoencoder_row(name: str, model: str, sensor: Sensor, scans: Sequence[Scan]
         np.add.at(table, (real[decoded], label[decoded]), 1)
     returns, labels, near, error = sums[:4] / sums[4]
     print(f"| {name} | {100 * returns:.1f} | {100 * labels:.1f} | {100 * near:.1f} | {error:.2f} |")
-    return class_ious(table)
+    return np.where(table.sum(1) > 0, class_ious(table), np.nan)
 
 
 def generate(model: str, count: int) -> list[Scan]:
