@@ -106,7 +106,7 @@ def measure(given: argparse.Namespace) -> None:
 
 
 def autoencoder_row(name: str, model: str, sensor: Sensor, scans: Sequence[Scan]) -> NDArray[np.float64]:
-    """Print a model's figures on encoded and decoded scans; return the IoU of each class, (19,), NaN where it is not labelled.
+    """Print a model's figures on encoded and decoded scans; return the IoU of each class, (19,), NaN without a label.
 
     A model of another sensor is moved to the grid first; cells are sampled, as they are when scans are generated.
     """
