@@ -44,6 +44,7 @@ _HOME = {
     "SensorFit": "geometry.fitting",
     "Town": "town",
     "Trajectory": "geometry.fitting",
+    "adapt": "train.adaptation",
     "assign_beams": "geometry.fitting",
     "deskew": "geometry.fitting",
     "fit_sensor": "geometry.fitting",
@@ -108,6 +109,7 @@ if TYPE_CHECKING:
     from lidar_synth.town import Town as Town
     from lidar_synth.town import fit_skin as fit_skin
     from lidar_synth.town import load_skin as load_skin
+    from lidar_synth.train.adaptation import adapt as adapt
 
 
 def __getattr__(name: str) -> Any:

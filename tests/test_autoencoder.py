@@ -1,5 +1,6 @@
 """The small autoencoder: what it says of every cell, its loss, and latents that are made once."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from lidar_synth.flow.path import METRICS
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models import build_network
 from lidar_synth.models.town_codec.autoencoder import ROUGHNESS, Autoencoder
@@ -52,8 +54,12 @@ def network(**arguments: Any) -> Autoencoder:
     return net.eval()
 
 
+def images() -> list[RangeImage]:
+    return [project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS]
+
+
 def tensors() -> Tensor:
-    return TENSORS.from_images([project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS])
+    return TENSORS.from_images(images())
 
 
 @pytest.mark.parametrize("arguments", [{}, {"wide": (1, 2)}, {"window": (3, 3)}])
@@ -268,7 +274,32 @@ def test_latents_that_were_made_before_are_those_that_are_made_on_the_way(on_dis
     assert not np.array_equal(cache_latents(cache, TENSORS, other, "cpu", folder, "b", progress=False), latents)
 
 
-def test_latents_cannot_be_turned() -> None:
+def test_latents_that_are_turned_are_those_of_turned_scans() -> None:
     cache = cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False)
-    with pytest.raises(ConfigError, match="latents=false"):
-        Batches(cache, TENSORS, roll=True, latents=np.zeros((2, 4, 8, 2, 4), np.float16))
+    codec = make_codec(network(), TENSORS, SENSOR.shape)
+    latents = cache_latents(cache, TENSORS, codec, "cpu", progress=False)
+    held = Batches(cache, TENSORS, flip=True, roll=True, codec=codec, latents=latents)
+    found = set()
+    for y0, scan in zip(held(range(16)).y0, held.scans_at(range(16)), strict=True):
+        x = TENSORS.encode(cache.read([scan]))
+        turned = {
+            (mirrored, k): codec.encode((x.flip(-1) if mirrored else x).roll(8 * k, -1))[0]
+            for mirrored in (False, True)
+            for k in range(4)
+        }
+        [match] = [key for key, z in turned.items() if torch.allclose(z, y0, atol=2e-3)]
+        found.add(match)
+    assert {mirrored for mirrored, _ in found} == {False, True} and {k for _, k in found} == set(range(4))
+
+
+def test_images_whose_labels_are_hidden_are_decoded_to_their_labels_anyway() -> None:
+    x, net = tensors(), network()
+    whole, hidden = (
+        Autoencoding(net, TENSORS, SENSOR, Losses(noise=0.0, unlabelled=share), METRICS["l1"], {}).eval()
+        for share in (0.0, 1.0)
+    )
+    blank = TENSORS.from_images(
+        [replace(i, channels={**i.channels, "label": np.full_like(i.channels["label"], IGNORE)}) for i in images()]
+    )
+    torch.testing.assert_close(hidden(x), whole.nll(net(blank, torch.zeros(len(x), 8, 2, 4)), x))
+    assert hidden(x) != whole(x)

@@ -30,6 +30,7 @@ LIMITS = {
     "docs/how-to/another-sensor.md": 180,
     "docs/how-to/skin.md": 170,
     "docs/how-to/measure.md": 270,
+    "docs/how-to/adapt.md": 160,
     "docs/how-to/train-a-generator.md": 380,
     "docs/how-to/edit.md": 160,
     "docs/how-to/layouts.md": 150,

@@ -83,7 +83,7 @@ def test_a_sequence_of_the_benchmark_is_a_part_of_a_raw_drive() -> None:
 def test_frames_without_a_number_count_as_the_complete_drive() -> None:
     assert frames_of("kitti360", ["drive/left", "drive/0000000001"]).drives == {(KITTI360, "drive"): None}
     assert not frames_of("npz", ["drive/0000000001"])
-    assert set(PLACES) == {"kitti360", "kitti_raw", "semantic_kitti", "kitti_object"}
+    assert set(PLACES) == {"kitti360", "kitti_raw", "semantic_kitti", "kitti_object", "pandaset"}
 
 
 def test_many_holes_are_kept_as_one_run() -> None:

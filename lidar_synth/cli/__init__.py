@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from lidar_synth import __version__
+from lidar_synth.cli.adapt import adapt
 from lidar_synth.cli.bake import bake
 from lidar_synth.cli.bank import bank, info, repair, verify
 from lidar_synth.cli.convert import convert
@@ -46,6 +47,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "distill": distill,
     "evaluate": evaluate,
     "prove": prove,
+    "adapt": adapt,
     "import": import_,
     "doctor": doctor,
 }

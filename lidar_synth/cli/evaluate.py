@@ -61,7 +61,7 @@ def evaluate(
     from lidar_synth.evaluate.comparison import check_counts
     from lidar_synth.evaluate.features import describe_missing
     from lidar_synth.evaluate.leaderboard import beside as published
-    from lidar_synth.evaluate.leakage import measured
+    from lidar_synth.evaluate.leakage import measured, seen_by_model_of
     from lidar_synth.evaluate.segmentation import load_judge
     from lidar_synth.formats import layout_of, open_scans
 
@@ -70,8 +70,8 @@ def evaluate(
     if judge is None and protocol not in PROTOCOLS:
         raise typer.BadParameter(f"{protocol!r} is none of {', '.join(PROTOCOLS)}", param_hint="--protocol")
     sources = open_scans(real, sensor=sensor, split=split), open_scans(fake, sensor=sensor)
-    if not training_data:
-        _refuse_training_data(measured(sources[0], layout_of(real), real, split), real, fake)
+    if not training_data and (seen := seen_by_model_of(fake)) is not None:
+        _refuse_training_data(seen, measured(sources[0], layout_of(real), real, split, seen), real, fake)
     if judge is not None:
         _recognition(judge, columns, sources, as_json)
         return
@@ -102,14 +102,11 @@ def _recognition(folder: Path, columns: int | None, sources: "tuple[Source, Sour
     typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
 
 
-def _refuse_training_data(reference: "Recordings", real: Path, fake: Path) -> None:
-    """Refuse a reference that contains training data of the model, where the generated scans record it."""
+def _refuse_training_data(seen: "Recordings", reference: "Recordings", real: Path, fake: Path) -> None:
+    """Refuse a reference that contains scans that the model of the generated ones has seen."""
     from lidar_synth.errors import ConfigError
-    from lidar_synth.evaluate.leakage import overlap, seen_by_model_of, undecided
+    from lidar_synth.evaluate.leakage import overlap, undecided
 
-    seen = seen_by_model_of(fake)
-    if seen is None:
-        return
     if shared := overlap(seen, reference):
         raise ConfigError(
             f"{real} as a reference for {fake}, whose model was trained on {shared} of it",

@@ -16,8 +16,10 @@ from typing import Any
 
 from lidar_synth.errors import DataError
 
-KITTI360, KITTI, KITTI_OBJECT, TOWN, FILES = "KITTI-360", "KITTI", "KITTI object", "town", "files"
-"""Names of datasets. A drive of the town is a seed; a drive of ``FILES`` is a path with scans of an unknown dataset."""
+KITTI360, KITTI, KITTI_OBJECT, PANDASET = "KITTI-360", "KITTI", "KITTI object", "PandaSet"
+TOWN, FILES, CONTENT = "town", "files", "content"
+"""Names of datasets. A drive of the town is a seed; a drive of ``FILES`` is a path with scans of an unknown dataset; a
+drive of ``CONTENT`` is the hash of a single scan, wherever it lies."""
 
 Frames = tuple[tuple[int, int], ...] | None
 """Frames of a drive as increasing intervals (first, last); None = all."""
@@ -158,6 +160,7 @@ PLACES: dict[str, Callable[[str], Place]] = {
     "kitti_raw": lambda drive: (KITTI, drive.removesuffix("_sync").removesuffix("_extract"), 0, None),
     "semantic_kitti": _sequence,
     "kitti_object": lambda part: (KITTI_OBJECT, part, 0, None),
+    "pandaset": lambda sequence: (PANDASET, sequence, 0, None),
 }
 """{layout: function from its drive to the recording}."""
 

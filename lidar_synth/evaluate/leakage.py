@@ -5,14 +5,18 @@ those of its teacher, its initial weights and its autoencoder. Provenances of ve
 or a path; a split with known drives is replaced by these drives, a path is kept as a path.
 """
 
+import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidar_synth.bank import Bank, is_bank
 from lidar_synth.datasets.recordings import (
+    CONTENT,
     FILES,
     KITTI,
     KITTI360,
@@ -30,6 +34,7 @@ from lidar_synth.formats import BankScans
 from lidar_synth.formats.semantic_kitti import SPLITS as SEMANTIC_KITTI_SPLITS
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.generate.importers import lidm
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.town.export import SETTINGS
 
 
@@ -92,9 +97,28 @@ def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recording
     return frames_of(layout, source.ids) if layout in PLACES else whole(FILES, [str(path)])
 
 
-def measured(source: ScanFiles, layout: str, path: Path, split: str | None) -> Recordings:
-    """The recordings of a reference, and its path: data on which an evaluated model must not have been trained."""
-    return recordings_of(source, layout, path) | whole(FILES, [str(path)] + ([f"{path}#{split}"] if split else []))
+def measured(
+    source: ScanFiles, layout: str, path: Path, split: str | None, seen: Recordings | None = None
+) -> Recordings:
+    """The recordings of a reference, and its path: data on which an evaluated model must not have been trained.
+
+    The scans are read and hashed if the model has ``seen`` scans that only their hashes identify.
+    """
+    found = recordings_of(source, layout, path) | whole(FILES, [str(path)] + ([f"{path}#{split}"] if split else []))
+    hashed = seen is not None and layout not in PLACES and any(dataset == CONTENT for dataset, _ in seen.drives)
+    return found | contents(map(content_of, source)) if hashed else found
+
+
+def content_of(scan: Scan) -> str:
+    """Hash of the points and the reflectance of a scan, which identifies it in any folder."""
+    digest = hashlib.sha256(np.ascontiguousarray(scan.points, np.float32).tobytes())
+    digest.update(np.ascontiguousarray(scan.reflectance, np.float32).tobytes())
+    return digest.hexdigest()[:32]
+
+
+def contents(hashes: Iterable[str]) -> Recordings:
+    """Scans that their hashes identify, see ``content_of``."""
+    return whole(CONTENT, hashes)
 
 
 def overlap(seen: Recordings, reference: Recordings) -> Recordings:

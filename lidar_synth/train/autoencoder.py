@@ -26,10 +26,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError
 from lidar_synth.flow.path import Example, Metric
 from lidar_synth.generate.codec import Latent, expected
-from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
+from lidar_synth.geometry.normalize import CHANNELS, TensorFormat, encode_labels
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models.convolution import Norm, WrapConv
@@ -67,6 +68,7 @@ class Losses:
         noise: standard deviation of the noise added to the latents of an "autoencoder", which lie in (-1, 1).
         rare: exponent of the class weights of an "autoencoder": the weight of a cell is the share of its class in the
             batch to the power of -rare. Poles cover one per cent of a scan, but matter more than that.
+        unlabelled: share of the images whose labels an "autoencoder" or "surfaces" decodes without having seen them.
 
     Raises:
         ConfigError: on a negative weight.
@@ -83,6 +85,7 @@ class Losses:
     discriminator_width: int = 32
     noise: float = 0.07
     rare: float = 0.0
+    unlabelled: float = 0.0
 
     def __post_init__(self) -> None:
         if min(value for value in vars(self).values()) < 0:
@@ -125,7 +128,7 @@ class Autoencoding(nn.Module):
             shape = self.network.latent_shape
             noise = torch.zeros_like(x) if noise is None else noise
             some = noise.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
-            return self.nll(self.network(x, self.losses.noise * some), x)
+            return self.nll(self.network(self._shown(x, noise), self.losses.noise * some), x)
         encoding: Encoding = self.network(x)
         output, mask = encoding.output.float().tensor_split([self.tensors.size], 1)
         loss = self.reconstruction(output, x)
@@ -137,6 +140,17 @@ class Autoencoding(nn.Module):
             loss = loss + self._adversarial(self.discriminator, expected(output, self.tensors), x, loss)
         loss = loss + self.losses.commitment * encoding.gap.mean()
         return loss + self.losses.codebook * encoding.code_gap.mean()
+
+    def _shown(self, x: Tensor, noise: Tensor) -> Tensor:
+        """The images (B, C, H, W), some of them without labels."""
+        if not self.losses.unlabelled:
+            return x
+        assert isinstance(self.network, Autoencoder | SurfaceAutoencoder)
+        bits = self.network.bits
+        blank = encode_labels(torch.full_like(x[:, 0], IGNORE, dtype=torch.uint8))
+        chosen = torch.special.ndtr(noise[:, -1, -1, -1]) < self.losses.unlabelled
+        hidden = torch.cat([x[:, :-bits], blank.to(x)], 1)
+        return torch.where(chosen.view(-1, 1, 1, 1), hidden, x)
 
     def finish(self, data: Batches) -> None:
         """Set what is not trained but measured, on the first scans: the noise of "surfaces"."""

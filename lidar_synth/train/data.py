@@ -67,14 +67,15 @@ class Batches:
         tensors: layout of the network's tensors.
         seed: 0 <= seed < 2^62.
         flip: mirror every other sample, left to right.
-        roll: turn every sample about the vertical by a random whole number of columns.
+        roll: turn every sample about the vertical by a random whole number of columns; of columns of the ``latents``
+            if there are any, by which an autoencoder whose columns wrap around turns them exactly.
         device: on which noise is generated and batches are assembled.
         codec: encodes tensors to states; None = the tensors are the states.
         latents: (2, N, *codec.shape) encoded scans and mirrored scans (``cache_latents``), in place of ``codec``.
         conditioning: the field of the cache that is the condition; None = unconditional.
 
     Raises:
-        ConfigError: on ``roll`` with cached latents or with a condition that cannot be turned.
+        ConfigError: on ``roll`` with a condition that cannot be turned.
     """
 
     cache: ImageCache
@@ -88,8 +89,6 @@ class Batches:
     latents: NDArray[np.float16] | None = None
 
     def __post_init__(self) -> None:
-        if self.roll and self.latents is not None:
-            raise ConfigError("roll with cached latents", "data.latents=false, or roll=false")
         if self.roll and self.conditioning and not CONDITIONS[self.conditioning.name].turns:
             raise ConfigError(f"roll with the condition {self.conditioning.name!r}", "roll=false: it does not turn")
 
@@ -104,14 +103,17 @@ class Batches:
         draws = uniform(seed, positions, (5,))
         scans = self.scans_at(positions)
         mirrored = (draws[:, 1] < 0.5) & self.flip
-        columns = (draws[:, 2] * self.cache.sensor.columns).long().tolist()
+        width = self.cache.sensor.columns
+        unit = 1 if self.latents is None else width // self.latents.shape[-1]
+        turns = (draws[:, 2] * (width // unit)).long()
 
         def augmented(x: Tensor) -> Tensor:
             x = _where(mirrored, x.flip(-1), x)
-            return _rolled(x, columns) if self.roll else x
+            return _rolled(x, (unit * turns).tolist()) if self.roll else x
 
         if self.latents is not None:
             y0 = torch.from_numpy(self.latents[mirrored.long().numpy(), scans]).to(self.device, torch.float32)
+            y0 = _rolled(y0, turns.tolist()) if self.roll else y0
         else:
             y0 = augmented(self.tensors.encode(self.cache.read(scans)).to(self.device))
             y0 = y0 if self.codec is None else self.codec.encode(y0)

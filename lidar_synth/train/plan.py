@@ -29,7 +29,7 @@ from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
 from lidar_synth.train.autoencoder import Autoencoding, autoencoder_loss, reconstruction_task
 from lidar_synth.train.cache import Other, cache_latents, cache_scans
-from lidar_synth.train.config import DistillConfig, Run, TrainConfig
+from lidar_synth.train.config import Data, DistillConfig, Run, TrainConfig
 from lidar_synth.train.data import Batches, Conditioning
 from lidar_synth.train.decoding import Decoding, decoding_loss, decoding_task
 from lidar_synth.train.loop import Loss, Task, several_steps_task, student_task, teacher_task
@@ -173,8 +173,9 @@ def _codec_of(networks: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
     return {CODEC: networks[CODEC]} if CODEC in networks else {}
 
 
-def open_data(config: Run, plan: TrainingPlan, device: torch.device) -> Batches:
-    """The batches of the run; its scans are projected once and cached."""
+def open_data(config: Run, plan: TrainingPlan, device: torch.device, data: Data | None = None) -> Batches:
+    """The batches of the run, or of other ``data``; the scans are projected once and cached."""
+    given, name = (config.data, "cache") if data is None else (data, "held_out")
     sensor, tensors = plan.header.sensor, plan.header.tensors
     conditioning, channels, others = None, set(tensors.channels), {}
     for name, options in plan.header.conditioning.items():
@@ -186,15 +187,15 @@ def open_data(config: Run, plan: TrainingPlan, device: torch.device) -> Batches:
             channels.add("label")
         else:
             others[condition.field] = Other(shape, _reader(name, sensor, shape, options))
-    folder = config.data.cache or config.output / "cache"
-    source = config.data.open(sensor)
-    cache = cache_scans(source, sensor, channels, folder, config.data.describe(), others=others)
+    folder = given.cache or config.output / name
+    source = given.open(sensor)
+    cache = cache_scans(source, sensor, channels, folder, given.describe(), others=others)
     codec = plan.codec() if plan.autoencoder is not None else None
-    data = Batches(cache, tensors, config.seed, config.data.flip, config.data.roll, device, codec, conditioning)
-    if codec is None or not config.data.latents:
-        return data
+    batches = Batches(cache, tensors, config.seed, given.flip, given.roll, device, codec, conditioning)
+    if codec is None or not given.latents:
+        return batches
     made_by = network_hash(plan.parts(plan.network)[CODEC])
-    return replace(data, latents=cache_latents(cache, tensors, codec, device, folder, made_by))
+    return replace(batches, latents=cache_latents(cache, tensors, codec, device, folder, made_by))
 
 
 def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, Any]) -> Callable[[Any], Any]:

@@ -6,7 +6,8 @@ The folder holds::
     cache/                   the projected scans
     selection.npz            a student's timesteps and how they were selected
     state.safetensors        the state from which an interrupted run resumes
-    <folder>.safetensors     the checkpoint: the averaged weights
+    held_out.json            losses on held-out scans, if there are any
+    <folder>.safetensors     the checkpoint: the averaged weights; the best ones, if there are held-out scans
     samples/, logs/          pictures; scalars for TensorBoard
 """
 
@@ -32,6 +33,7 @@ from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.train.autoencoder import Autoencoding, reconstruct, reconstruction_figures
 from lidar_synth.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.train.data import Batches
+from lidar_synth.train.held_out import Watch, open_watch
 from lidar_synth.train.loop import Record, steps
 from lidar_synth.train.plan import TrainingPlan, make_plan, open_data
 from lidar_synth.train.resume import check_parents, check_resumed
@@ -125,16 +127,20 @@ def _train(
     """The loop with logs and saved states."""
     with accelerator.main_process_first():
         data = open_data(config, plan, accelerator.device)
-    log = _Log(config, training.step) if accelerator.is_main_process else None
+    log = _Log(config, training.step, minutes is not None) if accelerator.is_main_process else None
+    watch = open_watch(config, plan, training, accelerator) if config.held_out and log is not None else None
+    if watch is not None and not watch.measured:
+        _save(config, plan, training, data, watch)
     end = math.inf if minutes is None else time.monotonic() + 60 * minutes
     for record in steps(training, plan.task, data, accelerator, plan.loss):
         # All processes stop at the same step, whose clock ever is ahead.
-        late = accelerator.reduce(torch.tensor(float(time.monotonic() > end), device=accelerator.device)).item() > 0
+        stops = time.monotonic() > end or (watch is not None and watch.exhausted)
+        late = accelerator.reduce(torch.tensor(float(stops), device=accelerator.device)).item() > 0
         last = late or record.step == config.recipe.iterations
         if log is not None:
             log.add(record)
             if last or record.step % config.save_every == 0:
-                _save(config, plan, training, data)
+                _save(config, plan, training, data, watch)
             if config.samples.every and (last or record.step % config.samples.every == 0):
                 with accelerator.autocast():
                     log.picture(plan, training, data)
@@ -146,23 +152,28 @@ def _train(
     return checkpoint_path(config)
 
 
-def _save(config: Run, plan: TrainingPlan, training: Training, data: Batches) -> None:
+def _save(config: Run, plan: TrainingPlan, training: Training, data: Batches, watch: Watch | None) -> None:
+    best = watch is None or watch.measure(training)
     training.save(config.output / "state.safetensors")
+    if not best:
+        return
     if isinstance(training.average, Autoencoding):
         training.average.finish(data)
-    header = replace(plan.header, provenance=plan.header.provenance | {"iterations": training.step})
+    facts = {"iterations": training.step} | ({} if watch is None else {"held_out_loss": watch.least})
+    header = replace(plan.header, provenance=plan.header.provenance | facts)
     save_checkpoint(checkpoint_path(config), header, plan.parts(training.average))
 
 
 class _Log:
     """A bar, TensorBoard's numbers, pictures."""
 
-    def __init__(self, config: Run, step: int) -> None:
+    def __init__(self, config: Run, step: int, limited: bool) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
         self.config = config
         self.board: Any = SummaryWriter(config.output / "logs", purge_step=step + 1)
-        self.bar = tqdm(total=config.recipe.iterations, initial=step, desc=config.output.name, unit="step")
+        total = None if limited else config.recipe.iterations
+        self.bar = tqdm(total=total, initial=step, desc=config.output.name, unit="step")
         self.records: list[Record] = []
 
     def add(self, record: Record) -> None:

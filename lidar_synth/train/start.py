@@ -3,6 +3,7 @@
 import json
 import os
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from lidar_synth import __version__
 from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.errors import ConfigError
 from lidar_synth.evaluate.leakage import inherited, recordings_of, town
@@ -136,10 +136,14 @@ def with_recordings(config: Run, header: Header) -> Header:
         FileError, DataError: where the scans cannot be opened.
     """
     seen = inherited(header.provenance) | _recordings(config.data, header.sensor)
+    if config.held_out is not None:  # they chose the weights
+        seen |= _recordings(config.held_out.data, header.sensor)
     return replace(header, provenance=header.provenance | {"seen": seen.to_list()})
 
 
 def _recordings(data: Data, sensor: Sensor) -> Recordings:
+    if data.seen is not None:
+        return Recordings.from_list(data.seen)
     if data.path is None:
         return town(data.seed)
     source = data.open(sensor)
@@ -151,11 +155,23 @@ def _recordings(data: Data, sensor: Sensor) -> Recordings:
 
 def provenance_of(config: Run) -> dict[str, Any]:
     """What a checkpoint says of its making; the checkpoints that it was made from stand beside, by their hash."""
-    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "init", "teacher", "weaker", "codec"}
+    beside = {
+        "output",
+        "data",
+        "licence",
+        "samples",
+        "save_every",
+        "sensor",
+        "init",
+        "teacher",
+        "weaker",
+        "codec",
+        "held_out",
+    }
     return {
         "data": config.data.describe(),
         "data_licence": config.data.licence,
         "licence": config.licence,
         "recipe": config.model_dump(mode="json", exclude=beside),
-        "software": f"lidar_synth {__version__}, torch {torch.__version__}",
+        "software": f"lidar_synth {version('lidar_synth')}, torch {torch.__version__}",
     }

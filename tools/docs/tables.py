@@ -37,6 +37,7 @@ TOPICS = {
     "generate": "Generating",
     "mixing": "Mixing",
     "labels": "Labels",
+    "train": "Training",
     "proof": "Proof",
     "town": "The town",
     "errors": "Errors",

@@ -5,13 +5,14 @@ What a run needs is built from the checked values by the caller, so that nothing
 
 from lidar_synth.train.config.load import check, load_config, read_values, validated
 from lidar_synth.train.config.recipes import Listed, find_recipe, published
-from lidar_synth.train.config.sections import Condition, Data, Network, Run, Samples, Section
+from lidar_synth.train.config.sections import Condition, Data, HeldOut, Network, Run, Samples, Section
 from lidar_synth.train.config.training import DistillConfig, SelectionSettings, TrainConfig
 
 __all__ = [
     "Condition",
     "Data",
     "DistillConfig",
+    "HeldOut",
     "Listed",
     "Network",
     "Run",

@@ -74,9 +74,9 @@ def check(config: Run) -> None:
     Raises:
         ConfigError: naming it.
     """
-    data = config.data
-    if (data.town is None) == (data.path is None):
-        raise ConfigError(f"data with town={data.town} and path={data.path}", "one of the two")
+    for data in (config.data, *([config.held_out.data] if config.held_out else [])):
+        if (data.town is None) == (data.path is None):
+            raise ConfigError(f"data with town={data.town} and path={data.path}", "one of the two")
     if isinstance(config, TrainConfig):
         _check_train(config)
     if isinstance(config, DistillConfig) and config.grid is not None:

@@ -39,7 +39,9 @@ class Data(Section):
         cache: folder of the projected scans; by default ``cache`` in the output folder.
         flip: mirror every other sample.
         roll: rotate every sample by a random number of columns.
-        latents: cache the latents of the autoencoder too; not with ``roll``.
+        latents: cache the latents of the autoencoder too.
+        seen: recordings behind the scans, where ``path`` has copies of them (``Recordings.to_list``); by default they
+            follow from the layout.
     """
 
     licence: str
@@ -55,6 +57,7 @@ class Data(Section):
     flip: bool = False
     roll: bool = False
     latents: bool = False
+    seen: list[dict[str, Any]] | None = None
 
     def open(self, sensor: Sensor) -> Source:
         """The scans.
@@ -73,7 +76,7 @@ class Data(Section):
         """What tells these scans from others, plain values."""
         keys = {"seed", "interval", "motion"} if self.path else {"path", "layout", "split", "on_bad"}
         keys |= {"motion"} if self.motion else set()  # caches of earlier versions do not name it
-        return self.model_dump(mode="json", exclude=keys | {"cache", "flip", "roll", "latents"})
+        return self.model_dump(mode="json", exclude=keys | {"cache", "flip", "roll", "latents", "seen"})
 
 
 class Samples(Section):
@@ -86,6 +89,23 @@ class Samples(Section):
 
     every: Annotated[int, Field(ge=0)] = 5000
     count: Count = 8
+
+
+class HeldOut(Section):
+    """Scans that are not trained on, by which a run keeps its best weights and stops early.
+
+    The loss on them is measured whenever the run is saved, and at its start; it always sees the same samples with the
+    same noise. The checkpoint has the weights with the least loss.
+
+    Args:
+        data: the scans.
+        samples: number of samples of a measurement; every scan counts several times if there are fewer.
+        patience: measurements without a new least loss after which the run stops.
+    """
+
+    data: Data
+    samples: Count = 32
+    patience: Count = 10
 
 
 class Run(Section):
@@ -102,6 +122,7 @@ class Run(Section):
         gradient_checkpointing: whether to save memory at the cost of time.
         save_every: iterations between two saves.
         samples: pictures of samples.
+        held_out: scans for early stopping; None = train to the end.
     """
 
     output: Path
@@ -114,6 +135,7 @@ class Run(Section):
     gradient_checkpointing: bool = False
     save_every: Count = 1000
     samples: Samples = Samples()
+    held_out: HeldOut | None = None
 
 
 class Network(Section):

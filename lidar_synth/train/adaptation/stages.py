@@ -1,0 +1,179 @@
+"""The trainings of an adaptation, one after the other, each a recipe of ``configs/`` on the user's scans.
+
+The limit of time is divided by ``STAGES``; what an early stop leaves goes to the stages after it. A stage is a training
+run in a folder of its own, so that an interrupted adaptation goes on where it stopped.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lidar_synth.files.disk import write_file
+from lidar_synth.generate.checkpoint import CODEC, Header
+from lidar_synth.train.adaptation.scans import HELD, TRAIN, Prepared
+from lidar_synth.train.config import DistillConfig, TrainConfig, check, read_values, validated
+from lidar_synth.train.config.recipes import merged
+from lidar_synth.train.held_out import read_history
+from lidar_synth.train.runs import run
+
+ENDLESS = 10**9
+"""Iterations of a stage: the limit of time or early stopping ends it."""
+TOWN_SEED, TOWN_HELD, TOWN_HELD_SCANS = 0, 7100, 16
+"""Seeds of the towns to train on and to hold out, and the scans that are held out."""
+CODEC_SAMPLES, FLOW_SAMPLES = 12, 32
+"""Samples of a measurement on held-out scans."""
+INTERVAL = 2.0
+"""Seconds between two scans of the town."""
+TOWN_LICENCE = "MIT (procedural, no one's data)"
+DONE = "done"
+UNLABELLED = 0.5
+"""Share of the town's images that an autoencoder labels without having seen their labels."""
+
+
+class Stage(NamedTuple):
+    """One training.
+
+    Args:
+        recipe: a name in ``configs/``.
+        share: of the limit of time.
+        town: whether it learns from the town cast through the user's sensor, in place of the user's scans.
+        about: what it does, for the plan.
+    """
+
+    recipe: str
+    share: float
+    town: bool
+    about: str
+
+
+STAGES = {
+    "labels": Stage("adapt_codec", 0.2, True, "the autoencoder learns to label scans, on the town"),
+    "codec": Stage("adapt_codec", 0.35, False, "the autoencoder, on your scans"),
+    "flow_town": Stage("adapt_flow", 0.2, True, "the flow, on the town as your sensor sees it"),
+    "flow": Stage("adapt_flow", 0.25, False, "the flow, on your scans"),
+    "student": Stage("adapt_student", 0.2, False, "the student of few steps, on your scans"),
+}
+"""Stages by name, in order."""
+
+
+def stages_for(header: Header, labelled: bool, town: int) -> dict[str, Stage]:
+    """The stages of a model.
+
+    Args:
+        header: of the model.
+        labelled: whether the scans have labels.
+        town: number of scans of the town.
+    """
+    left_out = set()
+    if CODEC not in header.networks:
+        left_out |= {"labels", "codec"}
+    if labelled or "label" not in header.channels:
+        left_out |= {"labels"}
+    if not town:
+        left_out |= {"flow_town"}
+    return {name: stage for name, stage in STAGES.items() if name not in left_out}
+
+
+@dataclass(frozen=True)
+class Work:
+    """What all stages of an adaptation share.
+
+    Args:
+        folder: of the runs.
+        header: of the model on the user's sensor.
+        scans: the prepared scans.
+        licence: of the scans and therefore of the weights.
+        town: number of scans of the town.
+        stages: the stages.
+        overrides: {name of a stage: values on top of its recipe}.
+    """
+
+    folder: Path
+    header: Header
+    scans: Prepared
+    licence: str
+    town: int
+    stages: Mapping[str, Stage]
+    overrides: Mapping[str, Mapping[str, Any]]
+
+    @property
+    def latent(self) -> bool:
+        """Whether the model has an autoencoder."""
+        return CODEC in self.header.networks
+
+    def run_folder(self, name: str) -> Path:
+        """The folder of a stage."""
+        return self.folder / name
+
+    def checkpoint(self, name: str) -> Path:
+        """The checkpoint of a stage."""
+        return self.folder / name / f"{name}.safetensors"
+
+    def seconds(self) -> float:
+        """What all stages have taken up to now."""
+        return sum(history[-1].seconds for n in self.stages if (history := read_history(self.run_folder(n))))
+
+    def minutes(self, name: str, limit: float) -> float:
+        """The minutes of a stage that is about to start or to continue, of a ``limit`` for all stages."""
+        names = list(self.stages)
+        later = names[names.index(name) :]
+        history = read_history(self.run_folder(name))
+        spent = self.seconds() - (history[-1].seconds if history else 0.0)
+        share = self.stages[name].share / sum(self.stages[n].share for n in later)
+        return max(0.0, (limit - spent / 60) * share - (history[-1].seconds / 60 if history else 0.0))
+
+    def train(self, name: str, start: Path, minutes: float) -> Path:
+        """Run or resume a stage, unless it is done: more steps would change what the next one began with.
+
+        Args:
+            name: of the stage.
+            start: the checkpoint that it starts from.
+            minutes: limit of its time.
+
+        Returns:
+            The checkpoint with the best weights.
+        """
+        done = self.run_folder(name) / DONE
+        if not done.is_file():
+            run(self.config(name, start), resume=True, minutes=minutes)
+            write_file(done, b"")
+        return self.checkpoint(name)
+
+    def config(self, name: str, start: Path) -> TrainConfig | DistillConfig:
+        """The configuration of a stage."""
+        kind: type[TrainConfig] | type[DistillConfig] = DistillConfig if name == "student" else TrainConfig
+        values = read_values(self.stages[name].recipe, kind)
+        for own in (self._own(name, start), dict(self.overrides.get(name, {}))):
+            values = merged(values, own)
+        config = validated(kind, values, f"stage {name}")
+        check(config)
+        return config
+
+    def _own(self, name: str, start: Path) -> dict[str, Any]:
+        stage = self.stages[name]
+        data = self._town(TOWN_SEED, self.town) if stage.town else self._scans(TRAIN)
+        held = self._town(TOWN_HELD, min(TOWN_HELD_SCANS, self.town)) if stage.town else self._scans(HELD)
+        codec = stage.recipe == "adapt_codec"
+        latents = {"latents": self.latent and not codec}
+        values: dict[str, Any] = {
+            "output": str(self.run_folder(name)),
+            "licence": self.licence,
+            "data": data | latents,
+            "held_out": {"data": held | latents | {"flip": True}, "samples": CODEC_SAMPLES if codec else FLOW_SAMPLES},
+            "recipe": {"iterations": ENDLESS},
+        }
+        if name == "student":
+            grid = self.header.time_grid
+            return values | {"teacher": str(start), "grid": list(grid), "intervals": len(grid) - 1}
+        if name == "labels":
+            values["losses"] = {"unlabelled": UNLABELLED}
+        return values | {"init": str(start)}
+
+    def _scans(self, part: str) -> dict[str, Any]:
+        seen = self.scans.recordings.to_list()
+        return {"path": str(self.scans.path(part)), "layout": "range", "licence": self.licence, "seen": seen}
+
+    def _town(self, seed: int, count: int) -> dict[str, Any]:
+        cast = {"town": count, "seed": seed, "interval": INTERVAL, "motion": False}
+        return cast | {"path": None, "licence": TOWN_LICENCE, "cache": str(self.folder / f"town-{seed}")}
