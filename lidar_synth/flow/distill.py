@@ -103,35 +103,47 @@ def timestep_distillation(
 
 
 def every_piece(
-    teacher: Velocity, y1: Tensor, grids: Sequence[Sequence[float]], steps: int, cond: Any = None
+    teacher: Velocity, y0: Tensor, y1: Tensor, grids: Sequence[Sequence[float]], steps: int, cond: Any = None
 ) -> Example:
-    """A student of several numbers of steps, which is told where a step ends: every interval of all grids on the
-    teacher's trajectories from noise. One trajectory serves all of them.
+    """A student of several numbers of steps, which is told where a step ends: every interval of all grids.
+
+    Intervals that begin at noise are parts of one trajectory of the teacher. The others begin between data and noise,
+    as in Algorithm 1.
 
     Args:
         teacher: the velocity to distil.
-        y1: (B, ...) noise.
+        y0, y1: (B, ...) data and noise.
         grids: the time grids.
-        steps: Euler steps of the teacher between two neighbouring times of all grids.
+        steps: Euler steps of the teacher in an interval of the first grid, in the mean; longer intervals have more.
         cond: (B, ...) conditions, passed to the teacher.
 
     Returns:
         An example of P B samples, P intervals in the order of the grids. Its condition is repeated, too.
+
+    Raises:
+        ConfigError: on fewer than one step, or a grid that does not descend within [0, 1].
     """
     if steps < 1:
         raise ConfigError(f"{steps} steps of the teacher", "at least 1")
-    times = sorted({float(t) for grid in grids for t in checked_grid(grid)}, reverse=True)
-    states = {times[0]: y1}
+    pieces = [(a, b) for grid in grids for a, b in pairwise(checked_grid(grid).tolist())]
+    evaluations, total = 0, steps * (len(grids[0]) - 1)
+
+    def follow(y: Tensor, a: float, b: float) -> Tensor:
+        nonlocal evaluations
+        count = max(1, round(total * (a - b)))
+        evaluations += count * len(y)
+        return solve(teacher, y, uniform_grid(count, a, b), "euler", cond)
+
     with torch.no_grad():
-        for a, b in pairwise(times):
-            states[b] = solve(teacher, states[a], uniform_grid(steps, a, b), "euler", cond)
-    pieces = [(float(a), float(b)) for grid in grids for a, b in pairwise(checked_grid(grid))]
-    start, end = (torch.cat([y1.new_full((len(y1),), t) for t in side]) for side in zip(*pieces, strict=True))
-    y, y_end = (torch.cat([states[t] for t in side]) for side in zip(*pieces, strict=True))
-    return Example(
-        y, start, (y_end - y) / per_sample(end - start, y), steps * (len(times) - 1) * len(y1),
-        None if cond is None else torch.cat([cond] * len(pieces)), end,
-    )  # fmt: skip
+        from_noise = {1.0: y1}
+        for a, b in pairwise(sorted({1.0, *(b for a, b in pieces if a == 1)}, reverse=True)):
+            from_noise[b] = follow(from_noise[a], a, b)
+        start, end = (torch.cat([y1.new_full((len(y1),), t) for t in side]) for side in zip(*pieces, strict=True))
+        states = [y1 if a == 1 else torch.lerp(y0, y1, a) for a, _ in pieces]
+        ends = [from_noise[b] if a == 1 else follow(y, a, b) for y, (a, b) in zip(states, pieces, strict=True)]
+    y, y_end = torch.cat(states), torch.cat(ends)
+    repeated = None if cond is None else torch.cat([cond] * len(pieces))
+    return Example(y, start, (y_end - y) / per_sample(end - start, y), evaluations, repeated, end)
 
 
 STRATEGIES: dict[str, Strategy] = {

@@ -40,7 +40,8 @@ def rms_norm(x: Tensor, eps: float = EPS) -> Tensor:
         return F.rms_norm(x, x.shape[-1:], eps=eps)
     # Half as many passes over memory as torch's own on a CPU.
     square = torch.linalg.vector_norm(x, dim=-1, keepdim=True).square_()
-    return x * square.div_(x.shape[-1]).add_(eps).rsqrt_()
+    out: Tensor = x * square.div_(x.shape[-1]).add_(eps).rsqrt_()
+    return out
 
 
 class Exact(nn.Module):

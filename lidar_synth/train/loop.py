@@ -48,7 +48,7 @@ def student_task(strategy: str, teacher: Velocity, grid: Sequence[float], steps:
 
 def several_steps_task(teacher: Velocity, grids: Sequence[Sequence[float]], steps: int) -> Task:
     """Distillation of ``teacher`` for several numbers of steps (``every_piece``)."""
-    return lambda batch: every_piece(teacher, batch.y1, grids, steps, batch.cond)
+    return lambda batch: every_piece(teacher, batch.y0, batch.y1, grids, steps, batch.cond)
 
 
 class Record(NamedTuple):

@@ -36,7 +36,7 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         widths: channels of the decoder on patches and on latent cells.
         reaches: dilations of the decoder's blocks on latent cells, since a wall is straight over many of them.
         depth: blocks of the decoder on patches.
-        surfaces: K of a patch, at most 3.
+        surfaces: K of a patch, at most 4.
         normalisation: a name of ``NORMALISATIONS``, that of the range.
 
     Raises:
@@ -48,7 +48,6 @@ class SurfaceAutoencoder(BoundedAutoencoder):
     roughness: Tensor
     relief: Tensor
     alike: Tensor
-    returned_alike: Tensor
 
     def __init__(
         self,
@@ -70,8 +69,8 @@ class SurfaceAutoencoder(BoundedAutoencoder):
                 f"{channels} channels, {codes} codes in {bits} bits, normalisation {normalisation!r}",
                 f"range, reflectance and enough bits for the codes; one of {', '.join(NORMALISATIONS)}",
             )
-        if not 1 <= surfaces < PATCH[1] // 2:  # an image of half the columns has a shared number for each, and one more
-            raise ConfigError(f"{surfaces} surfaces", f"1 to {PATCH[1] // 2 - 1}")
+        if not 1 <= surfaces <= PATCH[1] // 2:  # a patch of half the columns has a shared number for each in a row
+            raise ConfigError(f"{surfaces} surfaces", f"1 to {PATCH[1] // 2}")
         if any(not 1 <= reach <= pair(resolution)[1] // DOWN[1] for reach in reaches):
             raise ConfigError(f"reaches {list(reaches)}", f"columns of a latent, from 1 to {resolution[1] // DOWN[1]}")
         self.resolution, self.channels, self.bits, self.codes = pair(resolution), channels, bits, codes
@@ -101,12 +100,11 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         self.register_buffer("roughness", torch.full((codes,), 0.1))
         self.register_buffer("relief", torch.zeros(codes, len(SPANS)))
         self.register_buffer("alike", torch.zeros(codes))
-        self.register_buffer("returned_alike", torch.zeros(()))
 
     @property
     def noise(self) -> Noise:
         """The noise of sampled cells."""
-        return Noise(self.roughness, self.relief, self.alike, self.returned_alike)
+        return Noise(self.roughness, self.relief, self.alike)
 
     def embed(self, x: Tensor) -> Tensor:
         """Images with a channel of their returns, (B, C + 1, H, W), to patches of 2 x 8 cells."""

@@ -7,7 +7,6 @@ of reflectances is that of their normal scores. The relief of plants follows fro
 distances along a row: at the longer one, only the wider field is correlated.
 """
 
-import math
 from collections.abc import Iterable
 
 import torch
@@ -41,7 +40,6 @@ def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Te
     codes = len(network.roughness)
     sums = torch.zeros(codes, 4, dtype=torch.float64)  # pairs, |e1 - e2|, products and squares of scores
     relief = torch.zeros(codes, 1 + len(LAGS), 2, dtype=torch.float64)
-    returns = torch.zeros(2, dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     for x, code in images:
         z = network.squeeze(x)
@@ -57,16 +55,12 @@ def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Te
         terms = [torch.ones_like(left[0]), (left[0] - right[0]).abs(), left[1] * right[1], left[1] ** 2]
         for column, term in enumerate(terms):
             sums[:, column] += torch.bincount(left[3][same], term[same].double(), codes)
-        returns += _return_scores(surfaces, distance, generator)
         whole = from_patches(torch.stack([error, kinds.float(), distance], 1), PATCH, network.resolution)
         relief += _products(whole[:, 0], whole[:, 1], whole[:, 2], codes)
     total, known = sums.sum(0), sums[:, 0] >= LEAST
     network.roughness.copy_(torch.where(known, sums[:, 1] / sums[:, 0], total[1] / total[0]) / 1.5)
     network.alike.copy_(torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95))
     network.relief.copy_(_relief(relief))
-    # Scores that are random but for their sign have 2 / pi of the correlation of signs, which is 2 / pi asin(rho).
-    signs = (returns[0] / returns[1] * math.pi / 2).clamp(0, 0.8)
-    network.returned_alike.copy_((signs * math.pi / 2).sin())
 
 
 def _scores(
@@ -92,16 +86,6 @@ def _scores(
     below = zero + (1 - zero) * torch.sigmoid((value - middle) / spread.exp())
     some = torch.rand(value.shape, generator=generator)
     return error, _normal(torch.where(value <= -1, below * some, below)), shown
-
-
-def _return_scores(surfaces: Surfaces, distance: Tensor, generator: torch.Generator) -> Tensor:
-    """(2,) sums of products of neighbours and of squares of the normal scores of returns that are in doubt."""
-    likely = (surfaces.weights.exp() * surfaces.returned.sigmoid()).sum(1)
-    some = torch.rand(likely.shape, generator=generator)
-    score = _normal(torch.where(distance > -1, likely * some, likely + (1 - likely) * some)).view(-1, *PATCH)
-    left = ((likely > 0.1) & (likely < 0.9)).view(-1, *PATCH)[..., :-1]
-    pair = score[..., :-1][left], score[..., 1:][left]
-    return torch.stack([(pair[0] * pair[1]).sum(), (pair[0] ** 2).sum()]).double()
 
 
 def _products(error: Tensor, kinds: Tensor, distance: Tensor, codes: int) -> Tensor:

@@ -50,13 +50,11 @@ class Noise(NamedTuple):
         roughness: (C,) share of a range's scale that differs from cell to cell; the rest is doubt about the surface.
         relief: (C, F) factors of the fields of relief, in a range's scale; 0 for what is flat.
         reflectance: (C,) correlation of the reflectances of cells that show one surface of a patch.
-        returned: () correlation of the returns of a patch.
     """
 
     roughness: Tensor
     relief: Tensor
     reflectance: Tensor
-    returned: Tensor
 
 
 class Surfaces(NamedTuple):
@@ -115,15 +113,14 @@ class Surfaces(NamedTuple):
         )
         likely, code = self.classes.max(2)
         # What all cells of a surface have in common.
-        common = [self.scale[..., 0], *(part[..., 0] for part in self.reflectance[1:]), likely.exp(), code.float()]
-        common += [noise.reflectance[code], normal(shared[:, :count]), noise.roughness[code]]
-        common = torch.cat([torch.stack(common, 2), noise.relief[code]], 2)
+        parts = [self.scale[..., 0], *(part[..., 0] for part in self.reflectance[1:]), likely.exp(), code.float()]
+        parts += [noise.reflectance[code], normal(shared[:, :count]), noise.roughness[code]]
+        common = torch.cat([torch.stack(parts, 2), noise.relief[code]], 2)
         common = common.gather(1, chosen.mT.expand(-1, -1, common.shape[2]))
         scale, dull, blank, likely, kind, alike, patch, rough, *bumps = common.unbind(2)
         values = ZeroInflatedLogistic(median, dull, blank).sample(_mixed(dim, alike, patch))
         error = rough * laplace_noise(near) + sum(a * b for a, b in zip(bumps, relief.unbind(1), strict=True))
         distance = normalised(distance, normalisation) + scale * error
-        back = _mixed(back, noise.returned, normal(shared[:, count : count + 1]))
         distance = torch.where(returned + torch.logit(back) > 0, distance, -1.0)
         return torch.stack([distance, values, kind, likely], 1)
 
