@@ -265,10 +265,8 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(scans: Path, teacher
     call("distill", config, "also=[2, 1]")
     header, _ = read_header(tmp_path / "run" / "run.safetensors")
     assert [len(grid) - 1 for grid in (header.time_grid, *header.other_grids)] == [4, 2, 1]
-    assert header.networks["velocity"].arguments["ends"]
     student = load_generator(tmp_path / "run" / "run.safetensors")
-    assert student.network.ends
-    assert any(weight.any() for weight in student.network.step.out.parameters())  # it was trained
+    assert student.network.ends and student.network.step.out.weight.any()  # it was trained
     images = [student.range_images(0, [1], steps=steps)[0].range for steps in (1, 2, 4, None)]
     assert np.array_equal(images[2], images[3]) and not np.array_equal(images[0], images[1])
     with pytest.raises(ConfigError, match="it predicts mean velocities"):

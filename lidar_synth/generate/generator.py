@@ -293,7 +293,8 @@ def _compile(networks: dict[str, nn.Module]) -> None:
     if (autoencoder := networks.get(CODEC)) is not None:
         # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``.
         codec: Any = autoencoder
-        codec.decode = torch.compile(codec.decode)
+        # A decoder of two widths compiled for both at once gives NaN (torch 2.13).
+        codec.decode = torch.compile(codec.decode, dynamic=False)
 
 
 def shipped_models() -> dict[str, Path]:

@@ -37,6 +37,12 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
 
     Raises:
         DataError: on a scan without boxes, or with fewer than 20 returns of the ground.
+
+    Example:
+        >>> from lidar_synth import Town, layout_of
+        >>> layout = layout_of(Town(seed=0, scans=1)[0])
+        >>> len(layout.boxes) > 0, len(layout.outlines) > 0
+        (True, True)
     """
     if scan.boxes is None:
         raise DataError(f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects")

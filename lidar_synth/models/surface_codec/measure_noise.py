@@ -15,7 +15,7 @@ from torch import Tensor
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.models.surface_codec.blocks import PATCH, from_patches, to_patches
-from lidar_synth.models.surface_codec.relief import SPANS, correlation, normal
+from lidar_synth.models.surface_codec.relief import SPANS, correlation, to_normal
 from lidar_synth.models.surface_codec.surfaces import Surfaces, normalised
 
 LEAST = 200
@@ -112,4 +112,4 @@ def _relief(sums: Tensor) -> Tensor:
 
 
 def _normal(share: Tensor) -> Tensor:
-    return normal(share.clamp(_SURE, 1 - _SURE))
+    return to_normal(share.clamp(_SURE, 1 - _SURE))

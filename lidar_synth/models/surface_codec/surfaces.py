@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lidar_synth.geometry.normalize import Normalisation
-from lidar_synth.models.surface_codec.relief import normal
+from lidar_synth.models.surface_codec.relief import to_normal
 from lidar_synth.models.town_codec.planes import laplace_noise
 from lidar_synth.models.town_codec.reflectance import ZeroInflatedLogistic
 
@@ -114,7 +114,7 @@ class Surfaces(NamedTuple):
         likely, code = self.classes.max(2)
         # What all cells of a surface have in common.
         parts = [self.scale[..., 0], *(part[..., 0] for part in self.reflectance[1:]), likely.exp(), code.float()]
-        parts += [noise.reflectance[code], normal(shared[:, :count]), noise.roughness[code]]
+        parts += [noise.reflectance[code], to_normal(shared[:, :count]), noise.roughness[code]]
         common = torch.cat([torch.stack(parts, 2), noise.relief[code]], 2)
         common = common.gather(1, chosen.mT.expand(-1, -1, common.shape[2]))
         scale, dull, blank, likely, kind, alike, patch, rough, *bumps = common.unbind(2)
@@ -136,7 +136,7 @@ def _choose(shares: Tensor, which: Tensor) -> Tensor:
 
 def _mixed(own: Tensor, correlation: Tensor, shared: Tensor) -> Tensor:
     """Uniform numbers of cells, correlated by the standard normal numbers that they share (a Gaussian copula)."""
-    mixed: Tensor = torch.special.ndtr(correlation.sqrt() * shared + (1 - correlation).sqrt() * normal(own))
+    mixed: Tensor = torch.special.ndtr(correlation.sqrt() * shared + (1 - correlation).sqrt() * to_normal(own))
     return mixed.clamp(_SURE, 1 - _SURE)
 
 

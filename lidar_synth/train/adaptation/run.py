@@ -148,6 +148,14 @@ def adapt(
             sensor has rows that its networks cannot have.
         DataError: on fewer than 12 scans, scans of several sensors, some scans without labels, or labels of another
             table.
+
+    Example:
+        >>> from lidar_synth import adapt
+        >>> try:
+        ...     adapt("town-dense", "demo_out/town", "mine.safetensors", minutes=120)
+        ... except ValueError as error:
+        ...     print(str(error).split(";")[0])
+        3 scans
     """
     plan = plan_adaptation(model, scans, out, minutes, sensor, town)
     claim(plan.work / SETTINGS, _settings(plan))
