@@ -260,22 +260,6 @@ def test_a_student_is_distilled(
     assert read_header(tmp_path / "run" / "run.safetensors")[0].time_grid == header.time_grid
 
 
-def test_a_student_of_several_numbers_of_steps_is_distilled(scans: Path, teacher: Path, tmp_path: Path) -> None:
-    config = distilling(scans, tmp_path, teacher)
-    call("distill", config, "also=[2, 1]")
-    header, _ = read_header(tmp_path / "run" / "run.safetensors")
-    assert [len(grid) - 1 for grid in (header.time_grid, *header.other_grids)] == [4, 2, 1]
-    student = load_generator(tmp_path / "run" / "run.safetensors")
-    assert student.network.ends and student.network.step.out.weight.any()  # it was trained
-    images = [student.range_images(0, [1], steps=steps)[0].range for steps in (1, 2, 4, None)]
-    assert np.array_equal(images[2], images[3]) and not np.array_equal(images[0], images[1])
-    with pytest.raises(ConfigError, match="it predicts mean velocities"):
-        student.range_images(0, [1], solver="heun")
-    call("distill", config, "also=[2, 1]", "--resume", "recipe.iterations=6")
-    with pytest.raises(ConfigError, match=r"also=\[2\] for a hdit by reflow; expected an hdit, adaptive_piecewise"):
-        call("distill", config, "also=[2]", "strategy=reflow", f"output={tmp_path / 'other'}")
-
-
 def distilling(scans: Path, folder: Path, teacher: Path) -> Path:
     selection = {"candidates": 10, "trajectories": 3}
     recipe = {"metric": "pseudo_huber", "iterations": 4}

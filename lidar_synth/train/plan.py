@@ -135,6 +135,8 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
     teacher = load_checkpoint(config.teacher, accelerator.device)
     if VELOCITY not in teacher.networks:
         raise ConfigError(f"teacher {config.teacher}, an autoencoder", "a model that generates")
+    if teacher.header.networks[VELOCITY].arguments.get("ends"):
+        raise ConfigError(f"teacher {config.teacher}, a student of several numbers of steps", "its teacher")
     if CODEC in teacher.networks and config.recipe.weights:
         raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
     flow, made = target_flow(config, teacher, accelerator.device)

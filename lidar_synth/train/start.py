@@ -65,9 +65,22 @@ def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     networks = {CODEC: start.networks[CODEC]} if config.autoencodes else start.networks
     kept = {name: start.header.networks[name] for name in networks}
     header = replace(start.header, networks=kept, time_grid=grid, provenance=provenance)
+    if not (config.autoencodes or config.decoder):
+        networks, header = _without_ends(networks, header)
     if config.condition is None or ENCODER in networks or config.autoencodes:
         return networks, header
     return _add_condition(config, networks, header)
+
+
+def _without_ends(networks: dict[str, nn.Module], header: Header) -> tuple[dict[str, nn.Module], Header]:
+    """A student of several numbers of steps as the start of a flow, which is not told where a step ends."""
+    held = header.networks[VELOCITY]
+    if not held.arguments.get("ends"):
+        return networks, header
+    part = held._replace(arguments={name: value for name, value in held.arguments.items() if name != "ends"})
+    velocity = build_network(*part)
+    velocity.load_state_dict({k: v for k, v in networks[VELOCITY].state_dict().items() if not k.startswith("step.")})
+    return networks | {VELOCITY: velocity}, replace(header, networks=header.networks | {VELOCITY: part}, other_grids=())
 
 
 def _add_condition(

@@ -1,0 +1,37 @@
+"""A student of several numbers of steps: from distillation to scans, and as the start of another run."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_run import call, distilling, one_thread, scans, teacher, write_config
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.generate.generator import load_generator
+
+__all__ = ["one_thread", "scans", "teacher"]  # fixtures
+
+
+def test_a_student_of_several_numbers_of_steps_is_distilled(scans: Path, teacher: Path, tmp_path: Path) -> None:
+    config = distilling(scans, tmp_path, teacher)
+    call("distill", config, "also=[2, 1]")
+    header, _ = read_header(tmp_path / "run" / "run.safetensors")
+    assert [len(grid) - 1 for grid in (header.time_grid, *header.other_grids)] == [4, 2, 1]
+    student = load_generator(tmp_path / "run" / "run.safetensors")
+    assert student.network.ends and student.network.step.out.weight.any()  # it was trained
+    images = [student.range_images(0, [1], steps=steps)[0].range for steps in (1, 2, 4, None)]
+    assert np.array_equal(images[2], images[3]) and not np.array_equal(images[0], images[1])
+    with pytest.raises(ConfigError, match="it predicts mean velocities"):
+        student.range_images(0, [1], solver="heun")
+    call("distill", config, "also=[2, 1]", "--resume", "recipe.iterations=6")
+    made = tmp_path / "run" / "run.safetensors"
+    with pytest.raises(ConfigError, match="a student of several numbers of steps"):
+        call("distill", config, f"teacher={made}", f"output={tmp_path / 'other'}")
+    with pytest.raises(ConfigError, match=r"also=\[2\] for a hdit by reflow; expected an hdit, adaptive_piecewise"):
+        call("distill", config, "also=[2]", "strategy=reflow", f"output={tmp_path / 'other'}")
+    call(
+        "train", write_config(scans, tmp_path, recipe={"iterations": 1}), f"init={made}", f"output={tmp_path / 'flow'}"
+    )
+    flow = load_generator(tmp_path / "flow" / "flow.safetensors")  # it is not told where a step ends
+    assert not flow.network.ends and flow.header.other_grids == ()
