@@ -14,7 +14,7 @@ import numpy as np
 from lidar_synth.integrations.nuscenes import nuscenes_names, turned_boxes, turned_points
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import write_file
 from lidar_synth.formats.calibration import Calibration
@@ -22,7 +22,6 @@ from lidar_synth.formats.kitti_object import OBJECT_CAMERA
 from lidar_synth.formats.nuscenes import INTENSITY_MAX
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import ObjectBank
-from lidar_synth.labels.ground import GROUND
 
 NEAR = 40.0
 """Maximum distance of ground returns for the plane, metres."""

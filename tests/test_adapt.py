@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from accelerate.state import AcceleratorState
 from latent_runs import call
 from small_models import write as write_pixel_model
 
@@ -61,7 +60,6 @@ def short() -> Iterator[None]:
     yield
     torch.set_num_threads(threads)
     card.GENERATED = count
-    AcceleratorState._reset_state(True)
 
 
 @pytest.fixture(scope="module")

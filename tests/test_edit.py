@@ -13,6 +13,7 @@ from worlds import CAR, WALL, car, cast, wall
 
 from lidar_synth import ObjectBank, Town, load_generator, load_sensor, open_scans
 from lidar_synth.cli import app
+from lidar_synth.datasets.classes import GROUND
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS
 from lidar_synth.geometry.projection import locate, project
@@ -21,7 +22,7 @@ from lidar_synth.labels import edit, objects_of
 from lidar_synth.labels.edit.insertion import cut_out
 from lidar_synth.labels.edit.rays import rays_of_scan
 from lidar_synth.labels.edit.removal import returns_of
-from lidar_synth.labels.ground import FLOOR, GROUND
+from lidar_synth.labels.ground import FLOOR
 
 BEHIND = wall(24, 0, np.pi / 2, length=80)
 

@@ -3,7 +3,7 @@ student, decoder.
 
     python tools/make_town_weights.py WORK [--model town] [--codec 60] [--teacher 180] [--weaker 10] [--student 30]
         [--decoder 30] [--set RUN.KEY=VALUE ...]
-    python tools/make_town_weights.py WORK --model town-dense --codec 60 --teacher 90 --student 45
+    python tools/make_town_weights.py WORK --model town-dense --codec 60 --teacher 90 --student 45 --decoder 25
     python tools/make_town_weights.py WORK --model town-semantic --teacher 60      # after town, in the same folder
     python tools/make_town_weights.py WORK --model town-camera --teacher 60
 
@@ -66,6 +66,7 @@ DENSE = {
     "codec": Stage(TrainConfig, 60),
     "teacher": Stage(TrainConfig, 180, {"codec": "codec"}),
     "student": Stage(DistillConfig, 45, {"teacher": "teacher"}),
+    "decoder": Stage(TrainConfig, 25, {"init": "student"}),
 }
 CONDITIONAL = {
     "teacher": Stage(TrainConfig, 180, {"init": "unconditional"}),

@@ -28,7 +28,7 @@ class BakeJob(BaseModel):
     seed: int = Field(0, ge=0, lt=2**64, description="scan i is a function of the model, the seed and i")
     first: int = Field(0, ge=0, lt=2**62, description="index of the first scan")
     shard_size: Count = Field(1024, description="scans per file; a worker builds a file in memory")
-    steps: Count | None = Field(None, description="steps of a uniform time grid [the model's own time grid]")
+    steps: Count | None = Field(None, description="number of steps [the model's own]")
     solver: str = Field("euler", description="ODE solver: euler | heun")
     condition: str | None = Field(
         None, description="dataset with the labels, images or boxes that a conditional model needs, or a layout.yaml"

@@ -13,9 +13,7 @@ def sample(
     model: Annotated[str, typer.Option(help="name of a shipped model, or a .safetensors checkpoint")] = "town",
     count: Annotated[int, typer.Option(min=1, help="number of scans")] = 16,
     seed: Annotated[int, typer.Option(min=0, help="scan i is a function of the model, the seed and i")] = 0,
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="steps of a uniform time grid [the model's own time grid]")
-    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="number of steps [the model's own]")] = None,
     solver: Annotated[str, typer.Option(help="ODE solver: euler | heun")] = "euler",
     condition: Annotated[
         str | None,

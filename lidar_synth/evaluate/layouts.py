@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.datasets.classes import GROUND
 from lidar_synth.errors import DataError
-from lidar_synth.generate.boxed import GROUND, TOLERANCE
+from lidar_synth.generate.boxed import TOLERANCE
 from lidar_synth.geometry.layout import CODES, Layout, layout_image
 from lidar_synth.geometry.layout.raster import depth_of
 from lidar_synth.geometry.scan import Scan
@@ -94,5 +95,5 @@ def _inside(layout: Layout, scan: Scan) -> tuple[NDArray[np.bool_], NDArray[np.b
     if scan.label is None:
         raise DataError(f"scan {scan.id!r} has no labels", "labels, to compare it with its layout")
     inside = layout.boxes.enlarged(TOLERANCE).contain(scan.points)
-    points: NDArray[np.int64] = (inside & ~np.isin(scan.label, GROUND)[None]).sum(1)
+    points: NDArray[np.int64] = (inside & ~GROUND[scan.label]).sum(1)
     return np.asarray(inside.any(0)), np.isin(scan.label, BOXED), points

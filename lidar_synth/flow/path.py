@@ -84,7 +84,7 @@ def velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tenso
 
 
 def balanced_velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
-    """``velocity_loss`` with each sample divided by its own error, so that long steps, whose errors are a hundred times
+    """``velocity_loss`` with each sample divided by its own error, so that long steps, whose errors are tens of times
     larger, do not outweigh short ones (Geng et al., "Mean Flows for One-step Generative Modeling", NeurIPS 2025: p = 1,
     c = 0.001)."""
     errors = _errors(velocity, example, metric)

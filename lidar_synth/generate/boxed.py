@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.datasets.classes import TRAIN_ID
+from lidar_synth.datasets.classes import GROUND
 from lidar_synth.geometry.layout import Layout, known_boxes
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
@@ -16,9 +16,6 @@ TOLERANCE = 0.1
 
 FIELDS = frozenset(("boxes", "instance"))
 """What the scans of a layout have besides those of other models."""
-
-GROUND = [TRAIN_ID[name] for name in ("road", "parking", "sidewalk", "other-ground", "terrain")]
-"""Train ids of returns that belong to no box."""
 
 
 def boxes_of(given: Any, count: int) -> list[Boxes] | None:
@@ -42,7 +39,7 @@ def with_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
     scan = unproject(image)
     inside = boxes.enlarged(TOLERANCE).contain(scan.points)
     if scan.label is not None:
-        inside &= ~np.isin(scan.label, GROUND)
+        inside &= ~GROUND[scan.label]
     held = inside.any(1)
     kept, inside = boxes[held], inside[held]
     kept = replace(kept, instance=np.arange(1, len(kept) + 1, dtype=np.int32))

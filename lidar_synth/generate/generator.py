@@ -291,9 +291,9 @@ def _compile(networks: dict[str, nn.Module]) -> None:
     """Compile the velocity network and the decoder, in place."""
     networks[VELOCITY].compile()
     if (autoencoder := networks.get(CODEC)) is not None:
-        # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``.
+        # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``. Compiled for two widths at once,
+        # it gives infinite values (torch 2.13).
         codec: Any = autoencoder
-        # A decoder of two widths compiled for both at once gives NaN (torch 2.13).
         codec.decode = torch.compile(codec.decode, dynamic=False)
 
 

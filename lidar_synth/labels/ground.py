@@ -6,12 +6,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import box_frame
-
-GROUND = np.isin(np.arange(256), [TRAIN_ID[n] for n in ("road", "parking", "sidewalk", "other-ground", "terrain")])
-"""(256,) True for labels of ground."""
 
 LEAST = 5
 """Minimum number of returns of a plane."""

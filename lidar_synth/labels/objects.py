@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import GROUND, IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grown, turned, turned_points
-from lidar_synth.labels.ground import GROUND, ground_under
+from lidar_synth.labels.ground import ground_under
 
 LABELS = {
     "Car": TRAIN_ID["car"], "Van": TRAIN_ID["car"], "Truck": TRAIN_ID["truck"], "Pedestrian": TRAIN_ID["person"],

@@ -5,6 +5,7 @@ errors of a flow. Every norm is over the channels of one cell, so that crops (in
 the same result.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -38,7 +39,7 @@ class Residual(nn.Module):
         return out
 
 
-class BoundedAutoencoder(Network):
+class BoundedAutoencoder(Network, ABC):
     """Images (B, C, H, W) to latents and back. A subclass calls ``add_encoder``, and has ``embed`` and ``expand``."""
 
     is_autoencoder: ClassVar[bool] = True
@@ -70,14 +71,14 @@ class BoundedAutoencoder(Network):
         self.register_buffer("shift", torch.zeros(latent_channels))
         self.register_buffer("scale", torch.ones(latent_channels))
 
+    @abstractmethod
     def embed(self, x: Tensor) -> Tensor:
         """Images with a channel of their returns, (B, C + 1, H, W), to patches (B, widths[0], rows, columns)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def expand(self, z: Tensor, image: Tensor) -> Any:
         """Bounded latents (B, *latent_shape) to the distributions of the cells; a decoder may predict some of them from
         other cells of the image (B, C, H, W)."""
-        raise NotImplementedError
 
     def forward(self, x: Tensor, noise: Tensor) -> Any:
         """Encodes images (B, C, H, W) and expands them with ``noise`` (B, *latent_shape) added to the bounded latents;

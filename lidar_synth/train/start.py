@@ -168,19 +168,8 @@ def _recordings(data: Data, sensor: Sensor) -> Recordings:
 
 def provenance_of(config: Run) -> dict[str, Any]:
     """What a checkpoint says of its making; the checkpoints that it was made from stand beside, by their hash."""
-    beside = {
-        "output",
-        "data",
-        "licence",
-        "samples",
-        "save_every",
-        "sensor",
-        "init",
-        "teacher",
-        "weaker",
-        "codec",
-        "held_out",
-    }
+    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "held_out"}
+    beside |= {"init", "teacher", "weaker", "codec"}
     return {
         "data": config.data.describe(),
         "data_licence": config.data.licence,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, NAMES, TRAIN_ID
+from lidar_synth.datasets.classes import GROUND, IGNORE, NAMES
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 
@@ -19,9 +19,6 @@ SIDE, CELLS = 80.0, 32
 
 SIGNATURE = CELLS * CELLS
 """Entries of a signature."""
-
-GROUND = tuple(TRAIN_ID[name] for name in ("road", "parking", "sidewalk", "other-ground", "terrain"))
-"""Train ids of the ground classes."""
 
 _SAME_SURFACE = 0.02  # relative range difference of two neighbouring cells on the same surface
 
@@ -52,7 +49,7 @@ def _unlabelled(image: RangeImage, scan: Scan) -> float:
 
 def _floating(image: RangeImage, scan: Scan) -> float:
     assert scan.label is not None
-    return _share(scan.points[:, 2][np.isin(scan.label, GROUND)] > 0)
+    return _share(scan.points[:, 2][GROUND[scan.label]] > 0)
 
 
 def _speckle(image: RangeImage, scan: Scan) -> float:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import GROUND, IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.layout.layout import CLASSES, Layout, Outline, around_sensor, overlaps
 from lidar_synth.geometry.scan import Boxes, Scan
@@ -16,7 +16,6 @@ KINDS = {"building": ("building",), "vegetation": ("vegetation", "trunk"), "fenc
 SECTORS = 512
 """Directions in which an outline has a corner."""
 
-_GROUND = [TRAIN_ID[name] for name in ("road", "parking", "sidewalk", "other-ground", "terrain")]
 _LEAST = 3  # returns of an outline in a sector
 _GAP = 1.5  # metres between the first wall of a sector and what stands behind it; and between connected sectors
 _STEP = 0.5  # metres by which the edges of connected sectors may differ, before they are two outlines
@@ -47,7 +46,7 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
     if scan.boxes is None:
         raise DataError(f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects")
     label = scan.label if scan.label is not None and (scan.label != IGNORE).any() else None
-    ground = _plane(_lowest(scan.points) if label is None else scan.points[np.isin(label, _GROUND)], scan.id)
+    ground = _plane(_lowest(scan.points) if label is None else scan.points[GROUND[label]], scan.id)
     outlines = list(_unlabelled(scan, ground) if label is None else _labelled(scan.points, label))
     return Layout(known_boxes(scan.boxes), ground, outlines, reach or scan.sensor.range_max, scan.id)
 

@@ -6,15 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import ring_numbers
 from lidar_synth.geometry.projection.rings import fault_of
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer.kernels import find_level, neighbours_below, triangulate
-
-GROUND = np.isin(np.arange(256), [TRAIN_ID[n] for n in ("road", "parking", "sidewalk", "other-ground", "terrain")])
-"""(256,) whether a train id is a class of the ground."""
 
 ORDERED = np.radians(2.0)
 """Median step of azimuth between successive points of a file that may be in ring order, radians."""

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.datasets.classes import GROUND
 from lidar_synth.geometry.projection import carry, locate
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.labels.edit.rays import ScanRays
-from lidar_synth.labels.ground import GROUND
 from lidar_synth.labels.objects import THINGS
 
 if TYPE_CHECKING:  # importing it takes seconds, and most edits need no model

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grown, widened
@@ -20,7 +20,7 @@ from lidar_synth.labels.edit.compose import composed
 from lidar_synth.labels.edit.fill import continued
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
 from lidar_synth.labels.edit.redraw import Model, open_model, redrawn
-from lidar_synth.labels.ground import CLEARANCE, FLOOR, GROUND, ground_under, standing
+from lidar_synth.labels.ground import CLEARANCE, FLOOR, ground_under, standing
 from lidar_synth.labels.objects import NOISE, THINGS, belonging
 
 if TYPE_CHECKING:

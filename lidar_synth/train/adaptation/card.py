@@ -5,7 +5,6 @@ those of held-out real scans, in the features of the shipped segmenter.
 """
 
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +99,7 @@ def provenance_of(name: str, model: Checkpoint, work: Work, made: Checkpoint, fo
         "scans": {"train": list(work.scans.train), "held_out": list(work.scans.held_out)},
         "seen": seen_by(made.header.provenance).to_list(),
         "figures": found,
-        "software": f"lidar_synth {version('lidar_synth')}, torch {torch.__version__}",
+        "software": made.header.provenance["software"],
     }
 
 
