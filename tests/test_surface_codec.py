@@ -1,5 +1,7 @@
 """The autoencoder of dense models: patches, the likelihood of cells, sampling, training."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,13 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow.path import METRICS
 from lidar_synth.generate.checkpoint import CODEC, VELOCITY
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.generator import _compile
+from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES, DEPTH_STEP
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.models.surface_codec.blocks import PATCH, from_patches, split, to_patches
@@ -32,7 +37,7 @@ from lidar_synth.noise import uniform
 from lidar_synth.town import Town
 from lidar_synth.train.autoencoder import Autoencoding, Losses
 
-K, CODES, CELLS = 3, 20, PATCH[0] * PATCH[1]
+K, LABELS, CELLS = 3, 20, PATCH[0] * PATCH[1]
 SCALE = NORMALISATIONS["r2flow"]
 FORMAT = TensorFormat(("range", "reflectance", "label"), SCALE)
 COARSE = Sensor("coarse", 256, 1.45, 80.0, rows=16, fov_up=3.0, fov_down=-25.0)
@@ -47,10 +52,10 @@ def small(**changes: object) -> SurfaceAutoencoder:
 
 def random_surfaces(patches: int, spread: float = 1.0) -> Surfaces:
     generator = torch.Generator().manual_seed(3)
-    numbers = K * (NUMBERS + CODES) + CELLS * (K + PER_CELL)
+    numbers = K * (NUMBERS + LABELS) + CELLS * (K + PER_CELL)
     x = spread * torch.randn(patches, numbers, generator=generator)
-    x[:, : K * (NUMBERS + CODES)].view(patches, K, -1)[:, :, 0] += torch.tensor([1.5, 2.3, 3.0])
-    return surfaces_of(x, K, CODES, PATCH)
+    x[:, : K * (NUMBERS + LABELS)].view(patches, K, -1)[:, :, 0] += torch.tensor([1.5, 2.3, 3.0])
+    return surfaces_of(x, K, LABELS, PATCH)
 
 
 @settings(max_examples=20, deadline=None)
@@ -83,7 +88,7 @@ def test_the_likelihoods_of_all_that_a_cell_can_show_sum_to_one() -> None:
     )  # fmt: skip
     nothing = torch.zeros(1, 1).long()
     total = one.log_likelihood(torch.tensor([[-1.0]]), torch.tensor([[-1.0]]), nothing, SCALE, (1.0, 1.0)).exp()
-    for code in range(CODES):
+    for code in range(LABELS):
         codes = torch.full((1, len(grid)), code)
         cells = one.log_likelihood(grid[None, :, 0], grid[None, :, 1], codes, SCALE, (1.0, 1.0)).exp()
         dark = one.log_likelihood(far[None], torch.full((1, len(far)), -1.0), codes[:, : len(far)], SCALE, (1.0, 1.0))
@@ -97,7 +102,7 @@ def test_samples_have_the_predicted_frequencies() -> None:
         *(_repeat(part, 4000) for part in surfaces.reflectance)), *(_repeat(part, 4000) for part in surfaces[4:]),
     )  # fmt: skip
     noise = uniform(0, [0], (4000, DRAWS, CELLS))[0]
-    alike = Noise(torch.zeros(CODES), torch.zeros(CODES, len(SPANS)), torch.full((CODES,), 0.5))
+    alike = Noise(torch.zeros(LABELS), torch.zeros(LABELS, len(SPANS)), torch.full((LABELS,), 0.5))
     relief = torch.zeros(4000, len(SPANS), CELLS)
     distance, value, code, likely = many.sample(noise, relief, alike, SCALE).unbind(1)
     shares = surfaces.weights.exp()
@@ -115,10 +120,10 @@ def _repeat(part: Tensor, times: int) -> Tensor:
 
 def test_a_wall_is_exact_in_every_cell_of_a_patch() -> None:
     """Within a patch the inverse range of a plane is linear in row and column."""
-    x = torch.zeros(1, K * (NUMBERS + CODES) + CELLS * (K + PER_CELL))
-    numbers = x[:, : K * (NUMBERS + CODES)].view(K, -1)
+    x = torch.zeros(1, K * (NUMBERS + LABELS) + CELLS * (K + PER_CELL))
+    numbers = x[:, : K * (NUMBERS + LABELS)].view(K, -1)
     numbers[0, :3] = torch.tensor([np.log(10.0), 0.5, -0.4])
-    inverse = surfaces_of(x, K, CODES, PATCH).inverse[0, 0].view(PATCH)
+    inverse = surfaces_of(x, K, LABELS, PATCH).inverse[0, 0].view(PATCH)
     assert torch.allclose(inverse.diff(dim=1), inverse.diff(dim=1)[0, 0].expand(2, 7), atol=1e-6)
     assert inverse.mean() == pytest.approx(0.1)
 
@@ -138,9 +143,9 @@ def test_images_are_decoded_with_valid_labels_and_ranges() -> None:
 
 def test_half_the_columns_show_the_same_street() -> None:
     """A wider cell looks through the middle of two: on one plane, its inverse range is their mean."""
-    x = torch.zeros(5, K * (NUMBERS + CODES) + CELLS * (K + PER_CELL))
+    x = torch.zeros(5, K * (NUMBERS + LABELS) + CELLS * (K + PER_CELL))
     x[:, :3] = torch.randn(5, 3, generator=torch.Generator().manual_seed(0)) / 3 + torch.tensor([2.0, 0, 0])
-    fine, coarse = (surfaces_of(x, K, CODES, PATCH, merged).inverse[:, 0] for merged in (1, 2))
+    fine, coarse = (surfaces_of(x, K, LABELS, PATCH, merged).inverse[:, 0] for merged in (1, 2))
     assert torch.allclose(fine.view(5, 2, 4, 2).mean(3).flatten(1), coarse, rtol=1e-5)
     network = small().eval()
     z = torch.randn(1, *network.latent_shape)
@@ -148,6 +153,45 @@ def test_half_the_columns_show_the_same_street() -> None:
         assert network.decode(z, uniform(0, [0], (network.draws, 16, width))).shape == (1, 7, 16, width)
     with pytest.raises(DataError, match="one of 256, 128"):
         network.decode(z, torch.rand(1, network.draws, 16, 100))
+
+
+def layout_with_a_box() -> Tensor:
+    """(1, 5, 16, 256): ground, and a car between 12 m and 15 m in eleven columns."""
+    image = torch.zeros(1, 5, 16, 256, dtype=torch.uint8)
+    steps = round(12 / DEPTH_STEP)
+    image[:, 0] = CODES["ground"]
+    values = torch.tensor([CODES["Car"], steps >> 8, steps & 255, round(3 / CHORD_STEP), 0], dtype=torch.uint8)
+    image[..., 4:9, 30:41] = values.view(5, 1, 1)
+    return image
+
+
+@pytest.mark.parametrize("width", [256, 128])
+@pytest.mark.parametrize("cars", [1, 2, 3])
+def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int) -> None:
+    network = small().eval()
+    with torch.no_grad():  # classes of the three surfaces of every patch
+        kinds = network.head.bias[: K * (NUMBERS + LABELS)].view(K, -1)[:, NUMBERS:]
+        kinds[:cars, TRAIN_ID["car"]] += 30
+        kinds[cars:, TRAIN_ID["road"]] += 30
+    z, noise = torch.randn(1, *network.latent_shape), uniform(0, [0], (network.draws, 16, width))
+    layout, sensor = layout_with_a_box(), replace(COARSE, columns=width)
+
+    def image_of(layout: Tensor | None) -> RangeImage:
+        [image] = FORMAT.to_images(Latent(network, FORMAT).decode(z, noise, layout), sensor)
+        assert image.label is not None
+        return image
+
+    free, bounded = image_of(None), image_of(layout)
+    inside = (layout[0, 0] == CODES["Car"]).view(16, width, -1).any(2).numpy()
+    object_ = bounded.mask & (bounded.channels["label"] == TRAIN_ID["car"])
+    assert (free.mask & (free.channels["label"] == TRAIN_ID["car"]))[~inside].mean() > 0.1
+    assert object_[inside].any() and not object_[~inside].any()
+    assert ((bounded.range[object_] > 11.99) & (bounded.range[object_] < 15.01)).all()
+    # A cell without a box shows the road instead, if its patch has one.
+    assert bounded.mask[~inside].mean() == pytest.approx(free.mask[~inside].mean() if cars < 3 else 0, abs=0.1)
+    road = inside & (free.channels["label"] == TRAIN_ID["road"])  # rays through a box may miss the object
+    assert np.array_equal(free.range[road], bounded.range[road])
+    assert np.array_equal(free.range, image_of(torch.zeros_like(layout)).range)  # nothing is known of a blank layout
 
 
 @pytest.mark.slow
@@ -197,7 +241,7 @@ def test_the_noise_of_scans_is_measured() -> None:
     """Images that the codec itself sampled have the noise that it sampled with."""
     network = small().eval()
     with torch.no_grad():
-        numbers = network.head.bias[: K * (NUMBERS + CODES)].view(K, -1)
+        numbers = network.head.bias[: K * (NUMBERS + LABELS)].view(K, -1)
         numbers[:, 0] = torch.tensor([1.0, 2.3, 3.6])  # surfaces far apart, almost without reflectances of 0
         numbers[:, 3], numbers[:, 4], numbers[:, 7] = -4.5, 0.5, -6
         network.roughness.fill_(0.3)
@@ -230,10 +274,10 @@ def test_the_fields_of_relief_are_standard_normal_and_correlated_along_rows(merg
 def test_the_relief_of_plants_is_measured() -> None:
     """Images with a relief that is known; other classes have none."""
     network = small().eval()
-    relief = torch.zeros(CODES, 2)
+    relief = torch.zeros(LABELS, 2)
     relief[PLANTS[0]], relief[PLANTS[1]] = torch.tensor([1.0, 0.5]), torch.tensor([0.3, 1.0])
     with torch.no_grad():
-        numbers = network.head.bias[: K * (NUMBERS + CODES)].view(K, -1)
+        numbers = network.head.bias[: K * (NUMBERS + LABELS)].view(K, -1)
         numbers[:, 0] = torch.tensor([1.0, 2.3, 3.6])
         numbers[:, 3], numbers[:, 4] = -4.5, 6
         for k, plant in enumerate((*PLANTS, 13)):  # 13 is a building
@@ -246,7 +290,7 @@ def test_the_relief_of_plants_is_measured() -> None:
     network.squeeze = lambda x: next(latents)  # type: ignore[method-assign]
     measure_noise(network, ((x, _codes(x)) for x in images), noise=0.0)
     assert torch.allclose(network.relief[list(PLANTS)], relief[list(PLANTS)], atol=0.25)
-    assert not network.relief[[c for c in range(CODES) if c not in PLANTS]].any()
+    assert not network.relief[[c for c in range(LABELS) if c not in PLANTS]].any()
 
 
 def _codes(x: Tensor) -> Tensor:

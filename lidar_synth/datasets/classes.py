@@ -30,6 +30,9 @@ TRAIN_ID = {name: i for i, name in enumerate(NAMES)}
 GROUND = np.isin(np.arange(256), [TRAIN_ID[n] for n in ("road", "parking", "sidewalk", "other-ground", "terrain")])
 """(256,) whether a label, uint8, is of the ground."""
 
+BOXED = tuple(TRAIN_ID[name] for name in ("car", "truck", "other-vehicle", "person", "bicyclist"))
+"""Train ids of the objects that detectors' classes have boxes for."""
+
 COLOURS = np.array(
     [
         (100, 150, 245), (100, 230, 245), (30, 60, 150), (80, 30, 180), (0, 0, 255),

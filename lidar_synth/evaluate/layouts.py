@@ -7,14 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND
+from lidar_synth.datasets.classes import BOXED, GROUND
 from lidar_synth.errors import DataError
 from lidar_synth.generate.boxed import TOLERANCE
 from lidar_synth.geometry.layout import CODES, Layout, layout_image
 from lidar_synth.geometry.layout.raster import depth_of
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.labels.edit.unboxed import BOXED
 
 LEAST_RAYS, LEAST_POINTS = 20, 10
 """A box that so many rays meet first should hold so many points."""

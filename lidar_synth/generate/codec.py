@@ -4,6 +4,7 @@ Everything after the codec (path, solver, selection, distillation, sampling) is 
 contains range images encoded by ``TensorFormat``; a state is what the flow generates.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, cast
 
@@ -32,9 +33,9 @@ class Codec(Protocol):
         """Tensors (B, C, H, W) to states (B, *shape)."""
         ...
 
-    def decode(self, y: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
+    def decode(self, y: Tensor, uniform_noise: Tensor | None = None, layout: Tensor | None = None) -> Tensor:
         """States (B, *shape) to tensors (B, C, H, W), sampled with (B, draws, H, W) numbers in (0, 1); None = the
-        mode."""
+        mode. With images of layouts (B, 5, H, W), autoencoders that can draw objects in their boxes only."""
         ...
 
 
@@ -46,12 +47,14 @@ class Autoencoder(Protocol):
         resolution: rows and columns of an image.
         latent_shape: channels, rows and columns of a latent.
         draws: number of random numbers per cell for sampling an image; 0 if decoding is deterministic.
+        takes_layout: whether ``decode`` takes images of layouts, and draws objects in their boxes only.
     """
 
     channels: int
     resolution: tuple[int, int]
     latent_shape: tuple[int, int, int]
     draws: int
+    takes_layout: ClassVar[bool]
 
     def encode(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) to latents of approximate mean 0 and variance 1."""
@@ -77,7 +80,7 @@ class Identity:
         """(B, C, H, W), unchanged."""
         return x
 
-    def decode(self, y: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
+    def decode(self, y: Tensor, uniform_noise: Tensor | None = None, layout: Tensor | None = None) -> Tensor:
         """(B, C, H, W), unchanged."""
         return y
 
@@ -110,19 +113,22 @@ class Latent:
         return self.network.encode(x).float()
 
     @torch.no_grad()
-    def decode(self, y: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
+    def decode(self, y: Tensor, uniform_noise: Tensor | None = None, layout: Tensor | None = None) -> Tensor:
         """Latents (B, *shape), quantised if there is a codebook, to tensors (B, C, H, W).
 
         Args:
             y: latents.
             uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample with; None = the mode.
+            layout: (B, 5, H, W) uint8, images of layouts. Autoencoders without ``takes_layout`` do not use them.
 
         Raises:
             DataError: on latents of another shape.
         """
         if y.shape[1:] != self.shape:
             raise DataError(f"a latent of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, self.shape))})")
-        return expected(self.network.decode(y, uniform_noise).float(), self.tensors)
+        decode: Callable[..., Tensor] = self.network.decode
+        layouts = () if layout is None or not self.network.takes_layout else (layout,)
+        return expected(decode(y, uniform_noise, *layouts).float(), self.tensors)
 
 
 def expected(output: Tensor, tensors: TensorFormat) -> Tensor:

@@ -207,8 +207,10 @@ class Generator:
             noise = gaussian(seed, indices[part], codec.shape, self.device)
             uniform_noise = uniform(seed, indices[part], noise_shape, self.device) if codec.draws else None
             with torch.inference_mode():
-                velocity, cond = self._flow(None if given is None else given[part], guidance, grid)
-                yield codec.decode(solve(velocity, noise, grid, solver, cond), uniform_noise)
+                own = None if given is None else given[part]
+                velocity, cond = self._flow(own, guidance, grid)
+                layout = own if self.condition == "layout" else None
+                yield codec.decode(solve(velocity, noise, grid, solver, cond), uniform_noise, layout)
 
     def _flow(self, condition: Tensor | None, guidance: float, grid: Sequence[float]) -> tuple[Velocity, Tensor | None]:
         """The velocity to solve on a grid, and its encoded condition: it is encoded once, not at every step."""

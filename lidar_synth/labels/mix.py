@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.datasets.classes import BOXED
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.edit.redraw import open_model
-from lidar_synth.labels.edit.unboxed import BOXED, closed
+from lidar_synth.labels.edit.unboxed import closed
 from lidar_synth.labels.exchange import swap_bands, swap_sector, thinned
 from lidar_synth.labels.objects import THINGS, Object, instances_of, objects_of
 from lidar_synth.labels.own import Ignored, Own, generated

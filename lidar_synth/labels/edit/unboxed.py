@@ -13,17 +13,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND, NAMES
+from lidar_synth.datasets.classes import BOXED, GROUND, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grown
 from lidar_synth.labels.edit.redraw import Model
 from lidar_synth.labels.edit.removal import without
 from lidar_synth.labels.ground import FLOOR, standing
-from lidar_synth.labels.objects import LABELS
-
-BOXED = tuple(sorted(set(LABELS.values())))
-"""Train ids of the classes that have boxes."""
 
 LEAST = 20
 """Minimum number of points of an unboxed object; smaller ones are too small for a detector, too."""

@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lidar_synth.geometry.normalize import Normalisation
+from lidar_synth.models.surface_codec.bounds import Bounds
 from lidar_synth.models.surface_codec.relief import to_normal
 from lidar_synth.models.town_codec.planes import laplace_noise
 from lidar_synth.models.town_codec.reflectance import ZeroInflatedLogistic
@@ -96,7 +97,14 @@ class Surfaces(NamedTuple):
         seen = F.logsigmoid(self.returned) + temper[0] * distance + temper[1] * shown + self.classes.gather(2, index)
         return torch.logsumexp(self.weights + torch.where(x > -1, seen, F.logsigmoid(-self.returned)), 1)
 
-    def sample(self, uniform_noise: Tensor, relief: Tensor, noise: Noise, normalisation: Normalisation) -> Tensor:
+    def sample(
+        self,
+        uniform_noise: Tensor,
+        relief: Tensor,
+        noise: Noise,
+        normalisation: Normalisation,
+        bounds: Bounds | None = None,
+    ) -> Tensor:
         """(N, 4, P) range, -1 without a return, reflectance, class and its probability, of sampled cells.
 
         Args:
@@ -104,14 +112,17 @@ class Surfaces(NamedTuple):
             relief: (N, F, P) fields of relief.
             noise: of the cells.
             normalisation: of the ranges.
+            bounds: (N, P) where objects may be. A cell without a box shows another surface of its patch, or nothing;
+                ranges of objects are clipped to the box.
         """
         which, back, near, dim, shared = uniform_noise.unbind(1)
         count = self.weights.shape[1]
-        chosen = _choose(self.weights.exp(), which)[:, None]
+        likely, code = self.classes.max(2)
+        shares = self.weights.exp() if bounds is None else _allowed(self.weights.exp(), bounds.codes[code], bounds)
+        chosen = _choose(shares, which)[:, None]
         distance, median, returned = (
             part.gather(1, chosen)[:, 0] for part in (self.inverse, self.reflectance.middles, self.returned)
         )
-        likely, code = self.classes.max(2)
         # What all cells of a surface have in common.
         parts = [self.scale[..., 0], *(part[..., 0] for part in self.reflectance[1:]), likely.exp(), code.float()]
         parts += [noise.reflectance[code], to_normal(shared[:, :count]), noise.roughness[code]]
@@ -121,8 +132,16 @@ class Surfaces(NamedTuple):
         values = ZeroInflatedLogistic(median, dull, blank).sample(_mixed(dim, alike, patch))
         error = rough * laplace_noise(near) + sum(a * b for a, b in zip(bumps, relief.unbind(1), strict=True))
         distance = normalised(distance, normalisation) + scale * error
+        if bounds is not None:  # where no box is, far = -1: no return
+            distance = torch.where(bounds.codes[kind.long()], distance.clamp(bounds.near, bounds.far), distance)
         distance = torch.where(returned + torch.logit(back) > 0, distance, -1.0)
         return torch.stack([distance, values, kind, likely], 1)
+
+
+def _allowed(shares: Tensor, object_: Tensor, bounds: Bounds) -> Tensor:
+    """Shares (N, K, P) of the surfaces, without the objects (N, K) where no box is."""
+    shares = shares * ~(object_[..., None] & (bounds.near > bounds.far)[:, None])
+    return shares / shares.sum(1, keepdim=True).clamp_min(1e-9)
 
 
 def _choose(shares: Tensor, which: Tensor) -> Tensor:

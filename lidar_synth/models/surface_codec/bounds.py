@@ -1,0 +1,53 @@
+"""Where a layout lets objects stand: in its boxes, and nowhere else."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lidar_synth.datasets.classes import BOXED
+from lidar_synth.geometry.layout.layout import CHANNELS, CHORD_STEP, CODES, DEPTH_STEP, OUTLINES
+from lidar_synth.geometry.normalize import Normalisation
+from lidar_synth.models.surface_codec.blocks import to_patches
+
+_FIRST_BOX = len(OUTLINES) + 2  # the codes of boxes come after "unknown", "ground" and the outlines
+assert CODES["Car"] == _FIRST_BOX and CHANNELS[:4] == ("class", "depth_high", "depth_low", "chord")
+
+
+class Bounds(NamedTuple):
+    """The part of each ray that is in a box.
+
+    Args:
+        near, far: (N, P) normalised ranges where the ray of a cell enters and leaves a box; near > far if it meets
+            none.
+        codes: (C,) bool, the classes that stand in boxes only.
+    """
+
+    near: Tensor
+    far: Tensor
+    codes: Tensor
+
+
+def bounds_of(layout: Tensor, columns: int, patch: tuple[int, int], codes: int, normalisation: Normalisation) -> Bounds:
+    """The bounds of the cells of N patches.
+
+    Rays that meet no box have near = 1 and far = -1, and all rays of a blank image -1 and 1, since nothing is known of
+    them. A column that stands for several has what is in any of them.
+
+    Args:
+        layout: (B, 5, H, W) uint8, images of layouts.
+        columns: of the cells; a divisor of W.
+        patch: rows and columns of a patch.
+        codes: number of classes.
+        normalisation: of the ranges.
+    """
+    code, high, low, chord = layout[:, :4].float().unbind(1)
+    boxed, blank = code >= _FIRST_BOX, (code == 0).all(2).all(1)[:, None, None]
+    depth = (256 * high + low) * DEPTH_STEP
+    near = torch.where(boxed, normalisation.encode(depth), 1.0).masked_fill(blank, -1.0)
+    far = torch.where(boxed, normalisation.encode(depth + chord * CHORD_STEP), -1.0).masked_fill(blank, 1.0)
+    shape = (*near.shape[:2], columns, -1)
+    ranges = torch.stack([near.reshape(shape).amin(3), far.reshape(shape).amax(3)], 1)
+    kinds = torch.isin(torch.arange(codes, device=layout.device), torch.tensor(BOXED, device=layout.device))
+    near, far = to_patches(ranges, patch).unbind(1)
+    return Bounds(near, far, kinds)
