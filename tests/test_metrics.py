@@ -129,6 +129,7 @@ def test_frechet_distance_by_hand() -> None:
     few = a[:3]  # covariances of rank 2 in 6 dimensions
     assert frechet_distance(few, few + 1) == pytest.approx(6, abs=1e-6)
     assert frechet_distance(few, few.astype(np.float32)) == pytest.approx(0, abs=1e-6)
+    assert all(frechet_distance(f, f) >= 0 for f in rng.normal(size=(20, 6, 60)))  # never below, by rounding
 
 
 @given(data=st.data(), bins=st.integers(1, 20))

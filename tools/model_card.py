@@ -20,8 +20,10 @@ tools/condition_card.py is for conditional models.
 """
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -238,23 +240,32 @@ def main() -> None:
     given = parser.parse_args()
 
     judge = load_judge()
-    pair = [opened(path, given.count) for path in given.real] if given.real else [
-        town(seed, given.count) for seed in (REFERENCE, OTHER)]  # fmt: skip
-    reference, other = pair
-    sets = [measure("real against real (lower bound)", reference, other, judge, given.intervals)]
+
+    @cache
+    def real(which: int) -> list[Scan]:
+        if given.real:
+            return opened(given.real[which], given.count)
+        return town((REFERENCE, OTHER)[which], given.count)
+
+    def add(name: str, scans: Sequence[Scan]) -> None:
+        sets.append(measure(name, real(0), scans, judge, given.intervals))
+        print("\n".join([name, *map(str, sets[-1].scores)]), file=sys.stderr, flush=True)
+
+    sets: list[Measured] = []
     for i, text in enumerate(given.models):
         name, spec = text.split("=", 1)
         model, steps, *guidance = spec.split(":") if ":" in spec else (spec, "")
         if steps == "0":
-            scans = resampled(model, other)
+            scans = resampled(model, real(1))
         else:
             scans = generate(model, int(steps) if steps else None, given.count, *guidance)
-        sets.append(measure(name, reference, scans, judge, given.intervals))
+        add(name, scans)
         if i == 0 and given.pictures:
-            apart = np.linspace(0, len(reference) - 1, TILES).astype(int)
+            apart = np.linspace(0, len(real(0)) - 1, TILES).astype(int)
             picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans, not selected")
-            picture(given.pictures / "town.png", [reference[k] for k in apart], f"{TILES} scans of the town")
-    print(f"{given.count} scans in each set, {len(reference)} of the reference\n\n{table(sets)}")
+            picture(given.pictures / "town.png", [real(0)[k] for k in apart], f"{TILES} scans of the town")
+    add("real against real (lower bound)", real(1))
+    print(f"{given.count} scans in each set, {len(real(0))} of the reference\n\n{table([sets[-1], *sets[:-1]])}")
 
 
 if __name__ == "__main__":

@@ -67,6 +67,8 @@ def evaluate(
 
     if (protocol is None) == (judge is None):
         raise typer.BadParameter("give --protocol or --judge, one of them", param_hint="--protocol")
+    if beside and (as_json or judge is not None):
+        raise typer.BadParameter("goes with --protocol and prints tables: leave out --json", param_hint="--beside")
     if judge is None and protocol not in PROTOCOLS:
         raise typer.BadParameter(f"{protocol!r} is none of {', '.join(PROTOCOLS)}", param_hint="--protocol")
     sources = open_scans(real, sensor=sensor, split=split), open_scans(fake, sensor=sensor)

@@ -160,4 +160,5 @@ def more_figures(name: str, real: NDArray[np.floating], fake: NDArray[np.floatin
 
 def describe_missing(missing: Mapping[str, str], protocol: Protocol) -> str:
     """One line per measure that could not be measured, with the reason."""
-    return "\n".join(f"{protocol.measures[name].table or name}: {reason}" for name, reason in missing.items())
+    measures = protocol.measures
+    return "\n".join(f"{measures[n].table or measures[n].title}: {reason}" for n, reason in missing.items())
