@@ -250,11 +250,11 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], st
     "no state": ("lidm_minkowski", _reweigh("model.ckpt", lambda c: c.pop("state_dict")), DataError, "not tensors"),
     "a weight is missing": (
         "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"].pop("stem.0.kernel")), DataError,
-        "another architecture.*stem.0.kernel",
+        r"another architecture \(it lacks stem.0.kernel\)",
     ),
     "a weight of another shape": (
         "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"].update({"stem.0.kernel": torch.ones(2)})),
-        DataError, "another architecture.*stem.0.kernel",
+        DataError, r"another architecture \(it has another shape of stem.0.kernel\)",
     ),
     "a weight is not a number": (
         "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"]["stem.0.kernel"].fill_(torch.nan)),
@@ -315,7 +315,7 @@ def test_a_faulty_archive_is_refused_and_the_right_one_named(
     damage(path)
     with pytest.raises(error, match=message) as caught:
         load_extractor(name, path)
-    assert EXTRACTORS[name].source in str(caught.value)
+    assert EXTRACTORS[name].source in str(caught.value) and ".." not in str(caught.value).replace("../", "")
 
 
 def test_what_cannot_be_extracted_is_refused(

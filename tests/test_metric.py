@@ -126,7 +126,7 @@ def test_features_that_are_not_finite_name_their_scan() -> None:
 
 def test_one_scan_has_no_frechet_distance() -> None:
     assert evaluate(REAL[:1], FAKE[:1], "town", progress=False)  # histograms can be compared
-    with pytest.raises(DataError, match="at least two samples each"):
+    with pytest.raises(DataError, match="features of 1 and 4 scans; expected at least two of each"):
         evaluate(REAL[:1], FAKE, "town", {"moments": moments}, progress=False)
     with pytest.raises(DataError, match="1 real and 4 generated samples; expected at least two of each"):
         evaluate(REAL[:1], FAKE, "town", progress=False, replicates=20)

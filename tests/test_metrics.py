@@ -256,7 +256,9 @@ def test_bad_input() -> None:
         with pytest.raises(DataError, match=f"generated scan 'blank': a cloud of 0 points with none .*{area}"):
             evaluate(good, [good[0], empty], name, progress=False)
     features = np.ones((3, 4))
-    for a, b in ((features, features[:1]), (features, features[:, :3]), (features[0], features)):
+    with pytest.raises(DataError, match="features of 3 and 1 scans; expected at least two of each"):
+        frechet_distance(features, features[:1])
+    for a, b in ((features, features[:, :3]), (features[0], features)):
         with pytest.raises(DataError, match=r"features of shape .*; expected \(N, D\) and \(M, D\)"):
             frechet_distance(a, b)
     with pytest.raises(DataError, match="features that are not finite"):

@@ -12,7 +12,7 @@ for the others.
 import argparse
 from pathlib import Path
 
-from model_card import REFERENCE, generate, measure, table, town
+from model_card import REFERENCE, Comparison, generate, table, town
 
 from lidar_synth.evaluate.segmentation import load_judge
 from lidar_synth.flow.distill import STRATEGIES
@@ -60,12 +60,12 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     given = parser.parse_intermixed_args()
 
-    judge, reference = load_judge(), town(REFERENCE, given.count)
+    comparison = Comparison(town(REFERENCE, given.count), load_judge(), given.intervals)
     sets = []
 
     def add(name: str, model: str, steps: int | None) -> None:
         scans = generate(model, steps, given.count)
-        sets.append(measure(name, reference, scans, judge, given.intervals))
+        sets.append(comparison.measure(name, scans))
 
     for steps in (50, 4):
         add(f"teacher, {steps} steps", str(given.teacher), steps)

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import REFERENCE, SEED, Measured, measure, shrink, table, town
+from model_card import REFERENCE, SEED, Comparison, Measured, shrink, table, town
 from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
@@ -101,13 +101,14 @@ def main() -> None:
         real = [source[int(i)] for i in tqdm(chosen, desc=given.root, unit="scan")]
     else:
         real = town(REFERENCE, given.count)
+    comparison = Comparison(real, judge, given.intervals)
     sets: list[Measured] = []
     verdicts = []
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
         kind, scans = generate(model, int(steps) if steps else None, real)
-        sets.append(measure(name, real, scans, judge, given.intervals))
+        sets.append(comparison.measure(name, scans))
         if i == 0:
             verdicts.append(verdict("the real scans", kind, real, real, judge))
         verdicts.append(verdict(name, kind, scans, real, judge))

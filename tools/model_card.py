@@ -35,7 +35,7 @@ from tqdm import tqdm
 
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError
-from lidar_synth.evaluate import Score, bootstrap, evaluate
+from lidar_synth.evaluate import Metric, Score, bootstrap
 from lidar_synth.evaluate.segmentation import Judge, class_ious, load_judge, mean_iou
 from lidar_synth.evaluate.statistics import Counts, Statistic
 from lidar_synth.flow.path import autoguided
@@ -134,24 +134,40 @@ def opened(root: Path, count: int) -> list[Scan]:
     return [replace(source[int(i)], sensor=load_sensor("town")) for i in tqdm(indices, desc=root.name, unit="scan")]
 
 
-def measure(
-    name: str,
-    reference: Sequence[Scan],
-    scans: Sequence[Scan],
-    judge: Judge,
-    replicates: int = 0,
-    progress: bool = True,
-) -> Measured:
-    """Compare scans with a reference; with 95 % intervals from ``replicates`` resamples."""
-    scores = _distances(reference, scans, judge, replicates, progress)
-    columns = (*CLASSES, BEND)
-    if any(scan.label is None for scan in scans):
-        return Measured(name, scores, dict.fromkeys(columns, float("nan")))
-    tables = np.stack([judge.agreement([scan]) for scan in scans])
-    ious = 100 * class_ious(tables.sum(0))
-    values = [ious[TRAIN_ID[one]] for one in CLASSES] + [100 * bend(scans)]
-    agreement = _agreement(tables, len(reference), replicates)
-    return Measured(name, [*scores, agreement], dict(zip(columns, values, strict=True)))
+class Comparison:
+    """Scans that sets of scans are compared with; they are described once.
+
+    Args:
+        scans: the reference.
+        judge: the town segmenter.
+        replicates: resamples for 95 % intervals; 0 = none.
+    """
+
+    def __init__(self, scans: Sequence[Scan], judge: Judge, replicates: int = 0) -> None:
+        self._judge, self._replicates, self._count = judge, replicates, len(scans)
+        own = {"the town segmenter": judge.features}
+        more = (Metric(name, replicates=replicates) for name in ("lidm", "general"))
+        self._metrics = [Metric("town", own, replicates=replicates, extended=True), *more]
+        for metric in self._metrics:
+            metric.update(tqdm(scans, desc=f"reference, {metric.protocol.name}", unit="scan"), real=True)
+
+    def measure(self, name: str, scans: Sequence[Scan]) -> Measured:
+        """Compare a set of scans with the reference."""
+        scores: list[Score] = []
+        for metric in self._metrics:
+            metric.reset(real=False)
+            metric.update(tqdm(scans, desc=f"{name}, {metric.protocol.name}", unit="scan"), real=False)
+            # LiDM's distances of features need weights that do not belong to the card.
+            own = metric.protocol.name == "town"
+            scores += [s for s in metric.scores() if own or not s.metric.startswith("Frechet")]
+        columns = (*CLASSES, BEND)
+        if any(scan.label is None for scan in scans):
+            return Measured(name, scores, dict.fromkeys(columns, float("nan")))
+        tables = np.stack([self._judge.agreement([scan]) for scan in scans])
+        ious = 100 * class_ious(tables.sum(0))
+        values = [ious[TRAIN_ID[one]] for one in CLASSES] + [100 * bend(scans)]
+        agreement = _agreement(tables, self._count, self._replicates)
+        return Measured(name, [*scores, agreement], dict(zip(columns, values, strict=True)))
 
 
 def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
@@ -195,19 +211,6 @@ def bend(scans: Sequence[Scan]) -> float:
     return float(np.median(np.concatenate(found)))
 
 
-def _distances(
-    reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge, replicates: int, progress: bool
-) -> list[Score]:
-    """R2Flow's measures on the town's grid, those of the segmenter's features, LiDM's measures, and the package's own
-    of ranges and classes."""
-    features = {"the town segmenter": judge.features}
-    how: dict[str, Any] = {"progress": progress, "replicates": replicates}
-    own = evaluate(reference, scans, "town", features, extended=True, **how)
-    more = [evaluate(reference, scans, protocol, **how) for protocol in ("lidm", "general")]
-    # LiDM's distances of features need weights that do not belong to the card.
-    return own + [s for scores in more for s in scores if not s.metric.startswith("Frechet")]
-
-
 def _shown(score: Score) -> str:
     """The value with its interval, where it has one."""
     return f"{score.value:.4g}" + ("" if score.low is None else f" [{score.low:.4g}, {score.high:.4g}]")
@@ -239,8 +242,6 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="folder for sheets of the first model and of the town")
     given = parser.parse_args()
 
-    judge = load_judge()
-
     @cache
     def real(which: int) -> list[Scan]:
         if given.real:
@@ -248,9 +249,10 @@ def main() -> None:
         return town((REFERENCE, OTHER)[which], given.count)
 
     def add(name: str, scans: Sequence[Scan]) -> None:
-        sets.append(measure(name, real(0), scans, judge, given.intervals))
+        sets.append(comparison.measure(name, scans))
         print("\n".join([name, *map(str, sets[-1].scores)]), file=sys.stderr, flush=True)
 
+    comparison = Comparison(real(0), load_judge(), given.intervals)
     sets: list[Measured] = []
     for i, text in enumerate(given.models):
         name, spec = text.split("=", 1)

@@ -51,7 +51,10 @@ def bootstrap(
     if not 0 < level < 1 or replicates < 20:
         raise ConfigError(f"level {level} and {replicates} resamples", "a level in (0, 1) and at least 20 resamples")
     if min(statistic.sizes) < 2:
-        raise DataError(f"{statistic.sizes[0]} real and {statistic.sizes[1]} generated samples", "at least two of each")
+        raise DataError(
+            f"{statistic.sizes[0]} real and {statistic.sizes[1]} generated samples",
+            "at least two of each for an interval",
+        )
     rng = np.random.default_rng(seed)
     values = []
     for first in range(0, replicates, _BATCH):
