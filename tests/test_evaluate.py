@@ -67,10 +67,18 @@ def test_the_figures_stand_beside_the_published_ones(folders: tuple[Path, Path])
     assert "| LiDAR-Flow | 4 | 165.31 | 12.41 | 9.46 | 32.09 | 33.43 | 0.025 | 0.34 |" in rows
     own = rows[-1].split("|")
     jsd = re.search(r"in its tables JSD = (\S+)", result.stdout)
-    assert jsd and own[1].strip() == "**these scans**" and own[8].split()[0] == jsd[1]
+    assert jsd and own[1].strip() == "**these scans** (3 real, 3 generated)" and own[8].split()[0] == jsd[1]
     assert own[8].strip().endswith("]") and not own[3].strip()  # an interval; no weights, no FRD
     assert "FRD: no weights of rangenet53" in result.stderr
     assert "those of training among them" in result.stderr
+    for more in (["--json"], ["--judge", "squeezeseg"]):
+        refused = CliRunner().invoke(app, [*call, *more])
+        assert refused.exit_code == 2 and "--beside" in refused.stderr
+
+
+def test_a_measure_without_a_place_in_a_table_is_left_out_by_its_title(folders: tuple[Path, Path]) -> None:
+    result = CliRunner().invoke(app, ["evaluate", *map(str, folders), "--protocol", "spiral", "--anyway"])
+    assert "Frechet distance of range features and class shares: no weights of rangenet53" in result.stderr
 
 
 @pytest.mark.parametrize("protocol", ["r2flow", "town"])

@@ -1,10 +1,13 @@
 """Feature extractors: the published archives with random weights, against numbers that the peers' own code gave."""
 
+import importlib
 import json
 import shutil
+import sys
 import tarfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,6 +20,7 @@ from typer.testing import CliRunner
 
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError, LidarSynthError
+from lidar_synth.evaluate import frechet_distance
 from lidar_synth.evaluate.extractors import EXTRACTORS, load_extractor
 from lidar_synth.evaluate.extractors.archive import Archive
 from lidar_synth.evaluate.extractors.bonnetal import POOLS, load_lidm, read_segmenter
@@ -24,10 +28,12 @@ from lidar_synth.evaluate.extractors.inputs import PREPARATIONS
 from lidar_synth.evaluate.extractors.liploc import picture
 from lidar_synth.evaluate.extractors.rangevit import build
 from lidar_synth.evaluate.street_judge import load_archive
+from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import presets
 
 ROOT = Path(__file__).parents[1]
+Of = Callable[[torch.Tensor], NDArray[np.floating]]
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -55,8 +61,19 @@ def peer(golden: Golden) -> dict[str, NDArray[np.float32]]:
 
 @pytest.fixture(scope="module")
 def scan(peer: dict[str, NDArray[np.float32]]) -> Scan:
-    points = peer["points"]
+    return _scan(peer["points"])
+
+
+def _scan(points: NDArray[np.float32]) -> Scan:
     return Scan(points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id="random")
+
+
+@pytest.fixture(scope="module")
+def inputs() -> Iterator[ModuleType]:
+    """The random inputs that the peers' code was given."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "tools" / "extractors"))
+        yield importlib.import_module("random_inputs")
 
 
 def difference(ours: NDArray[np.floating], theirs: NDArray[np.floating]) -> float:
@@ -65,52 +82,91 @@ def difference(ours: NDArray[np.floating], theirs: NDArray[np.floating]) -> floa
     return float(abs(ours - theirs).max() / abs(theirs).max())
 
 
-CLOUDS = ["sparenet_pointnet", "lidm_minkowski", "lidm_spvcnn", "lidm_minkowski as r2flow", "lidm_spvcnn as r2flow"]
+CLOUDS = [
+    "liploc",
+    "sparenet_pointnet",
+    "lidm_minkowski",
+    "lidm_spvcnn",
+    "lidm_minkowski as r2flow",
+    "lidm_spvcnn as r2flow",
+]
 
 
 @pytest.mark.parametrize("case", CLOUDS)
-def test_features_of_points_are_the_peers(
-    case: str, archives: Callable[[str], Path], peer: dict[str, NDArray[np.float32]], scan: Scan
+def test_features_and_distances_of_points_are_the_peers(
+    case: str, archives: Callable[[str], Path], peer: dict[str, NDArray[np.float32]], scan: Scan, inputs: ModuleType
 ) -> None:
     name, _, preparation = case.partition(" as ")
-    found = load_extractor(name, archives(name), preparation or None)([scan])
+    if name == "liploc":
+        _timm()
+    extract = load_extractor(name, archives(name), preparation or None)
+    found = extract([scan])
     assert found.shape == (1, EXTRACTORS[name].width)
     assert difference(found[0], peer[case]) < 1e-4
+    both = [extract([_scan(inputs.random_points(1000, *one))])[0] for one in inputs.two_sets()]
+    assert distance(both, inputs) == pytest.approx(float(peer[f"{case} distance"][0]), rel=1e-4)
 
 
-def _random_image(channels: int) -> torch.Tensor:
-    rng = np.random.RandomState(6)  # as tools/extractors/against_peers.py
-    image = rng.uniform(-1, 1, (channels, 64, 64)) * (rng.random_sample((64, 64)) < 0.8)
-    return torch.from_numpy(image.astype(np.float32))
+def _timm() -> ModuleType:
+    """timm, which an installation may lack, or have beside a torchvision that does not fit."""
+    try:
+        return importlib.import_module("timm")
+    except (ImportError, RuntimeError) as error:
+        pytest.skip(f"timm cannot be imported ({error})")
 
 
-POOLED = {"rangenet53": "subsample", "r2flow_rangenet": "bands", "squeezeseg": "returns"}
+POOLED = {"rangenet53": "subsample", "rangenet21": "subsample", "r2flow_rangenet": "bands", "squeezeseg": "returns"}
+IMAGES = [*POOLED, "lidm_rangenet", "r3dpa_rangevit", "r3dpa_rangevit_remission"]
+
+
+@pytest.fixture
+def features_of(archives: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Of]:
+    """Features of an image (C, H, W) by an extractor's name, without its preparation of scans."""
+
+    def made(name: str) -> Of:
+        path = archives(name)
+        if name in POOLED:
+            segmenter = read_segmenter(Archive(path, "lidar-bonnetal"))
+            return lambda image: POOLS[POOLED[name]](segmenter.decode(image), image).numpy()
+        if name == "lidm_rangenet":
+            given: list[NDArray[np.float32]] = []
+            changed = PREPARATIONS["lidm"]._replace(image=lambda scan, generated: given[-1])
+            monkeypatch.setitem(PREPARATIONS, "lidm", changed)
+            extract = load_lidm(path, "lidm")
+
+            def features(image: torch.Tensor) -> NDArray[np.float32]:
+                given.append(torch.cat([image, torch.full((1, 64, 64), -1.0)]).numpy())  # remission is unknown
+                return extract([random_scan(presets()["town"], 10)])[0]
+
+            return features
+        network = build(yaml.safe_load((path / "config.yaml").read_text()))
+        network.load_state_dict(Archive(path, "R3DPA").weights("model.ckpt")["state_dict"])
+        network.eval()
+        return lambda image: network(image[None])[0].numpy()
+
+    return made
+
+
+def channels(name: str) -> int:
+    return 4 if name in ("lidm_rangenet", "r2flow_rangenet") else 5
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*POOLED, "lidm_rangenet", "r3dpa_rangevit", "r3dpa_rangevit_remission"])
-def test_features_of_an_image_are_the_peers(
-    name: str, archives: Callable[[str], Path], peer: dict[str, NDArray[np.float32]], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", IMAGES)
+def test_features_and_distances_of_images_are_the_peers(
+    name: str, features_of: Callable[[str], Of], peer: dict[str, NDArray[np.float32]], inputs: ModuleType
 ) -> None:
-    path = archives(name)
+    of = features_of(name)
     with torch.inference_mode():
-        if name in POOLED:
-            segmenter = read_segmenter(Archive(path, "lidar-bonnetal"))
-            image = _random_image(len(segmenter.channels))
-            found = POOLS[POOLED[name]](segmenter.decode(image), image).numpy()
-        elif name == "lidm_rangenet":
-            changed = PREPARATIONS["lidm"]._replace(image=lambda scan, generated: _random_and_unknown())
-            monkeypatch.setitem(PREPARATIONS, "lidm", changed)
-            found = load_lidm(path, "lidm")([random_scan(presets()["town"], 10)])[0]
-        else:
-            network = build(yaml.safe_load((path / "config.yaml").read_text()))
-            network.load_state_dict(Archive(path, "R3DPA").weights("model.ckpt")["state_dict"])
-            found = network.eval()(_random_image(5)[None])[0].numpy()
-    assert difference(found, peer[name]) < 1e-4
+        assert difference(of(inputs.random_image(channels(name))[0]), peer[name]) < 1e-4
+        both = [of(inputs.random_image(channels(name), *one)[0]) for one in inputs.two_sets()]
+    assert distance(both, inputs) == pytest.approx(float(peer[f"{name} distance"][0]), rel=1e-4)
 
 
-def _random_and_unknown() -> NDArray[np.float32]:
-    return torch.cat([_random_image(4), torch.full((1, 64, 64), -1.0)]).numpy()
+def distance(features: list[NDArray[np.floating]], inputs: ModuleType) -> float:
+    """Our Fréchet distance between two sets of inputs, of as many numbers as the peers' covariances allow."""
+    few = inputs.reduced(np.stack(features))
+    return frechet_distance(few[: inputs.PER_SET], few[inputs.PER_SET :])
 
 
 def test_the_images_of_r2flow(peer: dict[str, NDArray[np.float32]], scan: Scan) -> None:
@@ -194,11 +250,11 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], st
     "no state": ("lidm_minkowski", _reweigh("model.ckpt", lambda c: c.pop("state_dict")), DataError, "not tensors"),
     "a weight is missing": (
         "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"].pop("stem.0.kernel")), DataError,
-        "another architecture.*stem.0.kernel",
+        r"another architecture \(it lacks stem.0.kernel\)",
     ),
     "a weight of another shape": (
         "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"].update({"stem.0.kernel": torch.ones(2)})),
-        DataError, "another architecture.*stem.0.kernel",
+        DataError, r"another architecture \(it has another shape of stem.0.kernel\)",
     ),
     "a weight is not a number": (
         "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"]["stem.0.kernel"].fill_(torch.nan)),
@@ -259,7 +315,7 @@ def test_a_faulty_archive_is_refused_and_the_right_one_named(
     damage(path)
     with pytest.raises(error, match=message) as caught:
         load_extractor(name, path)
-    assert EXTRACTORS[name].source in str(caught.value)
+    assert EXTRACTORS[name].source in str(caught.value) and ".." not in str(caught.value).replace("../", "")
 
 
 def test_what_cannot_be_extracted_is_refused(
@@ -286,13 +342,18 @@ def test_a_network_without_remission_is_no_judge(archives: Callable[[str], Path]
 
 
 def test_an_extractor_without_its_library_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "timm", None)
-    with pytest.raises(LibraryError, match=r"lidar_synth\[metrics\]"):
+    monkeypatch.setitem(sys.modules, "timm", None)
+    with pytest.raises(LibraryError, match=r"needs timm.*lidar_synth\[metrics\]"):
+        load_extractor("liploc", tmp_path)
+    monkeypatch.delitem(sys.modules, "timm")
+    (tmp_path / "timm.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(LibraryError, match="torchvision::nms does not exist.*torchvision of the same build"):
         load_extractor("liploc", tmp_path)
 
 
 def test_liploc_is_the_network_of_timm(archives: Callable[[str], Path], scan: Scan) -> None:
-    timm = pytest.importorskip("timm")
+    timm = _timm()
     path = archives("liploc")
     network = timm.create_model("resnet50", num_classes=0, global_pool="avg").eval()
     state = torch.load(path / "model.ckpt", weights_only=True)["state_dict"]
@@ -315,11 +376,15 @@ def test_setup_says_what_to_fetch_and_what_is_there(
     assert found["lidm_minkowski"]["state"] == f"{tmp_path / 'minkowskinet'} is readable"
     assert "its hash differs" in found["sparenet_pointnet"]["state"]
     assert "is not usable" in found["rangenet53"]["state"] and "truncated" in found["rangenet53"]["state"]
-    assert found["lidm_spvcnn"]["state"] == "missing"
+    assert found["lidm_spvcnn"]["state"] == "missing" and found["lidm_spvcnn"]["sha256"] is None
+    assert found["sparenet_pointnet"]["sha256"] == sha256(tmp_path / "cls_model_39.pth")
+    known = [name for name, one in found.items() if not one["hash"].startswith("unknown: its publisher states none")]
+    assert known == ["sparenet_pointnet"]
     (tmp_path / "hello").write_text("hello\n")  # what `git hash-object` prints
-    known = EXTRACTORS["sparenet_pointnet"]._replace(git_blob="ce013625030ba8dba906f756967f9e9ca394464a")
-    assert known.is_published(tmp_path / "hello")
+    published = EXTRACTORS["sparenet_pointnet"]._replace(git_blob="ce013625030ba8dba906f756967f9e9ca394464a")
+    assert published.is_published(tmp_path / "hello")
     assert all("http" in one["from"] and one["licence"] for one in found.values())
     monkeypatch.delenv("LIDAR_SYNTH_METRICS")
     text = CliRunner().invoke(app, ["metrics", "setup"]).stdout
+    assert "sha256" not in text and "unknown" in text
     assert "set LIDAR_SYNTH_METRICS" in text and text.count(": missing") == len(EXTRACTORS)

@@ -102,6 +102,9 @@ def test_intervals_hold_the_values_and_features_get_them_with_enough_scans() -> 
     by_name = {s.metric: s for s in scores}
     assert all(s.low is not None and s.low <= s.high for s in scores if "infinitely" not in s.metric)
     assert 0 <= by_name["precision of moments"].value <= 1
+    same = evaluate(many[0], many[0][1:], "town", {"moments": moments}, progress=False, replicates=40, extended=True)
+    shares = [s for s in same if s.metric.startswith(("precision", "recall", "coverage"))]
+    assert len(shares) == 3 and all(s.high is not None and s.high <= 1 for s in shares)
     assert {"recall of moments", "density of moments", "coverage of moments"} <= by_name.keys()
     frechet, unbiased = (by_name[f"Frechet distance of moments{end}"] for end in ("", ", infinitely many samples"))
     assert unbiased.value < frechet.value
@@ -123,7 +126,7 @@ def test_features_that_are_not_finite_name_their_scan() -> None:
 
 def test_one_scan_has_no_frechet_distance() -> None:
     assert evaluate(REAL[:1], FAKE[:1], "town", progress=False)  # histograms can be compared
-    with pytest.raises(DataError, match="at least two samples each"):
+    with pytest.raises(DataError, match="features of 1 and 4 scans; expected at least two of each"):
         evaluate(REAL[:1], FAKE, "town", {"moments": moments}, progress=False)
     with pytest.raises(DataError, match="1 real and 4 generated samples; expected at least two of each"):
         evaluate(REAL[:1], FAKE, "town", progress=False, replicates=20)
@@ -294,6 +297,6 @@ def test_published_figures_name_their_protocol_and_source() -> None:
 def test_own_figures_stand_in_the_scale_of_the_table() -> None:
     scores = [Score("BEV minimum matching distance", 8.72e-5, "r3dpa", 1000, 2000, "MMD", 1e5, 8e-5, 9e-5)]
     shown = beside(scores)
-    assert shown.splitlines()[-1] == "| **these scans** | |  |  |  |  |  | 8.72 [8, 9] |"
+    assert shown.splitlines()[-1] == "| **these scans** (1000 real, 2000 generated) | |  |  |  |  |  | 8.72 [8, 9] |"
     assert "| R3DPA |  | 8.46 | 6.34 | 9.83 | 11.0 | 5.67 | 8.72 |" in shown and "LiDAR-Flow" not in shown
     assert "No published figures" in beside([Score("x", 1.0, "town", 2, 2)])

@@ -129,6 +129,7 @@ def test_frechet_distance_by_hand() -> None:
     few = a[:3]  # covariances of rank 2 in 6 dimensions
     assert frechet_distance(few, few + 1) == pytest.approx(6, abs=1e-6)
     assert frechet_distance(few, few.astype(np.float32)) == pytest.approx(0, abs=1e-6)
+    assert all(frechet_distance(f, f) >= 0 for f in rng.normal(size=(20, 6, 60)))  # never below, by rounding
 
 
 @given(data=st.data(), bins=st.integers(1, 20))
@@ -255,7 +256,9 @@ def test_bad_input() -> None:
         with pytest.raises(DataError, match=f"generated scan 'blank': a cloud of 0 points with none .*{area}"):
             evaluate(good, [good[0], empty], name, progress=False)
     features = np.ones((3, 4))
-    for a, b in ((features, features[:1]), (features, features[:, :3]), (features[0], features)):
+    with pytest.raises(DataError, match="features of 3 and 1 scans; expected at least two of each"):
+        frechet_distance(features, features[:1])
+    for a, b in ((features, features[:, :3]), (features[0], features)):
         with pytest.raises(DataError, match=r"features of shape .*; expected \(N, D\) and \(M, D\)"):
             frechet_distance(a, b)
     with pytest.raises(DataError, match="features that are not finite"):

@@ -19,6 +19,7 @@ from lidar_synth.evaluate.statistics import (
     gaussian_mmd,
     histogram_distance,
     polynomial_mmd,
+    share,
     smallest_of_pairs,
 )
 
@@ -144,6 +145,8 @@ def test_an_interval_narrows_with_more_samples_and_repeats_with_its_seed() -> No
     assert wide.low <= bootstrap(few, 100, level=0.5).low < bootstrap(few, 100, level=0.5).high <= wide.high
     equal = bootstrap(frechet(*[rng.normal(size=(40, 2))] * 2), 50, smallest=0.0)
     assert equal.low == 0.0 <= equal.high
+    nearly_all = share(np.r_[np.ones(28), 0, 0], True, 30)
+    assert bootstrap(nearly_all, 50, largest=1.0).high == 1.0 < bootstrap(nearly_all, 50).high
 
 
 def test_intervals_refuse_what_cannot_give_one() -> None:

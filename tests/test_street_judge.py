@@ -161,6 +161,16 @@ def street_judge() -> StreetJudge:
 
 
 @pytest.mark.slow
+def test_a_real_archive_has_its_accuracy_on_a_sequence_that_it_never_saw(street_judge: StreetJudge) -> None:
+    folder = _folder("LIDAR_SYNTH_LABELLED_SCANS") / "semantic_kitti"
+    if not (folder / "sequences" / "08").is_dir():
+        pytest.skip(f"{folder} without sequence 08; the others trained the network")
+    scans = open_scans(folder, split="val")
+    found = recognise(street_judge, [scans[i] for i in range(min(10, len(scans)))], progress=False)
+    assert found.accuracy == pytest.approx(0.740, abs=0.01)
+
+
+@pytest.mark.slow
 def test_a_real_archive_recognises_real_streets(street_judge: StreetJudge) -> None:
     scans = open_scans(_folder("LIDAR_SYNTH_LABELLED_SCANS") / "semantic_kitti")
     found = recognise(street_judge, [scans[i] for i in range(0, len(scans), 7)], progress=False)

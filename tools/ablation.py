@@ -12,7 +12,7 @@ for the others.
 import argparse
 from pathlib import Path
 
-from model_card import REFERENCE, generate, header, rows, town
+from model_card import REFERENCE, Comparison, generate, table, town
 
 from lidar_synth.evaluate.segmentation import load_judge
 from lidar_synth.flow.distill import STRATEGIES
@@ -55,21 +55,24 @@ def main() -> None:
     parser.add_argument("teacher", type=Path)
     parser.add_argument("work", type=Path, help="folder of the students")
     parser.add_argument("--evaluations", type=int, default=20_000, help="network evaluations of each strategy")
-    parser.add_argument("--count", type=int, default=256, help="scans in each row")
+    parser.add_argument("--count", type=int, default=256, help="scans in each set")
+    parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     given = parser.parse_intermixed_args()
 
-    judge, reference = load_judge(), town(REFERENCE, given.count)
-    lines = [
-        rows(f"teacher, {steps} steps", reference, generate(str(given.teacher), steps, given.count), judge)[0]
-        for steps in (50, 4)
-    ]
+    comparison = Comparison(town(REFERENCE, given.count), load_judge(), given.intervals)
+    sets = []
+
+    def add(name: str, model: str, steps: int | None) -> None:
+        scans = generate(model, steps, given.count)
+        sets.append(comparison.measure(name, scans))
+
+    for steps in (50, 4):
+        add(f"teacher, {steps} steps", str(given.teacher), steps)
     for strategy in STRATEGIES:
         path, what = student(strategy, given.teacher, given.work, given.evaluations, given.overrides)
-        scans = generate(str(path), None, given.count)
-        lines.append(rows(f"{strategy}, 4 steps ({what})", reference, scans, judge)[0])
-    print(f"{given.evaluations} evaluations for each strategy, {given.count} scans\n\n{header(reference, judge)}")
-    print("\n".join(lines))
+        add(f"{strategy}, 4 steps ({what})", str(path), None)
+    print(f"{given.evaluations} evaluations for each strategy, {given.count} scans\n\n{table(sets)}")
 
 
 if __name__ == "__main__":

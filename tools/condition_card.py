@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import REFERENCE, SEED, header, rows, shrink, town
+from model_card import REFERENCE, SEED, Comparison, Measured, shrink, table, town
 from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
@@ -101,19 +101,21 @@ def main() -> None:
         real = [source[int(i)] for i in tqdm(chosen, desc=given.root, unit="scan")]
     else:
         real = town(REFERENCE, given.count)
-    lines, verdicts = [], []
+    comparison = Comparison(real, judge, given.intervals)
+    sets: list[Measured] = []
+    verdicts = []
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
         kind, scans = generate(model, int(steps) if steps else None, real)
-        lines.append(rows(name, real, scans, judge, given.intervals)[0])
+        sets.append(comparison.measure(name, scans))
         if i == 0:
             verdicts.append(verdict("the real scans", kind, real, real, judge))
         verdicts.append(verdict(name, kind, scans, real, judge))
         if i == 0 and given.picture:
             apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
             draw(given.picture, kind, [scans[k] for k in apart], [real[k] for k in apart])
-    print(f"{len(real)} scans per row\n\n{header(real, judge)}\n" + "\n".join(lines))
+    print(f"{len(real)} scans in each set\n\n{table(sets)}")
     print("\n| scans | % | with its own condition | with another's |\n|---|---|---:|---:|\n" + "\n".join(verdicts))
 
 

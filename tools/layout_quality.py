@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import SEED, header, rows, shrink
+from model_card import SEED, Comparison, Measured, shrink, table
 from tqdm import tqdm
 
 from lidar_synth import Scan, Town, layout_of, load_generator
@@ -78,16 +78,16 @@ def main() -> None:
     town = Town(given.seed, "hdl64e_lasers", given.count * STRETCH_FRAMES, interval=2.0, motion=False)
     real = [town[i * STRETCH_FRAMES] for i in tqdm(range(given.count), desc="town", unit="scan")]
     layouts = [layout_of(scan) for scan in real]
-    judge = load_judge() if given.distances else None
+    comparison = Comparison(real, load_judge()) if given.distances else None
     counts: dict[str, Any] = {"the town's own scans": layout_agreement(real, layouts, real)}
-    distances = []
+    distances: list[Measured] = []
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
         kind, scans = generate(model, int(steps) if steps else None, given.guidance, real)
         counts[name] = layout_agreement(scans, layouts, real) if kind == "layout" else None
-        if judge is not None:
-            distances.append(rows(name, real, scans, judge)[0])
+        if comparison is not None:
+            distances.append(comparison.measure(name, scans))
         if i == 0 and given.picture:
             apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
             draw(given.picture, *([some[k] for k in apart] for some in (scans, real, layouts)))
@@ -95,8 +95,8 @@ def main() -> None:
     print("| scans | points of boxed classes in a box, % | boxes that 20 rays meet with 10 points, %", end=" ")
     print("| boxes with 20 points in the town's scan with 10 points, % | points | boxes | boxes |")
     print("|---|---:|---:|---:|---:|---:|---:|\n" + "\n".join(line(name, found) for name, found in counts.items()))
-    if judge is not None:
-        print(f"\n{header(real, judge)}\n" + "\n".join(distances))
+    if comparison is not None:
+        print(f"\n{table(distances)}")
     if given.dump:
         given.dump.write_text(json.dumps({name: found and found._asdict() for name, found in counts.items()}, indent=1))
 

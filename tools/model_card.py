@@ -1,35 +1,45 @@
 """The figures and images of docs/research/quality.md: how close generated scans are to scans of the town.
 
-    python tools/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ... [--count 512] [--pictures OUT]
+    python tools/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ... [--count 512] [--real A B]
+        [--pictures OUT]
 
     python tools/model_card.py "student, 4 steps=town" "teacher, 50 steps=RUN/town_teacher.safetensors:50" \\
         "teacher, 4 steps=RUN/town_teacher.safetensors:4" --pictures docs/models
 
 Every model generates scans from the same noise. They are compared with scans of a town that no model was trained on
-(seed 1), on the grid of its sensor; a denser scan is projected to it. The first row is a third town (seed 2): real
-against real, the lower bound. With STEPS = 0 a row has the third town's scans, encoded and decoded by the model's
-autoencoder: the lower bound for its flow. With the checkpoint of a WEAKER model the flow is autoguided from t = HIGH to
-LOW, as the teacher of a student is.
+(seed 1), on the grid of its sensor; a denser scan is projected to it. The first column is a third town (seed 2): real
+against real, the lower bound. ``--real A B`` takes the scans of two folders instead of the two towns. With STEPS = 0 a
+column has the third town's scans, encoded and decoded by the model's autoencoder: the lower bound for its flow. With
+the checkpoint of a WEAKER model the flow is autoguided from t = HIGH to LOW, as the teacher of a student is.
+
+The measures are those that need no published weights: R2Flow's, LiDM's, the package's own of ranges and classes, and
+those of the features of the town segmenter. 95 % intervals follow in brackets; the Fréchet distance gets one from 256
+scans on.
 
 tools/condition_card.py is for conditional models.
 """
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lidar_synth.datasets.classes import NAMES, TRAIN_ID
+from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError
-from lidar_synth.evaluate import Score, evaluate
+from lidar_synth.evaluate import Metric, Score, bootstrap
 from lidar_synth.evaluate.segmentation import Judge, class_ious, load_judge, mean_iou
+from lidar_synth.evaluate.statistics import Counts, Statistic
 from lidar_synth.flow.path import autoguided
+from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import CODEC, load_checkpoint
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.generator import find_model, load_generator
@@ -45,6 +55,7 @@ REFERENCE, OTHER = 1, 2
 SEED = 1
 """Seed of the noise."""
 CLASSES = ("road", "sidewalk", "terrain", "car", "building", "fence", "vegetation", "trunk", "pole")
+BEND = "bend of walls, %"
 SPAN = 8
 """Columns to either side over which the bend of a wall is measured."""
 TILES = 16
@@ -102,18 +113,88 @@ def town(seed: int, count: int) -> list[Scan]:
     return [source[i * STRETCH_FRAMES] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
 
 
-def rows(
-    name: str, reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge, replicates: int = 0
-) -> tuple[str, str]:
-    """A line of the first table, with 95 % intervals from ``replicates`` resamples, and one of the second: IoU by class
-    between the labels and the segmenter's prediction, and the bend of walls."""
-    values = [_shown(score) for score in _scores(reference, scans, judge, replicates)]
-    mean, bent, ious = float("nan"), float("nan"), np.full(len(NAMES), np.nan)
-    if scans[0].label is not None:
-        table = judge.agreement(scans)
-        mean, bent, ious = mean_iou(table), bend(scans), class_ious(table)
-    classes = [f"{100 * ious[TRAIN_ID[one]]:.0f}" for one in CLASSES] + [f"{100 * bent:.1f}"]
-    return f"| {name} | {' | '.join(values)} | {100 * mean:.1f} |", f"| {name} | {' | '.join(classes)} |"
+class Measured(NamedTuple):
+    """The figures of one set of scans.
+
+    Args:
+        name: the head of its column.
+        scores: distances from the reference, and the mIoU between labels and the segmenter's prediction, %.
+        classes: {class: its IoU, %, and the bend of walls, %}; NaN without labels.
+    """
+
+    name: str
+    scores: list[Score]
+    classes: dict[str, float]
+
+
+def opened(root: Path, count: int) -> list[Scan]:
+    """At most ``count`` scans of a folder, spread over it, on the town's grid."""
+    source = open_scans(root)
+    indices = np.unique(np.linspace(0, len(source) - 1, count).astype(int))
+    return [replace(source[int(i)], sensor=load_sensor("town")) for i in tqdm(indices, desc=root.name, unit="scan")]
+
+
+class Comparison:
+    """Scans that sets of scans are compared with; they are described once.
+
+    Args:
+        scans: the reference.
+        judge: the town segmenter.
+        replicates: resamples for 95 % intervals; 0 = none.
+    """
+
+    def __init__(self, scans: Sequence[Scan], judge: Judge, replicates: int = 0) -> None:
+        self._judge, self._replicates, self._count = judge, replicates, len(scans)
+        own = {"the town segmenter": judge.features}
+        more = (Metric(name, replicates=replicates) for name in ("lidm", "general"))
+        self._metrics = [Metric("town", own, replicates=replicates, extended=True), *more]
+        for metric in self._metrics:
+            metric.update(tqdm(scans, desc=f"reference, {metric.protocol.name}", unit="scan"), real=True)
+
+    def measure(self, name: str, scans: Sequence[Scan]) -> Measured:
+        """Compare a set of scans with the reference."""
+        scores: list[Score] = []
+        for metric in self._metrics:
+            metric.reset(real=False)
+            metric.update(tqdm(scans, desc=f"{name}, {metric.protocol.name}", unit="scan"), real=False)
+            # LiDM's distances of features need weights that do not belong to the card.
+            own = metric.protocol.name == "town"
+            scores += [s for s in metric.scores() if own or not s.metric.startswith("Frechet")]
+        columns = (*CLASSES, BEND)
+        if any(scan.label is None for scan in scans):
+            return Measured(name, scores, dict.fromkeys(columns, float("nan")))
+        tables = np.stack([self._judge.agreement([scan]) for scan in scans])
+        ious = 100 * class_ious(tables.sum(0))
+        values = [ious[TRAIN_ID[one]] for one in CLASSES] + [100 * bend(scans)]
+        agreement = _agreement(tables, self._count, self._replicates)
+        return Measured(name, [*scores, agreement], dict(zip(columns, values, strict=True)))
+
+
+def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
+    """The mIoU of (N, 19, 19) confusions, one per scan."""
+
+    def at(a: Counts, b: Counts) -> NDArray[np.float64]:
+        return np.array([100 * mean_iou(np.tensordot(counts, tables, 1)) for counts in b])
+
+    statistic = Statistic(at, (real, len(tables)))
+    low, high = bootstrap(statistic, replicates, smallest=0, largest=100) if replicates else (None, None)
+    return Score("mIoU with the town segmenter, %", statistic.value, "town", real, len(tables), low=low, high=high)
+
+
+def table(sets: Sequence[Measured]) -> str:
+    """Figures as rows, sets as columns; then IoU between the labels and the segmenter's prediction by class, and the
+    bend of walls."""
+    titles = list(dict.fromkeys(f"{s.metric} ({s.protocol})" for one in sets for s in one.scores))
+    lines = [f"| figure | {' | '.join(one.name for one in sets)} |", f"|---|{'---:|' * len(sets)}"]
+    for title in titles:
+        found = [next((s for s in one.scores if f"{s.metric} ({s.protocol})" == title), None) for one in sets]
+        lines.append(f"| {title} | {' | '.join(_shown(score) if score else '' for score in found)} |")
+    columns = (*CLASSES, BEND)
+    lines += ["", f"| IoU with the segmenter, % | {' | '.join(columns)} |", f"|---|{'---:|' * len(columns)}"]
+    for one in sets:
+        values = [f"{one.classes[c]:.1f}" if c == BEND else f"{one.classes[c]:.0f}" for c in columns]
+        lines.append(f"| {one.name} | {' | '.join(values)} |")
+    return "\n".join(lines)
 
 
 def bend(scans: Sequence[Scan]) -> float:
@@ -128,25 +209,6 @@ def bend(scans: Sequence[Scan]) -> float:
         second = np.roll(near, SPAN, 1) - 2 * near + np.roll(near, -SPAN, 1)
         found.append(np.abs(second[inside]) / near[inside])
     return float(np.median(np.concatenate(found)))
-
-
-def header(reference: Sequence[Scan], judge: Judge) -> str:
-    """The head of the table and its first row, real against real, in the order of ``rows``."""
-    scores = _scores(reference[:2], reference[2:4], judge, progress=False)
-    names = [f"{score.metric} ({score.protocol})" for score in scores]
-    return f"| scans | {' | '.join(names)} | mIoU with the town segmenter, % |\n|---|{'---:|' * (len(names) + 1)}"
-
-
-def _scores(
-    reference: Sequence[Scan], scans: Sequence[Scan], judge: Judge, replicates: int = 0, progress: bool = True
-) -> list[Score]:
-    """R2Flow's measures on the town's grid, distances of the segmenter's features, LiDM's measures, and the package's
-    own of ranges and classes."""
-    features = {"the town segmenter": judge.features}
-    own = evaluate(reference, scans, "town", features, progress=progress, replicates=replicates)
-    more = [evaluate(reference, scans, p, progress=progress, replicates=replicates) for p in ("lidm", "general")]
-    # LiDM's distances of features need weights that do not belong to the card.
-    return own + [s for scores in more for s in scores if not s.metric.startswith("Frechet")]
 
 
 def _shown(score: Score) -> str:
@@ -175,31 +237,37 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]]")
     parser.add_argument("--count", type=int, default=512, help="scans in each row")
+    parser.add_argument("--real", type=Path, nargs=2, metavar=("A", "B"), help="folders of scans instead of two towns")
     parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
     parser.add_argument("--pictures", type=Path, help="folder for sheets of the first model and of the town")
     given = parser.parse_args()
 
-    judge = load_judge()
-    reference = town(REFERENCE, given.count)
-    other = town(OTHER, given.count)
-    lines = [rows("real against real (lower bound)", reference, other, judge, given.intervals)]
+    @cache
+    def real(which: int) -> list[Scan]:
+        if given.real:
+            return opened(given.real[which], given.count)
+        return town((REFERENCE, OTHER)[which], given.count)
+
+    def add(name: str, scans: Sequence[Scan]) -> None:
+        sets.append(comparison.measure(name, scans))
+        print("\n".join([name, *map(str, sets[-1].scores)]), file=sys.stderr, flush=True)
+
+    comparison = Comparison(real(0), load_judge(), given.intervals)
+    sets: list[Measured] = []
     for i, text in enumerate(given.models):
         name, spec = text.split("=", 1)
         model, steps, *guidance = spec.split(":") if ":" in spec else (spec, "")
         if steps == "0":
-            scans = resampled(model, other)
+            scans = resampled(model, real(1))
         else:
             scans = generate(model, int(steps) if steps else None, given.count, *guidance)
-        lines.append(rows(name, reference, scans, judge, given.intervals))
+        add(name, scans)
         if i == 0 and given.pictures:
-            apart = np.linspace(0, given.count - 1, TILES).astype(int)
+            apart = np.linspace(0, len(real(0)) - 1, TILES).astype(int)
             picture(given.pictures / "generated.png", scans[:TILES], f"{name}: {TILES} scans, not selected")
-            picture(given.pictures / "town.png", [reference[k] for k in apart], f"{TILES} scans of the town")
-    print(f"{given.count} scans per row, {given.count} of the town\n\n{header(reference, judge)}")
-    print("\n".join(line for line, _ in lines))
-    columns = (*CLASSES, "bend of walls, %")
-    print(f"\n| IoU with the segmenter, % | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
-    print("\n".join(classes for _, classes in lines))
+            picture(given.pictures / "town.png", [real(0)[k] for k in apart], f"{TILES} scans of the town")
+    add("real against real (lower bound)", real(1))
+    print(f"{given.count} scans in each set, {len(real(0))} of the reference\n\n{table([sets[-1], *sets[:-1]])}")
 
 
 if __name__ == "__main__":

@@ -65,6 +65,8 @@ def evaluate(
     from lidar_synth.evaluate.segmentation import load_judge
     from lidar_synth.formats import layout_of, open_scans
 
+    if beside and (as_json or judge is not None):
+        raise typer.BadParameter("goes with --protocol and prints tables: leave out --json", param_hint="--beside")
     if (protocol is None) == (judge is None):
         raise typer.BadParameter("give --protocol or --judge, one of them", param_hint="--protocol")
     if judge is None and protocol not in PROTOCOLS:

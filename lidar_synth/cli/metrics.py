@@ -27,6 +27,9 @@ def setup(
 
     Nothing is downloaded. Put each archive, packed or unpacked, into one folder and name it in LIDAR_SYNTH_METRICS.
 
+    The hash is the publisher's, where one states it. sha256 is that of the file that is here, or of the names and
+    contents of all files of a folder: state it beside your figures.
+
     \b
     Examples:
       lidar-synth metrics setup
@@ -47,29 +50,33 @@ def setup(
     typer.echo(f"Folder: {where}")
     for name, facts in found.items():
         typer.echo(f"\n{name} ({facts['measure']}): {facts['state']}")
-        for key in ("file", "contents", "from", "licence", "hash"):
-            typer.echo(f"  {key:9}{facts[key]}")
+        for key in ("file", "contents", "from", "licence", "hash", "sha256"):
+            if facts[key]:
+                typer.echo(f"  {key:9}{facts[key]}")
 
 
 def _status(name: str, spec: "ExtractorSpec", folder: Path | None) -> dict[str, Any]:
     """What to fetch for an extractor, and whether it is there."""
+    from lidar_synth.evaluate.cache import weights_hash
+
+    path = spec.found(folder) if folder else None
     return {
         "measure": spec.measure,
-        "state": _state(name, spec, folder),
+        "state": _state(name, spec, path),
         "file": " or ".join(spec.archives) if spec.archives == spec.files else
         " or ".join(f"{archive}, {archive}.tar.gz" for archive in spec.archives),
         "contents": ", ".join(spec.files),
         "from": spec.source,
         "licence": spec.licence,
-        "hash": f"git blob {spec.git_blob}" if spec.git_blob else "its publisher states none",
+        "hash": f"git blob {spec.git_blob}" if spec.git_blob else "unknown: its publisher states none",
+        "sha256": weights_hash(path) if path else None,
     }  # fmt: skip
 
 
-def _state(name: str, spec: "ExtractorSpec", folder: Path | None) -> str:
+def _state(name: str, spec: "ExtractorSpec", path: Path | None) -> str:
     from lidar_synth.errors import LidarSynthError
     from lidar_synth.evaluate.extractors import load_extractor
 
-    path = spec.found(folder) if folder else None
     if path is None:
         return "missing"
     try:

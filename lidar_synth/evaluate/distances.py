@@ -56,7 +56,8 @@ def frechet_of_moments(
     values, vectors = np.linalg.eigh(cov_a)
     root = (vectors * np.sqrt(values.clip(0))) @ vectors.T
     cross = np.sqrt(np.linalg.eigvalsh(root @ cov_b @ root).clip(0)).sum()
-    return float(np.square(mean_a - mean_b).sum() + np.trace(cov_a) + np.trace(cov_b) - 2 * cross)
+    squared = np.square(mean_a - mean_b).sum() + np.trace(cov_a) + np.trace(cov_b) - 2 * cross
+    return float(max(squared, 0.0))  # rounding leaves equal sets a little below 0
 
 
 class Chooser(Protocol):
@@ -108,8 +109,10 @@ def checked_features(
     """
     sets = a, b
     a, b = (np.asarray(features).astype(np.float64) for features in sets)
-    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1] or min(len(a), len(b)) < 2:
-        raise DataError(f"features of shape {a.shape} and {b.shape}", "(N, D) and (M, D), at least two samples each")
+    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
+        raise DataError(f"features of shape {a.shape} and {b.shape}", "(N, D) and (M, D)")
+    if min(len(a), len(b)) < 2:
+        raise DataError(f"features of {len(a)} and {len(b)} scans", "at least two of each for a distance of features")
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise DataError("features that are not finite", "finite numbers")
     return a, b

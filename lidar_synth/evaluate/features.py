@@ -114,8 +114,10 @@ def statistic_of(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Stat
     return frechet(real, fake) if enough else None
 
 
-Figure = tuple[str, Callable[[], float], Callable[[], Statistic | None], float | None]
-"""Title, value, statistic to resample (None = no interval), and the smallest possible value."""
+Figure = tuple[str, Callable[[], float], Callable[[], Statistic | None], tuple[float, float]]
+"""Title, value, statistic to resample (None = no interval), and the smallest and the largest possible value."""
+
+ANY, POSITIVE, SHARE = (-np.inf, np.inf), (0.0, np.inf), (0.0, 1.0)
 
 
 def figures_of(name: str, real: NDArray[np.floating], fake: NDArray[np.floating], extended: bool) -> list[Figure]:
@@ -127,9 +129,10 @@ def figures_of(name: str, real: NDArray[np.floating], fake: NDArray[np.floating]
         extended: add unbiased forms, precision, recall, density and coverage.
     """
     figures: list[Figure] = [
-        (f"Frechet distance of {name}", partial(frechet_distance, real, fake), partial(statistic_of, real, fake), 0.0),
+        (f"Frechet distance of {name}", partial(frechet_distance, real, fake), partial(statistic_of, real, fake),
+         POSITIVE),
         (f"squared maximum mean discrepancy of {name}", partial(squared_mmd, real, fake),
-         partial(polynomial_mmd, real, fake), None),
+         partial(polynomial_mmd, real, fake), ANY),
     ]  # fmt: skip
     return figures + more_figures(name, real, fake) if extended else figures
 
@@ -138,18 +141,18 @@ def more_figures(name: str, real: NDArray[np.floating], fake: NDArray[np.floatin
     """Unbiased forms, precision, recall, density and coverage; those for which there are enough samples."""
     figures: list[Figure] = []
 
-    def add(title: str, statistic: Statistic, least: float | None) -> None:
-        figures.append((f"{title} of {name}", lambda: statistic.value, lambda: statistic, least))
+    def add(title: str, statistic: Statistic, limits: tuple[float, float]) -> None:
+        figures.append((f"{title} of {name}", lambda: statistic.value, lambda: statistic, limits))
 
-    add("unbiased squared maximum mean discrepancy", polynomial_mmd(real, fake), None)
+    add("unbiased squared maximum mean discrepancy", polynomial_mmd(real, fake), ANY)
     try:
         value = extrapolated_frechet(real, fake)
-        figures.append((f"Frechet distance of {name}, infinitely many samples", lambda: value, lambda: None, None))
+        figures.append((f"Frechet distance of {name}, infinitely many samples", lambda: value, lambda: None, ANY))
     except DataError:
         pass  # too few samples to extrapolate from
     try:
         for title, statistic in manifold(real, fake)._asdict().items():
-            add(title, statistic, 0.0)
+            add(title, statistic, POSITIVE if title == "density" else SHARE)
     except DataError:
         pass  # too few samples for neighbours
     return figures
@@ -157,4 +160,5 @@ def more_figures(name: str, real: NDArray[np.floating], fake: NDArray[np.floatin
 
 def describe_missing(missing: Mapping[str, str], protocol: Protocol) -> str:
     """One line per measure that could not be measured, with the reason."""
-    return "\n".join(f"{protocol.measures[name].table or name}: {reason}" for name, reason in missing.items())
+    measures = protocol.measures
+    return "\n".join(f"{measures[n].table or measures[n].title}: {reason}" for n, reason in missing.items())

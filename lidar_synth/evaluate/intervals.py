@@ -28,7 +28,8 @@ def bootstrap(
     replicates: int = REPLICATES,
     level: float = LEVEL,
     seed: int = 0,
-    smallest: float | None = None,
+    smallest: float = -np.inf,
+    largest: float = np.inf,
 ) -> Interval:
     """The basic bootstrap interval (Davison and Hinkley, 1997, section 5.2.1): twice the value less the quantiles of
     its resamples. Both sets are resampled with replacement.
@@ -41,7 +42,7 @@ def bootstrap(
         replicates: number of resamples.
         level: of confidence, in (0, 1).
         seed: of the resamples.
-        smallest: value below which the interval is cut, for instance 0.
+        smallest, largest: the values between which the interval is cut, for instance 0 and 1 of a share.
 
     Raises:
         ConfigError: on a level outside (0, 1) or fewer than 20 resamples.
@@ -50,16 +51,17 @@ def bootstrap(
     if not 0 < level < 1 or replicates < 20:
         raise ConfigError(f"level {level} and {replicates} resamples", "a level in (0, 1) and at least 20 resamples")
     if min(statistic.sizes) < 2:
-        raise DataError(f"{statistic.sizes[0]} real and {statistic.sizes[1]} generated samples", "at least two of each")
+        raise DataError(
+            f"{statistic.sizes[0]} real and {statistic.sizes[1]} generated samples",
+            "at least two of each for an interval",
+        )
     rng = np.random.default_rng(seed)
     values = []
     for first in range(0, replicates, _BATCH):
         count = min(_BATCH, replicates - first)
         values.append(statistic.at(*(rng.multinomial(n, np.full(n, 1 / n), count) for n in statistic.sizes)))
     tails = np.quantile(np.concatenate(values), [(1 - level) / 2, (1 + level) / 2])
-    low, high = 2 * statistic.value - tails[::-1]
-    if smallest is not None:
-        low, high = max(low, smallest), max(high, smallest)
+    low, high = np.clip(2 * statistic.value - tails[::-1], smallest, largest)
     return Interval(float(low), float(high))
 
 

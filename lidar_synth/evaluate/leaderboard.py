@@ -8,9 +8,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict
 
-from lidar_synth.evaluate.metric import Score
-
-_OWN = "**these scans**"
+from lidar_synth.evaluate.metric import SIDES, Score
 
 
 class Table(BaseModel):
@@ -43,9 +41,11 @@ def leaderboard() -> tuple[tuple[Table, ...], Mapping[str, str]]:
 
 
 def beside(scores: Sequence[Score]) -> str:
-    """The published figures of the scores' protocol as tables in Markdown, each with the scores as its last row."""
+    """The published figures of the scores' protocol as tables in Markdown, each with the scores as its last row, which
+    says how many scans they are of."""
     named = {score.table: score for score in scores if score.table}
     tables, sources = leaderboard()
+    counts = ", ".join(f"{max((getattr(s, side) for s in scores), default=0)} {side}" for side in SIDES)
     parts = []
     for table in (t for t in tables if scores and t.protocol == scores[0].protocol):
         longest_first = sorted(table.rows, key=len, reverse=True)
@@ -57,7 +57,7 @@ def beside(scores: Sequence[Score]) -> str:
         ]
         own = " | ".join(_shown(named[c]) if c in named else "" for c in columns)
         where = f"{table.dataset}, {table.task}. {sources[table.source]}. {table.note}".rstrip(". ")
-        parts.append("\n".join([f"{where}.", "", *head, *rows, f"| {_OWN} | | {own} |"]))
+        parts.append("\n".join([f"{where}.", "", *head, *rows, f"| **these scans** ({counts}) | | {own} |"]))
     return "\n\n".join(parts) or "No published figures of this protocol are known."
 
 

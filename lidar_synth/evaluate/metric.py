@@ -259,21 +259,21 @@ class Metric:
         return self._made(measure, compared.value, compared, *compared.sizes)
 
     def _made(self, measure: Measure, value: float, statistic: Any, real: int, fake: int) -> Score:
-        low, high = self._interval(statistic, measure.least)
+        low, high = self._interval(statistic, (-np.inf if measure.least is None else measure.least, np.inf))
         return Score(measure.title, value, self.protocol.name, real, fake, measure.table, measure.times, low, high)
 
     def _of_figures(self, figures: Iterable[Figure], kept: Mapping[str, _Kept]) -> list[Score]:
         real, fake = (kept[side].count for side in SIDES)
         scores = []
-        for title, value, statistic, least in figures:
-            low, high = self._interval(statistic() if self._replicates else None, least)
+        for title, value, statistic, limits in figures:
+            low, high = self._interval(statistic() if self._replicates else None, limits)
             scores.append(Score(title, value(), self.protocol.name, real, fake, low=low, high=high))
         return scores
 
-    def _interval(self, statistic: Any, least: float | None) -> tuple[float | None, float | None]:
+    def _interval(self, statistic: Any, limits: tuple[float, float]) -> tuple[float | None, float | None]:
         if statistic is None or not self._replicates:
             return None, None
-        interval = bootstrap(statistic, self._replicates, LEVEL, smallest=least)
+        interval = bootstrap(statistic, self._replicates, LEVEL, smallest=limits[0], largest=limits[1])
         return interval.low, interval.high
 
     def _gathered(self) -> dict[str, _Kept]:

@@ -49,10 +49,18 @@ def sparse_histogram_distance(
     real: Sequence["Sparse"], fake: Sequence["Sparse"], size: int,
     distance: Callable[[NDArray[Any], NDArray[Any]], float] = jensen_shannon_distance,
 ) -> Statistic:  # fmt: skip
-    """As ``histogram_distance``, of histograms of ``size`` bins that keep only the bins that are not empty."""
+    """As ``histogram_distance``, of histograms of ``size`` bins that keep only the bins that are not empty.
+
+    Only the bins that some histogram uses are compared: of the 4 million cells of LiDM's grid, the fewest.
+    """
+    filled = np.zeros(size, bool)
+    for one in (*real, *fake):
+        filled[one.bins] = True
+    place, used = np.cumsum(filled, dtype=np.int32) - 1, int(filled.sum())
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
-        return np.array([distance(_sum(real, p, size), _sum(fake, q, size)) for p, q in zip(a, b, strict=True)])
+        sums = ((_sum(real, p, place, used), _sum(fake, q, place, used)) for p, q in zip(a, b, strict=True))
+        return np.array([distance(p, q) for p, q in sums])
 
     return Statistic(at, (len(real), len(fake)))
 
@@ -69,11 +77,12 @@ def _sparse(histogram: NDArray[Any]) -> Sparse:
     return Sparse(bins.astype(np.int32), histogram.ravel()[bins])
 
 
-def _sum(histograms: Sequence[Sparse], counts: NDArray[Any], size: int) -> NDArray[np.int64]:
+def _sum(histograms: Sequence[Sparse], counts: NDArray[Any], place: NDArray[np.int32], size: int) -> NDArray[np.int64]:
+    """(size,) weighted sum of histograms; ``place`` says where each of their bins lies in it."""
     total = np.zeros(size, np.int64)
     for one, count in zip(histograms, counts, strict=True):
         if count:
-            total[one.bins] += one.amounts * np.int64(count)  # a bin occurs once in a histogram
+            total[place[one.bins]] += one.amounts * np.int64(count)  # a bin occurs once in a histogram
     return total
 
 

@@ -5,8 +5,8 @@
 CLONES holds clones of the peers' repositories: LiDAR-Diffusion, r2flow, R3DPA, SpareNet, lidar-bonnetal. SCANS holds
 ``.bin`` files of KITTI-360. Needs torchsparse 1.4.0 (a CPU build will do), timm, torchvision and einops. Prints the
 largest difference of the features relative to the largest feature, and the Fréchet distance between the two halves of
-the scans by our features and code, and by the peers'. ``--golden`` writes the peers' numbers on random points for the
-tests.
+the scans (of fixed sums of the features) by our features and code, and by the peers'. ``--golden`` writes the peers'
+numbers on random points and images for the tests.
 """
 
 import argparse
@@ -23,6 +23,7 @@ import torch
 import yaml
 from numpy.typing import NDArray
 from random_archives import WRITERS, write
+from random_inputs import PER_SET, random_image, random_points, reduced, two_sets
 
 from lidar_synth.evaluate.distances import frechet_distance
 from lidar_synth.evaluate.extractors import EXTRACTORS, load_extractor
@@ -204,18 +205,24 @@ def _loaded(net: torch.nn.Module, archive: Path) -> torch.nn.Module:
     return net.eval()
 
 
-def _bonnetal_squeezeseg(clones: Path, archive: Path) -> Peer:
-    """lidar-bonnetal's own network on its own projection; the pooling is this package's."""
-    train = clones / "lidar-bonnetal" / "train"
-    sys.path.insert(0, str(train))
-    from backbones.squeezeseg import Backbone
-    from common.laserscan import LaserScan
-    from tasks.semantic.decoders.squeezeseg import Decoder
+def _bonnetal(clones: Path, archive: Path, name: str, pool: Callable[[torch.Tensor, torch.Tensor], Any]) -> Peer:
+    """lidar-bonnetal's own network on its own projection; ``pool`` makes features of (1, C, H, W) and the image.
 
+    Its projection takes the cell of the first point for empty: a point that another one hides is put first.
+    """
+    import importlib
+
+    train = str(clones / "lidar-bonnetal" / "train")
+    if train not in sys.path:
+        sys.path.insert(0, train)
+    from common.laserscan import LaserScan
+
+    networks = importlib.import_module(f"backbones.{name}"), importlib.import_module(f"tasks.semantic.decoders.{name}")
     settings = yaml.safe_load((archive / "arch_cfg.yaml").read_text())
-    backbone = Backbone(params=settings["backbone"] | {"OS": 16})
+    stride = {"squeezeseg": 16, "darknet": 32}[name]
+    backbone = networks[0].Backbone(params=settings["backbone"] | {"OS": stride})
     _, skips = backbone(torch.zeros(1, 5, 64, 64))
-    decoder = Decoder(settings["decoder"], skips, OS=16, feature_depth=backbone.get_last_depth())
+    decoder = networks[1].Decoder(settings["decoder"], skips, OS=stride, feature_depth=backbone.get_last_depth())
     backbone.load_state_dict(torch.load(archive / "backbone", weights_only=True))
     decoder.load_state_dict(torch.load(archive / "segmentation_decoder", weights_only=True))
     backbone.eval(), decoder.eval()
@@ -223,16 +230,31 @@ def _bonnetal_squeezeseg(clones: Path, archive: Path) -> Peer:
     mean, std = (torch.tensor(sensor[k])[:, None, None] for k in ("img_means", "img_stds"))
 
     def of_image(image: torch.Tensor) -> NDArray[np.floating]:
-        return decoder(*backbone(image))[0][:, image[0].abs().sum(0) > 0].mean(1).numpy()
+        return pool(decoder(*backbone(image)), image).numpy()  # type: ignore[no-any-return]
 
     def features(points: Points) -> NDArray[np.floating]:
-        scan = LaserScan(project=True, H=64, W=2048, fov_up=3, fov_down=-25)
-        scan.set_points(points[:, :3].copy(), points[:, 3].copy())
+        scan = LaserScan(project=True, H=64, W=sensor["img_prop"]["width"], fov_up=3, fov_down=-25)
+        hidden_first = np.concatenate([points[:1] * np.float32([1.5, 1.5, 1.5, 1]), points])
+        scan.set_points(hidden_first[:, :3].copy(), hidden_first[:, 3].copy())
         channels = [scan.proj_range[None], scan.proj_xyz.transpose(2, 0, 1), scan.proj_remission[None]]
         mask = torch.from_numpy(scan.proj_mask).float()
         return of_image(((torch.from_numpy(np.concatenate(channels)) - mean) / std * mask)[None])
 
     return Peer(features, of_image)
+
+
+def _squeezeseg(clones: Path, archive: Path) -> Peer:
+    """The pooling is this package's."""
+    return _bonnetal(clones, archive, "squeezeseg", lambda maps, image: maps[0][:, image[0].abs().sum(0) > 0].mean(1))
+
+
+def _rangenet21(clones: Path, archive: Path) -> Peer:
+    """The pooling is R2Flow's, which it has of LiDARGen."""
+    sys.path.insert(0, str(clones / "r2flow"))
+    from r2flow.metrics.models import rangenet
+
+    pool = rangenet.PostProcess()
+    return _bonnetal(clones, archive, "darknet", lambda maps, image: pool(maps, "subsample")[0])
 
 
 def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
@@ -241,7 +263,8 @@ def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
     return {
         "rangenet53": (lambda a: r2flow.rangenet(a, "subsample", 5), "r2flow"),
         "r2flow_rangenet": (lambda a: r2flow.rangenet(a, "depth", 4), "r2flow"),
-        "squeezeseg": (lambda a: _bonnetal_squeezeseg(clones, a), "bonnetal"),
+        "rangenet21": (lambda a: _rangenet21(clones, a), "bonnetal"),
+        "squeezeseg": (lambda a: _squeezeseg(clones, a), "bonnetal"),
         "sparenet_pointnet": (r2flow.pointnet, "r2flow"),
         "lidm_rangenet": (lidm.rangenet, "lidm"),
         "lidm_minkowski": (lambda a: lidm.voxels(a, "minkowskinet"), "lidm"),
@@ -254,37 +277,25 @@ def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
     }
 
 
-def random_points(count: int = 3000) -> Points:
-    """(N, 4) points all around a sensor, for the golden vectors."""
-    rng = np.random.RandomState(5)
-    azimuth, elevation = rng.uniform(-np.pi, np.pi, count), np.radians(rng.uniform(-24.5, 2.5, count))
-    directions = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    points = np.stack(directions, -1) * np.exp(rng.uniform(np.log(2), np.log(70), count))[:, None]
-    return np.column_stack([points, rng.random_sample(count)]).astype(np.float32)
-
-
-def random_image(channels: int) -> torch.Tensor:
-    """(1, C, 64, 64) normalised image with empty cells, for the golden vectors."""
-    rng = np.random.RandomState(6)
-    image = rng.uniform(-1, 1, (channels, 64, 64)) * (rng.random_sample((64, 64)) < 0.8)
-    return torch.from_numpy(image.astype(np.float32))[None]
-
-
 def read(path: Path) -> Points:
-    """(N, 4) the points of a scan, without those that lie in one cell at one range with an earlier point: which of
-    them an image shows depends on the sort in the peers' code."""
+    """(N, 4) the points of a scan, without those whose place in an image depends on rounding or on the sort in the
+    peers' code: points that lie in one cell at one range with an earlier point, and points at the edge of a cell."""
     points = np.fromfile(path, np.float32).reshape(-1, 4)
     cells = locate(points[:, :3].copy(), presets()["hdl64e_kitti360"])
     _, first = np.unique(np.column_stack([cells.cell, cells.range.view(np.int32)]), axis=0, return_index=True)
-    return points[np.sort(first)]
+    points = points[np.sort(first)]
+    x, y, z = points[:, :3].T.astype(np.float64)
+    column = (1 - np.arctan2(y, x) / np.pi) / 2 * 2048
+    row = (3 - np.degrees(np.arcsin(z / np.sqrt(x**2 + y**2 + z**2)))) / 28 * 64
+    inside = np.logical_and.reduce([abs(v - np.round(v)) > 0.002 for v in (column, row)])
+    return points[inside]
 
 
 def compare(clones: Path, files: list[Path], only: list[str]) -> None:
     """Print the table."""
     print("| extractor | prepared as | features | largest difference | Frechet distance: ours | the peer's |")
     print("|---|---|---:|---:|---:|---:|")
-    fid = _functions(clones / "LiDAR-Diffusion" / "lidm" / "eval" / "fid_score.py", ("calculate_frechet_distance",),
-                     {"np": np, "linalg": __import__("scipy.linalg").linalg}).calculate_frechet_distance  # fmt: skip
+    frechet = peers_frechet(clones)
     for key, (make, preparation) in peers(clones).items():
         name = key.split(" ")[0]
         if only and name not in only:
@@ -298,22 +309,34 @@ def compare(clones: Path, files: list[Path], only: list[str]) -> None:
                 scan = Scan(points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id=file.stem)
                 rows[0].append(ours([scan])[0])
                 rows[1].append(np.asarray(theirs.features(points)))
-        a, b = np.stack(rows[0]).astype(np.float64), np.stack(rows[1]).astype(np.float64)
+        a, b = np.stack(rows[0]), np.stack(rows[1])
         error, half = abs(a - b).max() / abs(b).max(), len(files) // 2
         distances = ["", ""]
         if half > 2:
-            ends = slice(0, half - 1)  # the peers' code needs covariances of full rank: as many features as scans allow
-            other = fid(b[:half, ends].mean(0), np.cov(b[:half, ends], rowvar=False), b[half:, ends].mean(0),
-                        np.cov(b[half:, ends], rowvar=False))  # fmt: skip
-            distances = [f"{frechet_distance(a[:half, ends], a[half:, ends]):.6g}", f"{other:.6g}"]
+            ours, theirs = reduced(a, half - 1), reduced(b, half - 1)
+            distances = [f"{v:.6g}" for v in (frechet_distance(ours[:half], ours[half:]), frechet(theirs, half))]
         print(f"| {name} | {preparation} | {a.shape[1]} | {error:.1e} | {distances[0]} | {distances[1]} |", flush=True)
 
 
+def peers_frechet(clones: Path) -> Callable[[NDArray[np.float64], int], float]:
+    """LiDM's Fréchet distance between the first samples, by their number, and the others."""
+    path = clones / "LiDAR-Diffusion" / "lidm" / "eval" / "fid_score.py"
+    env = {"np": np, "linalg": __import__("scipy.linalg").linalg}
+    code = _functions(path, ("calculate_frechet_distance",), env)
+
+    def distance(x: NDArray[np.float64], first: int) -> float:
+        moments = [m for part in (x[:first], x[first:]) for m in (part.mean(0), np.cov(part, rowvar=False))]
+        return float(code.calculate_frechet_distance(*moments))
+
+    return distance
+
+
 def golden(clones: Path, path: Path) -> None:
-    """Write what the peers' networks make of random images or points, and their images of the points."""
+    """Write what the peers' networks make of random images or points, their Fréchet distances between two sets of them,
+    and their images of the points."""
     from safetensors.numpy import save_file
 
-    points = random_points()
+    points, frechet = random_points(), peers_frechet(clones)
     found: dict[str, Any] = {"points": points}
     makers = {"r2flow": R2Flow(clones), "lidm": LiDM(clones)}
     for name, maker in makers.items():
@@ -323,13 +346,19 @@ def golden(clones: Path, path: Path) -> None:
         found[f"{name} cells"] = np.flatnonzero(filled).astype(np.int32)
     for key, (make, _) in peers(clones).items():
         name = key.split(" ")[0]
-        if name == "liploc":
-            continue  # a network of timm, which the tests do not have
         with tempfile.TemporaryDirectory() as folder, torch.inference_mode():
             peer = make(write(name, Path(folder) / EXTRACTORS[name].archives[0]))
             channels = 4 if name in ("lidm_rangenet", "r2flow_rangenet") else 5
+
+            def of(seed: int, scale: float, peer: Peer = peer, channels: int = channels) -> NDArray[np.floating]:
+                if peer.of_image:
+                    return np.asarray(peer.of_image(random_image(channels, seed, scale)))
+                return np.asarray(peer.features(random_points(1000, seed, scale)))
+
             features = peer.of_image(random_image(channels)) if peer.of_image else peer.features(points)
             found[key] = np.ascontiguousarray(features, np.float32)
+            both = reduced(np.stack([of(*one) for one in two_sets()]))
+            found[f"{key} distance"] = np.array([frechet(both, PER_SET)])
     save_file(found, path)
 
 

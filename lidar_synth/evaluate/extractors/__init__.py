@@ -96,4 +96,6 @@ def load_extractor(name: str, path: Path | None = None, preparation: str | None 
     try:
         return spec.load(Path(path), preparation or spec.preparation)
     except (ConfigError, DataError, FileError) as error:
-        raise type(error)(str(error), hint=f"{name} takes {spec.archives[0]} of {spec.source}.") from error
+        raise type(error)(
+            str(error).removesuffix("."), hint=f"{name} takes {spec.archives[0]} of {spec.source}."
+        ) from error

@@ -5,7 +5,7 @@ Nothing is unpacked to disk, and no code of a file runs.
 
 import tarfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -81,6 +81,10 @@ class Archive:
         raise FileError(f"{self.path} without {name}", f"the archive that {self.project} publishes")
 
 
+def _some(names: Sequence[str]) -> str:
+    return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
+
+
 def load_weights(module: nn.Module, state: Any, where: str, extra: bool = False) -> None:
     """Load a state dictionary, checking names and shapes.
 
@@ -98,11 +102,14 @@ def load_weights(module: nn.Module, state: Any, where: str, extra: bool = False)
     own = module.state_dict()
     counters = {k: v for k, v in own.items() if k.endswith("num_batches_tracked")}  # absent before PyTorch 0.4.1
     chosen = counters | {k: v for k, v in state.items() if k in own or not extra}
-    try:
-        module.load_state_dict(chosen)
-    except RuntimeError as error:
-        text = " ".join(str(error).split())
-        raise DataError(f"{where}: weights of another architecture ({text[:300]})", "those of the published network"
-                        ) from error  # fmt: skip
+    differences = {
+        "lacks": [k for k in own if k not in chosen],
+        "has another shape of": [k for k, v in chosen.items() if k in own and v.shape != own[k].shape],
+        "has": [k for k in chosen if k not in own],
+    }
+    if any(differences.values()):
+        found = "; ".join(f"it {what} {_some(names)}" for what, names in differences.items() if names)
+        raise DataError(f"{where}: weights of another architecture ({found})", "those of the published network")
+    module.load_state_dict(chosen)
     if bad := [k for k, v in chosen.items() if v.is_floating_point() and not v.isfinite().all()]:
         raise DataError(f"{where}: {bad[0]} holds values that are not finite", "finite weights")

@@ -45,6 +45,9 @@ def load_liploc(path: Path, prepared: str) -> PerScan:
         import timm
     except ImportError as error:
         raise LibraryError("LIP-Loc's encoder needs timm", hint="pip install 'lidar_synth[metrics]'") from error
+    except RuntimeError as error:  # of torchvision, which timm imports
+        raise LibraryError(f"timm cannot be imported ({error})", hint="Install torchvision of the same build as torch."
+                           ) from error  # fmt: skip
     archive = Archive(path, "R3DPA")
     name = archive.yaml("config.yaml").get("trained_image_model_name")
     if not isinstance(name, str) or not timm.is_model(name):
