@@ -88,6 +88,17 @@ def from_camera() -> list[list[tuple[str, Picture]]]:
     return rows
 
 
+def from_layout() -> list[list[tuple[str, Picture]]]:
+    """Scans with boxes, and the scans generated from their layouts."""
+    generator, rows = load_generator("town-layout"), []
+    for i in range(2):
+        scan = street(i, sensor="hdl64e_lasers")
+        [made] = generator.scans(0, [i], condition=scan)
+        rows += [[("generated from boxes, ground and outlines", near(made, boxes=True)),
+                  ("the town's scan with this layout", near(scan, boxes=True))]]  # fmt: skip
+    return rows
+
+
 def pasted() -> list[list[tuple[str, Picture]]]:
     """A generated scan, and the same with objects of the town in place of its own (the label policy ``mix``)."""
     generator = load_generator("town")
@@ -109,6 +120,7 @@ PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
     "pairs": pairs,
     "map": from_map,
     "camera": from_camera,
+    "layout": from_layout,
     "paste": pasted,
     "sensors": sensors,
 }
