@@ -175,18 +175,17 @@ def _train(work: Work, start: Path, minutes: float) -> Work:
     """Run all stages, each from the checkpoint of the one before; return the work with the scans' labels."""
     flow = start
     for name in work.stages:
-        limit = work.minutes(name, minutes)
         if name in ("labels", "codec"):
-            start = work.train(name, start, limit)
+            start = work.train(name, start, minutes)
             if name == "labels":
                 codec = load_checkpoint(start)
                 latent: Any = Latent(codec.networks[CODEC], codec.header.tensors)  # type: ignore[arg-type]
                 work = replace(work, scans=label(work.scans, latent, work.folder / "labelled"))
         elif name == "student":
-            flow = work.train(name, flow, limit)
+            flow = work.train(name, flow, minutes)
         else:
             begin = _with_codec(work, name, flow, start) if work.latent else flow
-            flow = work.train(name, begin, limit)
+            flow = work.train(name, begin, minutes)
     return work
 
 
@@ -202,7 +201,7 @@ def _with_codec(work: Work, name: str, flow: Path, codec: Path) -> Path:
 
 def _finish(plan: AdaptPlan, work: Work, start: Path, licence: str) -> Path:
     """Write the checkpoint and its card."""
-    made = load_checkpoint(work.checkpoint("student"))
+    made = load_checkpoint(work.runs.checkpoint("student"))
     found = figures(work, made)
     provenance = provenance_of(plan.name, plan.model, work, made, found)
     header: Header = replace(made.header, provenance=provenance)
