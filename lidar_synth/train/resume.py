@@ -5,7 +5,7 @@ from typing import Any
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import Header, read_header
-from lidar_synth.train.config import Run, read_values, validated
+from lidar_synth.train.config import PARENTS, Run, read_values, validated
 from lidar_synth.train.config.load import Config
 from lidar_synth.train.schedules import SCHEDULES
 from lidar_synth.train.state import read_progress
@@ -14,9 +14,6 @@ HARMLESS = {"output", "save_every", "samples.every", "samples.count", "compile",
 """Keys that change where things lie, how much is written and how fast it goes, and not what is learned."""
 MORE = "recipe.iterations"
 """What may grow, and may shrink before the learning rate falls."""
-PARENTS = ("teacher", "weaker", "init", "codec")
-"""Keys of a configuration that name checkpoints; a provenance holds their hashes under the same names."""
-
 _SHOWN = 4  # differences in one message
 
 

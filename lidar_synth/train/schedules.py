@@ -6,7 +6,6 @@ To add one: write it, enter it in ``SCHEDULES``.
 import math
 from collections.abc import Callable
 
-
 PLATEAU = 0.75
 """Share of the iterations before ``trapezoid`` falls."""
 

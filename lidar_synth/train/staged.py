@@ -56,17 +56,11 @@ class StagedRuns:
         """Minutes that a stage has trained."""
         return read_progress(self.folder_of(name)).seconds / 60
 
-    def budget(self, name: str, limit: float) -> float:
-        """Minutes of a stage that is about to start or to continue: its share of what the others have left.
-
-        Args:
-            name: of the stage.
-            limit: minutes of all stages.
-        """
-        names = list(self.shares)
-        later = sum(self.shares[n] for n in names[names.index(name) :])
-        others = sum(self.spent(n) for n in names if n != name)
-        return (limit - others) * self.shares[name] / later
+    def budgets(self, limit: float) -> dict[str, float]:
+        """Minutes of each stage that is not done, which share what the others have left of a ``limit`` for all."""
+        open_ = {name: share for name, share in self.shares.items() if not self.is_done(name)}
+        left = limit - sum(self.spent(name) for name in self.shares.keys() - open_.keys())
+        return {name: left * share / sum(open_.values()) for name, share in open_.items()}
 
 
 def iterations_of(config: Run) -> int:

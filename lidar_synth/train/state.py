@@ -1,7 +1,8 @@
 """The state of a training run, and how it is saved for resumption.
 
 The file is safetensors like a checkpoint, but serves to resume, not to sample: it holds the network, the averaged
-weights, the optimiser's moments, the step and the seconds of training. Everything else is a function of the configuration and the step.
+weights, the optimiser's moments, the step and the seconds of training. Everything else is a function of the
+configuration and the step.
 """
 
 import copy
@@ -23,7 +24,6 @@ from lidar_synth.flow.path import METRICS
 from lidar_synth.geometry.normalize import CHANNELS
 from lidar_synth.train.optimizers import OPTIMIZERS
 from lidar_synth.train.schedules import SCHEDULES
-
 
 STATE = "state.safetensors"
 """The file of the state in a run's folder."""

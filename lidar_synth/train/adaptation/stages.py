@@ -71,6 +71,11 @@ def stages_for(header: Header, labelled: bool, town: int) -> dict[str, Stage]:
     return {name: stage for name, stage in STAGES.items() if name not in left_out}
 
 
+def shares(stages: Mapping[str, Stage]) -> dict[str, float]:
+    """The share of each stage of the limit of time."""
+    return {name: stage.share for name, stage in stages.items()}
+
+
 @dataclass(frozen=True)
 class Work:
     """What all stages of an adaptation share.
@@ -101,7 +106,7 @@ class Work:
     @property
     def runs(self) -> StagedRuns:
         """The runs of the stages."""
-        return StagedRuns(self.folder, {name: stage.share for name, stage in self.stages.items()})
+        return StagedRuns(self.folder, shares(self.stages))
 
     def train(self, name: str, start: Path, limit: float) -> Path:
         """Run or resume a stage, unless it is done: more steps would change what the next one began with.
@@ -115,7 +120,7 @@ class Work:
             The checkpoint with the best weights.
         """
         if not self.runs.is_done(name):
-            minutes = max(0.0, self.runs.budget(name, limit) - self.runs.spent(name))
+            minutes = max(0.0, self.runs.budgets(limit)[name] - self.runs.spent(name))
             run(self.config(name, start), resume=True, minutes=minutes)
             self.runs.mark_done(name)
         return self.runs.checkpoint(name)
