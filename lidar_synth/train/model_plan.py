@@ -206,7 +206,7 @@ def _planned(name: str, stage: Stage, path: Path, runs: StagedRuns, overrides: S
 def _needed(stages: Mapping[str, PlannedStage], last: str, runs: StagedRuns) -> dict[str, PlannedStage]:
     """The stages that the last one starts from, directly or not, and itself."""
     needed = {last}
-    for name in reversed(stages):
+    for name in reversed(list(stages)):
         if name in needed:
             starts = stages[name].starts.values()
             needed |= {other for other in stages if runs.checkpoint(other) in starts}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.disk import write_file
-from lidar_synth.train.config import Run
+from lidar_synth.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.train.config.load import Config
 from lidar_synth.train.resume import began_with
 from lidar_synth.train.runs import checkpoint_path, run
@@ -73,7 +73,7 @@ def with_iterations(config: Config, iterations: int) -> Config:
     return config.model_copy(update={"recipe": replace(config.recipe, iterations=iterations)})
 
 
-def train_for(config: Config, minutes: float) -> Path:
+def train_for(config: TrainConfig | DistillConfig, minutes: float) -> Path:
     """A run with a limit of time in place of iterations; a second call resumes it.
 
     Args:
