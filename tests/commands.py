@@ -23,8 +23,8 @@ from lidar_synth.bake import ENGINES, BakeJob
 from lidar_synth.cli import app
 from lidar_synth.evaluate import PROTOCOLS
 from lidar_synth.formats import WRITERS
-from lidar_synth.train import DistillConfig, TrainConfig, load_config
-from lidar_synth.train.config import read_values, validated
+from lidar_synth.train import DistillConfig, TrainConfig, load_config, plan_model
+from lidar_synth.train.config import published_models, read_values, validated
 
 PLAIN = (
     ".", "apt-get", "cat", "cd", "cp", "docker", "export", "git", "ln", "ls", "mkdir", "printf", "source", "sudo",
@@ -108,6 +108,13 @@ def _config(kind: Any) -> Callable[[dict[str, Any], Path | None], None]:
     return load
 
 
+def _train(values: dict[str, Any], folder: Path | None) -> None:
+    if values["recipe"] in {one.name for one in published_models()}:
+        plan_model(values["recipe"], values["overrides"] or (), values["minutes"], values["until"])
+    else:
+        _config(TrainConfig)(values, folder)
+
+
 def _bake(values: dict[str, Any], folder: Path | None) -> None:
     file = values["config"]
     settings = {} if file is None else read_values(folder / file if folder and file.suffix else file, BakeJob)
@@ -125,7 +132,7 @@ def _one_of(option: str, known: tuple[str, ...]) -> Callable[[dict[str, Any], Pa
 
 
 VALUES: dict[str, Callable[[dict[str, Any], Path | None], None]] = {
-    "train": _config(TrainConfig),
+    "train": _train,
     "distill": _config(DistillConfig),
     "bake": _bake,
     "town": _one_of("layout", ("kitti360", "semantic_kitti", "kitti")),

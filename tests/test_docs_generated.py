@@ -9,7 +9,7 @@ from project import ROOT
 
 import lidar_synth
 from lidar_synth.cli import COMMANDS
-from lidar_synth.train.config import published
+from lidar_synth.train.config import published, published_models
 
 markdown = pytest.importorskip("markdown")
 pytest.importorskip("latex2mathml")
@@ -64,7 +64,7 @@ def test_the_command_line_has_every_command_and_no_control_characters() -> None:
 
 def test_every_recipe_is_listed_with_its_time() -> None:
     text = TABLES["recipes"]()
-    assert all(f"{one.name}` |" in text and one.time in text for one in published())
+    assert all(f"{one.name}` |" in text and one.time in text for one in (*published_models(), *published()))
 
 
 @pytest.mark.parametrize("section", TABLES["SECTIONS"], ids=lambda name: name or "top")

@@ -28,7 +28,7 @@ FURTHER = {
     "lidar_synth.labels.edit": ("insert", "measure", "move", "remove"),
     "lidar_synth.mixing": ("Generated", "MixedScans.batches", "MixedScans.domain", "MixedScans.wrap"),
     "lidar_synth.noise": ("gaussian",),
-    "lidar_synth.train": ("TrainConfig", "load_config", "run"),
+    "lidar_synth.train": ("TrainConfig", "load_config", "plan_model", "run", "train_model"),
     "lidar_synth.viz": ("write_view",),
 }
 """What the documents name besides ``lidar_synth.__all__``. Python keeps no docstring of a dictionary such as

@@ -11,20 +11,21 @@ def recipes(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="print the file of this recipe")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Lists the recipes of the package with the data, model size and expected time of each.
+    """Lists the recipes and the models of several stages of the package with data, size and expected time of each.
 
     \b
     Examples:
       lidar-synth recipes
       lidar-synth recipes town_teacher > mine.yaml
+      lidar-synth recipes town-dense
       lidar-synth train town_teacher data.path=scans data.town=null output=runs/mine
     """
-    from lidar_synth.train.config import find_recipe, published
+    from lidar_synth.train.config import find_model_file, find_recipe, published, published_models
 
     if name is not None:
-        typer.echo(find_recipe(name).read_text(encoding="utf-8"), nl=False)
+        typer.echo((find_model_file(name) or find_recipe(name)).read_text(encoding="utf-8"), nl=False)
         return
-    listed = list(published())
+    listed = [*published_models(), *published()]
     if as_json:
         typer.echo(json.dumps([asdict(one) for one in listed], indent=1))
         return

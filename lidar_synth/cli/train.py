@@ -16,22 +16,57 @@ Resume = Annotated[bool, typer.Option("--resume", help="resume the run in the ou
 Minutes = Annotated[float | None, typer.Option(help="save and stop after this many minutes; --resume continues")]
 
 
-def train(recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
-    """Trains a teacher: a rectified flow from noise to scans.
+def train(
+    recipe: Annotated[
+        str,
+        typer.Argument(
+            metavar="RECIPE|MODEL",
+            help="name of a recipe or of a model of several stages (see `lidar-synth recipes`), or a YAML file",
+        ),
+    ],
+    overrides: Overrides = None,
+    resume: Resume = False,
+    minutes: Annotated[
+        float | None,
+        typer.Option(help="save and stop after this many minutes; --resume continues. Of a model: limit of all stages"),
+    ] = None,
+    until: Annotated[str | None, typer.Option(metavar="STAGE", help="of a model: the last stage to run")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="of a model: print the time of each stage")] = False,
+) -> None:
+    """Trains a teacher, a rectified flow from noise to scans; or a model by all its stages.
 
     The output folder gets the checkpoint, named like the folder; state.safetensors, from which an interrupted run
     resumes with the same losses; logs for TensorBoard; and images of samples. torchrun runs it on several GPUs.
 
+    A model such as town-dense has several stages: autoencoder, teacher, student, decoder. Each gets its share of
+    the minutes. The same command resumes. STAGE.KEY=VALUE changes the recipe of a stage, KEY=VALUE all of them.
+
     \b
     Examples:
+      lidar-synth train town-dense --dry-run
+      lidar-synth train town-dense --minutes 600 teacher.recipe.batch=16
+      lidar-synth train town-dense --until teacher output=runs/town-dense
+      lidar-synth train town-layout teacher.init=tools/stages/town_dense_teacher.safetensors
       lidar-synth train town_codec
       lidar-synth train town_teacher
       lidar-synth train town_teacher --resume recipe.iterations=20000
       lidar-synth train mine.yaml init=runs/town_teacher/town_teacher.safetensors data.path=scans
       torchrun --nproc-per-node 8 -m lidar_synth train kitti360_teacher precision=bf16
     """
-    from lidar_synth.train import TrainConfig, load_config, run
+    from lidar_synth.errors import ConfigError
+    from lidar_synth.train import TrainConfig, load_config, plan_model, run, train_model
+    from lidar_synth.train.config import find_model_file
 
+    if find_model_file(recipe) is not None:
+        plan = plan_model(recipe, overrides or (), minutes, until)
+        if dry_run:
+            typer.echo(plan)
+        else:
+            _print_once(train_model(plan))
+        return
+    if until is not None or dry_run:
+        given = "--dry-run" if dry_run else f"--until {until}"
+        raise ConfigError(f"{given} for the recipe {recipe}", "a model of several stages, such as town-dense")
     _print_once(run(load_config(TrainConfig, recipe, overrides or ()), resume, minutes))
 
 

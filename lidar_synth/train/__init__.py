@@ -1,6 +1,7 @@
 """Training of teachers, autoencoders and students.
 
-``run(config)`` trains as ``lidar-synth train`` and ``lidar-synth distill`` do; the parts below it (data, tasks, state,
+``run(config)`` trains as ``lidar-synth train RECIPE`` and ``lidar-synth distill`` do, ``train_model(plan)`` as
+``lidar-synth train MODEL``; the parts below it (data, tasks, state,
 the loop as a generator) serve trainings of your own. Running needs Accelerate (extra ``train``).
 """
 
@@ -17,6 +18,8 @@ from lidar_synth.train.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.train.data import Batch, Batches, Conditioning, micro_batches
 from lidar_synth.train.decoding import Decoding, decoding_loss, decoding_task
 from lidar_synth.train.loop import Loss, Record, Task, steps, student_task, teacher_task
+from lidar_synth.train.model_plan import ModelPlan, plan_model
+from lidar_synth.train.models import train_model
 from lidar_synth.train.optimizers import OPTIMIZERS
 from lidar_synth.train.runs import run
 from lidar_synth.train.schedules import SCHEDULES
@@ -34,6 +37,7 @@ __all__ = [
     "ImageCache",
     "Loss",
     "Losses",
+    "ModelPlan",
     "Other",
     "Recipe",
     "Record",
@@ -47,6 +51,7 @@ __all__ = [
     "decoding_task",
     "load_config",
     "micro_batches",
+    "plan_model",
     "reconstruct",
     "reconstruction_figures",
     "reconstruction_task",
@@ -54,4 +59,5 @@ __all__ = [
     "steps",
     "student_task",
     "teacher_task",
+    "train_model",
 ]

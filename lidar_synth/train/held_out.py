@@ -1,7 +1,6 @@
 """Early stopping: the loss on scans that are not trained on, always of the same samples with the same noise."""
 
 import json
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -73,10 +72,6 @@ class Watch:
     accelerator: "Accelerator"
     measured: list[Measured] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        self._before = self.measured[-1].seconds if self.measured else 0.0
-        self._start = time.monotonic()
-
     @property
     def least(self) -> float:
         """The least loss up to now."""
@@ -94,9 +89,8 @@ class Watch:
         if self.measured and self.measured[-1].step == training.step:
             return self.measured[-1].loss == self.least
         loss = self._loss(training)
-        seconds = self._before + time.monotonic() - self._start
         best = not self.measured or loss < self.least
-        self.measured.append(Measured(training.step, loss, seconds))
+        self.measured.append(Measured(training.step, loss, training.seconds))
         write_file(self.config.output / HISTORY, json.dumps(self.measured).encode())
         return best
 

@@ -5,15 +5,15 @@ from typing import Any
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import Header, read_header
-from lidar_synth.train.config import Run, read_values, validated
+from lidar_synth.train.config import PARENTS, Run, read_values, validated
+from lidar_synth.train.config.load import Config
+from lidar_synth.train.schedules import SCHEDULES
+from lidar_synth.train.state import read_progress
 
 HARMLESS = {"output", "save_every", "samples.every", "samples.count", "compile", "gradient_checkpointing", "data.cache"}
 """Keys that change where things lie, how much is written and how fast it goes, and not what is learned."""
 MORE = "recipe.iterations"
-"""What may grow."""
-PARENTS = ("teacher", "weaker", "init", "codec")
-"""Keys of a configuration that name checkpoints; a provenance holds their hashes under the same names."""
-
+"""What may grow, and may shrink before the learning rate falls."""
 _SHOWN = 4  # differences in one message
 
 
@@ -21,16 +21,34 @@ def check_resumed(config: Run) -> None:
     """Refuse to resume a run with other settings than those in the ``config.yaml`` of its output folder.
 
     Raises:
-        ConfigError: naming the differences, or where the run has fewer iterations than before.
-        FileError: where there is no ``config.yaml``.
+        ConfigError: naming the differences, or where fewer iterations than before would change the steps done.
+        FileError: where there is no ``config.yaml``, or the state cannot be read.
+        DataError: on a file that is not a state.
     """
-    path = config.output / "config.yaml"
-    began = validated(type(config), read_values(path, type(config)), str(path))
+    began = began_with(config)
     before, now = flat(began.model_dump(mode="json")), flat(config.model_dump(mode="json"))
-    if now[MORE] > before[MORE]:
+    if now[MORE] > before[MORE] or _same_steps(config, began.recipe.iterations):
         before[MORE] = now[MORE]
     if differs := [k for k in before | now if before.get(k) != now.get(k) and k not in HARMLESS]:
         raise _other(config, differs, before, now)
+
+
+def began_with(config: Config) -> Config:
+    """The configuration with which the run in the output folder of ``config`` was started or resumed last.
+
+    Raises:
+        ConfigError: if it is damaged.
+        FileError: where it cannot be read.
+    """
+    path = config.output / "config.yaml"
+    return validated(type(config), read_values(path, type(config)), str(path))
+
+
+def _same_steps(config: Run, before: int) -> bool:
+    """Whether all steps done had the learning rate that they have with the iterations of ``config``."""
+    recipe, done = config.recipe, read_progress(config.output).step
+    rates = {SCHEDULES[recipe.schedule](max(0, done - 1), recipe.warmup, i) for i in (before, recipe.iterations)}
+    return done < recipe.iterations and len(rates) == 1
 
 
 def check_parents(config: Run, header: Header) -> None:
@@ -56,7 +74,7 @@ def _other(config: Run, differs: list[str], before: Mapping[str, Any], now: Mapp
     more = f" and {len(named) - _SHOWN} more" if len(named) > _SHOWN else ""
     return ConfigError(
         f"--resume of {config.output} with {', '.join(named[:_SHOWN])}{more}",
-        "the settings that it began with; more recipe.iterations are allowed",
+        "the settings that it began with; more recipe.iterations, or fewer before the rate falls, are allowed",
         "Give those, or another output=FOLDER for a new run.",
     )
 

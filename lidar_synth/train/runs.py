@@ -37,7 +37,7 @@ from lidar_synth.train.held_out import Watch, open_watch
 from lidar_synth.train.loop import Record, steps
 from lidar_synth.train.plan import TrainingPlan, make_plan, open_data
 from lidar_synth.train.resume import check_parents, check_resumed
-from lidar_synth.train.state import Training
+from lidar_synth.train.state import STATE, Training
 from lidar_synth.viz import write_view
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
         >>> run(load_config(TrainConfig, "town_tiny", changes)).as_posix()
         'runs/mine/mine.safetensors'
     """
-    state = config.output / "state.safetensors"
+    state = config.output / STATE
     if state.exists():
         if not resume:
             raise ConfigError(f"{config.output} holds a run", "--resume to continue it, or another output=FOLDER")
@@ -127,6 +127,7 @@ def _train(
     """The loop with logs and saved states."""
     with accelerator.main_process_first():
         data = open_data(config, plan, accelerator.device)
+    training.began = time.monotonic()  # preparing the data is no training
     log = _Log(config, training.step, minutes is not None) if accelerator.is_main_process else None
     watch = open_watch(config, plan, training, accelerator) if config.held_out and log is not None else None
     if watch is not None and not watch.measured:
@@ -154,7 +155,7 @@ def _train(
 
 def _save(config: Run, plan: TrainingPlan, training: Training, data: Batches, watch: Watch | None) -> None:
     best = watch is None or watch.measure(training)
-    training.save(config.output / "state.safetensors")
+    training.save(config.output / STATE)
     if not best:
         return
     if isinstance(training.average, Autoencoding):

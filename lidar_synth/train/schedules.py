@@ -6,6 +6,9 @@ To add one: write it, enter it in ``SCHEDULES``.
 import math
 from collections.abc import Callable
 
+PLATEAU = 0.75
+"""Share of the iterations before ``trapezoid`` falls."""
+
 
 def cosine(step: int, warmup: int, iterations: int) -> float:
     """Linear from 0 over ``warmup`` steps, then down to 0 along half a cosine."""
@@ -14,7 +17,7 @@ def cosine(step: int, warmup: int, iterations: int) -> float:
     return (1 + math.cos(math.pi * (step - warmup) / max(1, iterations - warmup))) / 2
 
 
-def trapezoid(step: int, warmup: int, iterations: int, decay: float = 0.25) -> float:
+def trapezoid(step: int, warmup: int, iterations: int, decay: float = 1 - PLATEAU) -> float:
     """Linear from 0 over ``warmup`` steps, constant, then linear to 0 over the last quarter: up to there a run does
     not depend on ``iterations``, which may still be changed."""
     return min(1.0, (step + 1) / max(1, warmup), (iterations - step) / (decay * iterations))

@@ -1,14 +1,17 @@
 """The state of a training run, and how it is saved for resumption.
 
 The file is safetensors like a checkpoint, but serves to resume, not to sample: it holds the network, the averaged
-weights, the optimiser's moments and the step. Everything else is a function of the configuration and the step.
+weights, the optimiser's moments, the step and the seconds of training. Everything else is a function of the
+configuration and the step.
 """
 
 import copy
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -21,6 +24,9 @@ from lidar_synth.flow.path import METRICS
 from lidar_synth.geometry.normalize import CHANNELS
 from lidar_synth.train.optimizers import OPTIMIZERS
 from lidar_synth.train.schedules import SCHEDULES
+
+STATE = "state.safetensors"
+"""The file of the state in a run's folder."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +95,13 @@ class Training:
         make = OPTIMIZERS[recipe.optimizer]
         self.optimizers = make(network, recipe.rate, recipe.betas, recipe.weight_decay)
         self.step = 0
+        self.earlier = 0.0
+        self.began = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """Of training, interruptions left out; ``began`` is set when the data are ready."""
+        return self.earlier + time.monotonic() - self.began
 
     def update_average(self) -> None:
         """Move the averaged weights towards the network's, and copy its buffers (statistics of norms, codebooks)."""
@@ -112,7 +125,7 @@ class Training:
             for i, moments in optimizer.state_dict()["state"].items():
                 tensors |= {f"optimizer.{k}.{i}.{n}": value for n, value in moments.items()}
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        write_file(path, save(tensors, {"step": str(self.step)}))
+        write_file(path, save(tensors, {"step": str(self.step), "seconds": f"{self.seconds:.3f}"}))
 
     def load(self, path: Path) -> None:
         """Restore the state that ``save`` wrote.
@@ -121,14 +134,9 @@ class Training:
             FileError: where the file cannot be read.
             DataError: if it is not the state of such a run.
         """
-        try:
-            with safe_open(path, "pt") as file:
-                step = int(file.metadata()["step"])
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
-        except OSError as error:
-            raise FileError(f"{path} cannot be read ({error})", "a saved state", "Start without --resume.") from error
-        except (SafetensorError, KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path} is not a saved state ({error})", "state.safetensors of a run") from error
+        with _opened(path) as file:
+            progress = _progress(file)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
         parts: dict[str, dict[str, Any]] = {"network": {}, "average": {}, "optimizer": {}}
         for name, tensor in tensors.items():
             part, key = name.split(".", 1)
@@ -144,4 +152,46 @@ class Training:
                 optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
         except (RuntimeError, ValueError, IndexError) as error:
             raise DataError(f"{path} is the state of another network ({error})", "the same configuration") from error
-        self.step = step
+        self.step, self.earlier = progress
+        self.began = time.monotonic()
+
+
+class Progress(NamedTuple):
+    """How far a saved run has come.
+
+    Args:
+        step: its last step.
+        seconds: of training.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+
+
+def read_progress(folder: Path) -> Progress:
+    """How far the run in a folder has come; nothing yet if there is no state.
+
+    Raises:
+        FileError: where the state cannot be read.
+        DataError: on another file in its place.
+    """
+    if not (folder / STATE).exists():
+        return Progress()
+    with _opened(folder / STATE) as file:
+        return _progress(file)
+
+
+def _progress(file: Any) -> Progress:
+    held = file.metadata()
+    return Progress(int(held["step"]), float(held.get("seconds", 0.0)))  # older states have no seconds
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        with safe_open(path, "pt") as file:
+            yield file
+    except OSError as error:
+        raise FileError(f"{path} cannot be read ({error})", "a saved state", "Start without --resume.") from error
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path} is not a saved state ({error})", "state.safetensors of a run") from error

@@ -21,12 +21,16 @@ from lidar_synth.train.config import (
     Condition,
     Data,
     DistillConfig,
+    ModelConfig,
     Network,
     Run,
     Samples,
     SelectionSettings,
+    Stage,
+    TownScans,
     TrainConfig,
     published,
+    published_models,
 )
 from lidar_synth.train.state import Recipe
 
@@ -66,6 +70,8 @@ FURTHER = (
     "lidar_synth.evaluate.segmentation.load_judge",
     "lidar_synth.train.runs.run",
     "lidar_synth.train.config.load.load_config",
+    "lidar_synth.train.model_plan.plan_model",
+    "lidar_synth.train.models.train_model",
     "lidar_synth.viz.write_view",
 )
 """Names that pages use besides those of ``lidar_synth``."""
@@ -80,8 +86,12 @@ SECTIONS: dict[str, tuple[type, ...]] = {
     "samples": (Samples,),
     "distill": (DistillConfig,),
     "selection": (SelectionSettings,),
+    "models": (ModelConfig,),
+    "stages": (Stage,),
+    "town": (TownScans,),
 }
-"""Keys of a recipe that hold further keys; "" = the keys on top, "distill" = those of a student besides."""
+"""Keys of a recipe that hold further keys; "" = the keys on top, "distill" = those of a student besides,
+"models" = those of a model of several stages."""
 
 
 def api() -> str:
@@ -116,7 +126,7 @@ def _helps(group: TyperGroup, above: Context, names: list[str]) -> Iterator[str]
 def recipes() -> str:
     """The table of ``lidar-synth recipes``."""
     rows = ["| command | data | parameters | time |", "|---|---|---:|---|"]
-    for one in published():
+    for one in (*published_models(), *published()):
         command = "bake OUT --config" if one.command == "bake" else one.command
         rows.append(f"| `{command} {one.name}` | {one.data} | {one.size} | {one.time} |")
     return "\n".join(rows)
@@ -124,7 +134,7 @@ def recipes() -> str:
 
 def recipe_keys() -> str:
     """A table of the keys of each section of a recipe."""
-    titles = {"": "Keys of every recipe", "distill": "Keys of a student's recipe"}
+    titles = {"": "Keys of every recipe", "distill": "Keys of a student's recipe", "models": "Keys of a model's file"}
     parts = []
     for name, models in SECTIONS.items():
         rows = [row for model in models for row in _keys(model)]

@@ -39,7 +39,7 @@ def figures(work: Work, made: Checkpoint) -> dict[str, Any]:
     """
     found: dict[str, Any] = {"stages": {}}
     for name in work.stages:
-        history = read_history(work.run_folder(name))
+        history = read_history(work.runs.folder_of(name))
         best = min(history, key=lambda m: m.loss)
         found["stages"][name] = {
             "steps": history[-1].step, "best_step": best.step, "minutes": round(history[-1].seconds / 60, 1),

@@ -15,7 +15,8 @@ from lidar_synth.generate.regrid import check_movable, fitting, regrid, with_cod
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.train.adaptation.card import figures, provenance_of, write_card
 from lidar_synth.train.adaptation.scans import Split, digest, label, prepare, split
-from lidar_synth.train.adaptation.stages import Stage, Work, stages_for
+from lidar_synth.train.adaptation.stages import Stage, Work, shares, stages_for
+from lidar_synth.train.staged import StagedRuns
 
 MINUTES = 120.0
 TOWN_SCANS = 400
@@ -60,7 +61,7 @@ class AdaptPlan:
     def __str__(self) -> str:
         """The plan in words."""
         own, (rows, columns) = self.source.sensor, self.sensor.shape
-        total = sum(stage.share for stage in self.stages.values())
+        budgets = StagedRuns(self.work, shares(self.stages)).budgets(self.minutes)
         lines = [
             f"{self.name} -> {self.out}",
             f"sensor {own.name}: {own.shape[0]} x {own.columns}, as {rows} x {columns} cells from "
@@ -71,7 +72,7 @@ class AdaptPlan:
             if self.labelled
             else "without labels: generated labels are the model's own guess, learnt on the town",
             f"at most {self.minutes:g} minutes:",
-            *(f"  {name:<10} {self.minutes * s.share / total:6.1f}  {s.about}" for name, s in self.stages.items()),
+            *(f"  {name:<10} {minutes:6.1f}  {self.stages[name].about}" for name, minutes in budgets.items()),
             f"the folder {self.work} keeps what is needed to resume",
         ]
         return "\n".join(lines)
@@ -175,18 +176,17 @@ def _train(work: Work, start: Path, minutes: float) -> Work:
     """Run all stages, each from the checkpoint of the one before; return the work with the scans' labels."""
     flow = start
     for name in work.stages:
-        limit = work.minutes(name, minutes)
         if name in ("labels", "codec"):
-            start = work.train(name, start, limit)
+            start = work.train(name, start, minutes)
             if name == "labels":
                 codec = load_checkpoint(start)
                 latent: Any = Latent(codec.networks[CODEC], codec.header.tensors)  # type: ignore[arg-type]
                 work = replace(work, scans=label(work.scans, latent, work.folder / "labelled"))
         elif name == "student":
-            flow = work.train(name, flow, limit)
+            flow = work.train(name, flow, minutes)
         else:
             begin = _with_codec(work, name, flow, start) if work.latent else flow
-            flow = work.train(name, begin, limit)
+            flow = work.train(name, begin, minutes)
     return work
 
 
@@ -202,7 +202,7 @@ def _with_codec(work: Work, name: str, flow: Path, codec: Path) -> Path:
 
 def _finish(plan: AdaptPlan, work: Work, start: Path, licence: str) -> Path:
     """Write the checkpoint and its card."""
-    made = load_checkpoint(work.checkpoint("student"))
+    made = load_checkpoint(work.runs.checkpoint("student"))
     found = figures(work, made)
     provenance = provenance_of(plan.name, plan.model, work, made, found)
     header: Header = replace(made.header, provenance=provenance)

@@ -9,16 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidar_synth.files.disk import write_file
 from lidar_synth.generate.checkpoint import CODEC, Header
 from lidar_synth.train.adaptation.scans import HELD, TRAIN, Prepared
-from lidar_synth.train.config import DistillConfig, TrainConfig, check, read_values, validated
+from lidar_synth.train.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.train.config.recipes import merged
-from lidar_synth.train.held_out import read_history
 from lidar_synth.train.runs import run
+from lidar_synth.train.staged import ENDLESS, StagedRuns
 
-ENDLESS = 10**9
-"""Iterations of a stage: the limit of time or early stopping ends it."""
 TOWN_SEED, TOWN_HELD, TOWN_HELD_SCANS = 0, 7100, 16
 """Seeds of the towns to train on and to hold out, and the scans that are held out."""
 CODEC_SAMPLES, FLOW_SAMPLES = 12, 32
@@ -26,7 +23,6 @@ CODEC_SAMPLES, FLOW_SAMPLES = 12, 32
 INTERVAL = 2.0
 """Seconds between two scans of the town."""
 TOWN_LICENCE = "MIT (procedural, no one's data)"
-DONE = "done"
 UNLABELLED = 0.5
 """Share of the town's images that an autoencoder labels without having seen their labels."""
 
@@ -75,6 +71,11 @@ def stages_for(header: Header, labelled: bool, town: int) -> dict[str, Stage]:
     return {name: stage for name, stage in STAGES.items() if name not in left_out}
 
 
+def shares(stages: Mapping[str, Stage]) -> dict[str, float]:
+    """The share of each stage of the limit of time."""
+    return {name: stage.share for name, stage in stages.items()}
+
+
 @dataclass(frozen=True)
 class Work:
     """What all stages of an adaptation share.
@@ -102,53 +103,33 @@ class Work:
         """Whether the model has an autoencoder."""
         return CODEC in self.header.networks
 
-    def run_folder(self, name: str) -> Path:
-        """The folder of a stage."""
-        return self.folder / name
+    @property
+    def runs(self) -> StagedRuns:
+        """The runs of the stages."""
+        return StagedRuns(self.folder, shares(self.stages))
 
-    def checkpoint(self, name: str) -> Path:
-        """The checkpoint of a stage."""
-        return self.folder / name / f"{name}.safetensors"
-
-    def seconds(self) -> float:
-        """What all stages have taken up to now."""
-        return sum(history[-1].seconds for n in self.stages if (history := read_history(self.run_folder(n))))
-
-    def minutes(self, name: str, limit: float) -> float:
-        """The minutes of a stage that is about to start or to continue, of a ``limit`` for all stages."""
-        names = list(self.stages)
-        later = names[names.index(name) :]
-        history = read_history(self.run_folder(name))
-        spent = self.seconds() - (history[-1].seconds if history else 0.0)
-        share = self.stages[name].share / sum(self.stages[n].share for n in later)
-        return max(0.0, (limit - spent / 60) * share - (history[-1].seconds / 60 if history else 0.0))
-
-    def train(self, name: str, start: Path, minutes: float) -> Path:
+    def train(self, name: str, start: Path, limit: float) -> Path:
         """Run or resume a stage, unless it is done: more steps would change what the next one began with.
 
         Args:
             name: of the stage.
             start: the checkpoint that it starts from.
-            minutes: limit of its time.
+            limit: minutes of all stages.
 
         Returns:
             The checkpoint with the best weights.
         """
-        done = self.run_folder(name) / DONE
-        if not done.is_file():
+        if not self.runs.is_done(name):
+            minutes = max(0.0, self.runs.budgets(limit)[name] - self.runs.spent(name))
             run(self.config(name, start), resume=True, minutes=minutes)
-            write_file(done, b"")
-        return self.checkpoint(name)
+            self.runs.mark_done(name)
+        return self.runs.checkpoint(name)
 
     def config(self, name: str, start: Path) -> TrainConfig | DistillConfig:
         """The configuration of a stage."""
         kind: type[TrainConfig] | type[DistillConfig] = DistillConfig if name == "student" else TrainConfig
-        values = read_values(self.stages[name].recipe, kind)
-        for own in (self._own(name, start), dict(self.overrides.get(name, {}))):
-            values = merged(values, own)
-        config = validated(kind, values, f"stage {name}")
-        check(config)
-        return config
+        values = merged(self._own(name, start), dict(self.overrides.get(name, {})))
+        return load_config(kind, self.stages[name].recipe, values=values)
 
     def _own(self, name: str, start: Path) -> dict[str, Any]:
         stage = self.stages[name]
@@ -157,7 +138,7 @@ class Work:
         codec = stage.recipe == "adapt_codec"
         latents = {"latents": self.latent and not codec}
         values: dict[str, Any] = {
-            "output": str(self.run_folder(name)),
+            "output": str(self.runs.folder_of(name)),
             "licence": self.licence,
             "data": data | latents,
             "held_out": {"data": held | latents | {"flip": True}, "samples": CODEC_SAMPLES if codec else FLOW_SAMPLES},

@@ -3,27 +3,43 @@
 What a run needs is built from the checked values by the caller, so that nothing below knows of configurations.
 """
 
-from lidar_synth.train.config.load import check, load_config, read_values, validated
-from lidar_synth.train.config.recipes import Listed, find_recipe, published
+from lidar_synth.train.config.load import load_config, read_values, validated
+from lidar_synth.train.config.models import (
+    PARENTS,
+    ModelConfig,
+    Stage,
+    TownScans,
+    find_model_file,
+    load_model,
+    published_models,
+)
+from lidar_synth.train.config.recipes import Listed, command_of, find_recipe, published
 from lidar_synth.train.config.sections import Condition, Data, HeldOut, Network, Run, Samples, Section
 from lidar_synth.train.config.training import DistillConfig, SelectionSettings, TrainConfig
 
 __all__ = [
+    "PARENTS",
     "Condition",
     "Data",
     "DistillConfig",
     "HeldOut",
     "Listed",
+    "ModelConfig",
     "Network",
     "Run",
     "Samples",
     "Section",
     "SelectionSettings",
+    "Stage",
+    "TownScans",
     "TrainConfig",
-    "check",
+    "command_of",
+    "find_model_file",
     "find_recipe",
     "load_config",
+    "load_model",
     "published",
+    "published_models",
     "read_values",
     "validated",
 ]

@@ -1,6 +1,6 @@
 """From a recipe to checked values; unknown keys are refused, with the known ones named."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,7 +10,7 @@ from lidar_synth.errors import ConfigError, shorten
 from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.train.config.recipes import find_recipe, read_recipe
+from lidar_synth.train.config.recipes import find_recipe, merged, read_recipe
 from lidar_synth.train.config.sections import Run
 from lidar_synth.train.config.training import DistillConfig, TrainConfig
 
@@ -18,13 +18,16 @@ Config = TypeVar("Config", bound=Run)
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def load_config(kind: type[Config], recipe: str | Path, overrides: Sequence[str] = ()) -> Config:
+def load_config(
+    kind: type[Config], recipe: str | Path, overrides: Sequence[str] = (), values: Mapping[str, Any] | None = None
+) -> Config:
     """The configuration of a recipe.
 
     Args:
         kind: ``TrainConfig`` or ``DistillConfig``.
         recipe: a published recipe's name, such as ``town_teacher``, or a YAML file.
         overrides: ``key=value`` with dots between levels and values in YAML, such as ``recipe.batch=4``.
+        values: plain values on top of the recipe's and below the overrides.
 
     Returns:
         The checked configuration, for ``run``.
@@ -40,10 +43,10 @@ def load_config(kind: type[Config], recipe: str | Path, overrides: Sequence[str]
         >>> config.recipe.batch, config.recipe.iterations, config.output.as_posix()
         (4, 200, 'runs/mine')
     """
-    values = read_values(recipe, kind)
+    given = merged(read_values(recipe, kind), dict(values or {}))
     for override in overrides:
-        _override(values, override)
-    config = validated(kind, values, str(recipe))
+        _override(given, override)
+    config = validated(kind, given, str(recipe))
     check(config)
     return config
 

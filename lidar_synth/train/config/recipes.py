@@ -5,7 +5,7 @@ later files and the recipe's own values take precedence. Its key ``about`` descr
 Both keys are removed before the values are checked.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -76,16 +76,20 @@ def read_recipe(path: Path) -> dict[str, Any]:
     return values
 
 
+def command_of(values: Collection[str]) -> str:
+    """The command that runs a recipe with these keys: "bake", "distill" or "train"."""
+    return "bake" if "recipe" not in values else "distill" if "teacher" in values else "train"
+
+
 def published() -> Iterator[Listed]:
     """The recipes that come with the package, by name."""
     for path in sorted(folder().glob("*.yaml")):
-        about = _read(path).get("about")
+        about = read_file(path).get("about")
         if not isinstance(about, dict):  # a sensor, not a recipe
             continue
-        values = _merged(path, ())
-        command = "bake" if "recipe" not in values else "distill" if "teacher" in values else "train"
+        command = command_of(_merged(path, ()))
         data, size, time = (str(about[key]) for key in ("data", "size", "time"))
-        yield Listed(path.stem, command, data, size, time, _head(path))
+        yield Listed(path.stem, command, data, size, time, head_of(path))
 
 
 def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
@@ -100,7 +104,7 @@ def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 def _merged(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     if path in above:
         raise ConfigError(f"{path} is its own base", "bases that end")
-    values = _read(path)
+    values = read_file(path)
     bases = values.pop("base", [])
     result: dict[str, Any] = {}
     for base in [bases] if isinstance(bases, str) else bases:
@@ -119,7 +123,8 @@ def _base(path: Path, name: Any) -> Path:
     raise ConfigError(f"{path}: base {name!r}", f"a file beside it, or a recipe of {folder()}")
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_file(path: Path) -> dict[str, Any]:
+    """The keys and values of one file, without its bases; raises as ``read_recipe``."""
     values = read_yaml(path, "a configuration; lidar-synth recipes lists the published ones")
     if not isinstance(values, dict):
         raise ConfigError(f"{path} holds {type(values).__name__}", "keys and values")
@@ -129,7 +134,7 @@ def _read(path: Path) -> dict[str, Any]:
     return values
 
 
-def _head(path: Path) -> str:
+def head_of(path: Path) -> str:
     """The first sentence of the comment at the head of a file."""
     lines = []
     for line in path.read_text(encoding="utf-8").splitlines():
