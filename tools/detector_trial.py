@@ -13,7 +13,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from lidar_synth import MixedScans, ObjectBank, Source, load_generator, make_policy
 from lidar_synth.files.disk import write_file
-from lidar_synth.labels.augment import Augmentation, compose, flip_y, scale, yaw
+from lidar_synth.labels.augment import Augmentation, compose, flip_x, flip_y, scale, yaw
 from lidar_synth.mixing import Sources
 from lidar_synth.proof.machine import machine
 from lidar_synth.train.segmentation import endless_batches
@@ -38,8 +38,8 @@ TESTED, TEST_TOWNS = 40, (8, 9)
 """Tested scans of each town."""
 LAYOUT_TOWNS = (20, 21)
 UNBOXED_MODEL = "town-dense"
-BATCH, RATE = 4, 3e-3
-SETTLING = 12
+BATCH, RATE = 2, 3e-3
+SETTLING = 24
 """Batches of labelled scans for the statistics of the batch normalisation."""
 PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
 """Maximum number of objects that GT sampling pastes into a scan."""
@@ -134,7 +134,7 @@ def mixture(arm: Arm, labelled: Source, pool: Source | None, seed: int, count: i
     objects = ObjectBank.from_scans(labelled)
     there = {name: most for name, most in PASTED.items() if name in objects.boxes.names}
     options: dict[str, Any] = {"objects": objects, "count": there, "turn": 180.0, "clear": False}
-    steps: list[Augmentation] = [yaw, flip_y, scale]
+    steps: list[Augmentation] = [partial(yaw, limit=45), flip_x, flip_y, scale]
     if arm.pasted:
         steps.insert(0, make_policy("mix", fields=frozenset({"label", "boxes"}), **options))
     return MixedScans(
@@ -157,7 +157,7 @@ def run(work: Work, name: str, seed: int, test: Callable[[Detector], list[float]
     seconds = time.process_time() - start
     base = mixture(ARMS["real"], labelled, None, seed, SETTLING * BATCH)
     found = test(settled(network, _one_epoch(base)))
-    parts = [round(float(np.mean(part)), 3) for part in np.array_split(losses, 10)]
+    parts = [round(float(np.mean(part)), 3) for part in np.array_split(losses, 10) if len(part)]
     return {"arm": name, "seed": seed, "ap": found, "losses": parts, "seconds": round(seconds, 1)}
 
 

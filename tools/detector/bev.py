@@ -8,12 +8,14 @@ footprint, and few labelled boxes do not teach front from back.
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import torch
 import torch.nn.functional as F
-from detector.classes import CLASSES
 from numpy.typing import NDArray
 from torch import Tensor
+
+from detector.classes import CLASSES
 
 REACH = 51.2
 """Metres from the sensor to each of the four sides of the view."""
@@ -26,6 +28,8 @@ CHANNELS = 4 * (SLICES + 2)
 """Of the input: 2 x 2 cells side by side are one pixel."""
 REGRESSED = 8
 """Offset (2) in pixels of the output, height of the centre, logarithm of the size (3), cosine and sine of 2 yaw."""
+LOGARITHM = np.minimum(40 * np.log2(1 + np.arange(100)), 255).astype(np.uint8)
+"""The value of a cell by its number of returns."""
 APART = (1.2, 0.4, 0.7)
 """Minimum distance of two boxes of a class, metres."""
 
@@ -55,16 +59,24 @@ class Found:
 
 def view(points: NDArray[np.float32], reflectance: NDArray[np.float32]) -> Tensor:
     """(n, n, CHANNELS) uint8: a scan of N points from above, x along the first axis."""
-    place = np.floor((points[:, :2] + REACH) / CELL).astype(np.int64)
-    height = np.floor((points[:, 2] - LOW) / SLICE).astype(np.int64)
-    inside = ((place >= 0) & (place < CELLS)).all(1) & (height >= 0) & (height < SLICES)
-    (i, j), height = place[inside].T, height[inside]
-    cell = (i // 2 * (CELLS // 2) + j // 2) * 4 + i % 2 * 2 + j % 2
-    image = np.zeros((CELLS * CELLS, SLICES + 2), np.uint8)
-    image[cell, height] = 255
-    image[cell, SLICES] = reflectance[inside] * 255  # of any of its returns
-    image[:, SLICES + 1] = np.minimum(40 * np.log2(1 + np.bincount(cell, minlength=CELLS * CELLS)), 255)
+    image, count = np.zeros((CELLS * CELLS, SLICES + 2), np.uint8), np.zeros(CELLS * CELLS, np.int32)
+    _fill(image, count, points, reflectance)
+    image[:, SLICES + 1] = LOGARITHM[np.minimum(count, len(LOGARITHM) - 1)]
     return torch.from_numpy(image).view(CELLS // 2, CELLS // 2, CHANNELS)
+
+
+@numba.njit(cache=True)
+def _fill(image, count, points, reflectance):  # type: ignore[no-untyped-def]
+    """Set the slices and a reflectance of every cell that has returns, and count them."""
+    for k in range(len(points)):
+        x, y = (points[k, 0] + REACH) / CELL, (points[k, 1] + REACH) / CELL
+        height = (points[k, 2] - LOW) / SLICE
+        if 0 <= x < CELLS and 0 <= y < CELLS and 0 <= height < SLICES:
+            i, j = int(x), int(y)
+            cell = (i // 2 * (CELLS // 2) + j // 2) * 4 + i % 2 * 2 + j % 2
+            image[cell, int(height)] = 255
+            image[cell, SLICES] = int(reflectance[k] * 255)  # of any of its returns
+            count[cell] += 1
 
 
 def targets(boxes: NDArray[np.float32], classes: NDArray[np.int64], pixel: float) -> Target:

@@ -7,19 +7,19 @@ from itertools import islice
 import numpy as np
 import torch
 import torch.nn.functional as F
-from detector.bev import CHANNELS, REGRESSED, Found, Target, decode, targets, view
-from detector.classes import CLASSES
-from detector.pools import detected
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from detector.bev import CHANNELS, REGRESSED, Found, Target, decode, targets, view
+from detector.classes import CLASSES
+from detector.pools import classes_of, detected
 from lidar_synth import Scan
 
 PIXEL = 0.8
 """Side of a pixel of the output, metres."""
 WIDTHS, DEPTHS = (32, 64, 96), (1, 2, 3)
 """Channels and additional layers of the three levels."""
-RARE_HEAT = -2.2
+RARE_HEAT = -4.6
 """Initial logit of the heat: few pixels hold a centre."""
 
 Sample = tuple[Tensor, Target]
@@ -27,7 +27,8 @@ Sample = tuple[Tensor, Target]
 
 def sample(scan: Scan, rng: np.random.Generator) -> Sample:
     """The view and the targets of a scan with boxes."""
-    return view(scan.points, scan.reflectance), targets(*detected(scan), PIXEL)
+    boxes = detected(scan)
+    return view(scan.points, scan.reflectance), targets(boxes.values, classes_of(boxes), PIXEL)
 
 
 def collate(samples: Sequence[Sample]) -> Sample:
@@ -57,7 +58,7 @@ class Detector(nn.Module):
             )
             for width, scale in ((second, 2), (third, 4))
         )
-        self.head = nn.Sequential(_layer(3 * first, 2 * first), nn.Conv2d(2 * first, len(CLASSES) + REGRESSED, 1))
+        self.head = nn.Sequential(_layer(3 * first, 48), nn.Conv2d(48, len(CLASSES) + REGRESSED, 1))
         nn.init.constant_(self.head[1].bias[: len(CLASSES)], RARE_HEAT)
 
     def forward(self, views: Tensor) -> tuple[Tensor, Tensor]:

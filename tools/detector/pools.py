@@ -4,11 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from detector.classes import CLASS_OF, LEAST
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lidar_synth import Scan, Source, Town, load_generator, open_scans
+from detector.classes import CLASS_OF, LEAST
+from lidar_synth import Boxes, Scan, Source, Town, load_generator, open_scans
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.labels.edit import closed
 from lidar_synth.town import STRETCH_FRAMES
@@ -84,18 +84,21 @@ def laid_out(folder: Path, model: str, layouts: Source) -> Source:
 def with_points(scan: Scan) -> Scan:
     """The scan with those boxes that hold ``LEAST`` returns."""
     assert scan.boxes is not None
-    scan.boxes = scan.boxes[points_in(scan) >= LEAST]
+    scan.boxes = scan.boxes[points_in(scan.boxes, scan) >= LEAST]
     return scan
 
 
-def points_in(scan: Scan) -> NDArray[np.int64]:
-    """(M,) number of returns in each box above its floor."""
-    assert scan.boxes is not None
-    return np.asarray(scan.boxes.contain(scan.points, above_floor=0.1).sum(1))
+def points_in(boxes: Boxes, scan: Scan) -> NDArray[np.int64]:
+    """(M,) number of returns of a scan in each of M boxes, above its floor."""
+    return np.asarray(boxes.contain(scan.points, above_floor=0.1).sum(1))
 
 
-def detected(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The boxes (M, 7) of a scan's detected classes, and their classes (M,)."""
+def detected(scan: Scan) -> Boxes:
+    """The boxes of a scan's detected classes."""
     assert scan.boxes is not None
-    mine = [i for i, name in enumerate(scan.boxes.names) if name in CLASS_OF]
-    return scan.boxes.values[mine], np.array([CLASS_OF[scan.boxes.names[i]] for i in mine], np.int64)
+    return scan.boxes[np.array([name in CLASS_OF for name in scan.boxes.names], bool)]
+
+
+def classes_of(boxes: Boxes) -> NDArray[np.int64]:
+    """(M,) the class of each box."""
+    return np.array([CLASS_OF[name] for name in boxes.names], np.int64)

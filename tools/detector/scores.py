@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from detector.bev import REACH, Found
-from detector.classes import CLASSES, LEAST
-from detector.pools import detected, points_in
 from numpy.typing import NDArray
 
+from detector.bev import REACH, Found
+from detector.classes import LEAST
+from detector.pools import classes_of, detected, points_in
 from lidar_synth import Boxes, Scan
 
 OVERLAP = (0.5, 0.25, 0.25)
@@ -31,11 +31,9 @@ class Truth:
     @classmethod
     def of(cls, scan: Scan) -> "Truth":
         """The boxes of a scan."""
-        assert scan.boxes is not None
-        boxes, classes = detected(scan)
-        mine = [i for i, name in enumerate(scan.boxes.names) if any(name in names for names in CLASSES.values())]
-        inside = (np.abs(boxes[:, :2]) < REACH).all(1)
-        return cls(boxes, classes, inside & (points_in(scan)[mine] >= LEAST))
+        boxes = detected(scan)
+        inside = (np.abs(boxes.values[:, :2]) < REACH).all(1)
+        return cls(boxes.values, classes_of(boxes), inside & (points_in(boxes, scan) >= LEAST))
 
 
 def precisions(found: Sequence[Found], truths: Sequence[Truth]) -> list[float]:
