@@ -146,6 +146,7 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
     for name, value in {"LABELLED": 1, "TESTED": 1, "TEST_TOWNS": (8,), "SETTLING": 1}.items():
         monkeypatch.setattr(detector_trial, name, value)
+    monkeypatch.setattr(detector_trial.pools, "FRAMES", (4,))
     return detector_trial
 
 

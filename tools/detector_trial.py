@@ -1,6 +1,6 @@
 """Does a detector gain from synthetic scans? Trained on 30 labelled scans of one town, tested on two others.
 
-    python tools/detector_trial.py WORK [--arm real --arm gt_sampling ...] [--seeds 3] [--iterations 600]
+    python tools/detector_trial.py WORK [--arm real --arm gt_sampling ...] [--seeds 3] [--iterations 1600]
                                         [--layout-model CHECKPOINT] [--minutes M] [--out TABLE.md]
 
 All arms have the same network, iterations, augmentation (turned, mirrored, scaled) and test. Half of each batch of an
@@ -206,7 +206,7 @@ def main() -> None:
     parser.add_argument("work", type=Path, help="folder for scans and results")
     parser.add_argument("--arm", action="append", choices=ARMS, help="by default all; layout arms only with a model")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--iterations", type=int, default=600)
+    parser.add_argument("--iterations", type=int, default=1600)
     parser.add_argument("--pool", type=int, default=200, help="synthetic scans of each kind")
     parser.add_argument("--layout-model", metavar="CHECKPOINT")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="no training begins after these")
