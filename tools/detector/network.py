@@ -1,0 +1,134 @@
+"""The detector: a convolutional network in bird's-eye view with CenterPoint's head, its training and its test."""
+
+from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
+from itertools import islice
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from detector.bev import CHANNELS, REGRESSED, Found, Target, decode, targets, view
+from detector.classes import CLASSES
+from detector.pools import classes_of, detected
+from lidar_synth import Scan
+
+PIXEL = 0.8
+"""Side of a pixel of the output, metres."""
+WIDTHS, DEPTHS = (32, 64, 96), (1, 2, 3)
+"""Channels and additional layers of the three levels."""
+RARE_HEAT = -4.6
+"""Initial logit of the heat: few pixels hold a centre."""
+
+Sample = tuple[Tensor, Target]
+
+
+def sample(scan: Scan, rng: np.random.Generator) -> Sample:
+    """The view and the targets of a scan with boxes."""
+    boxes = detected(scan)
+    return view(scan.points, scan.reflectance), targets(boxes.values, classes_of(boxes), PIXEL)
+
+
+def collate(samples: Sequence[Sample]) -> Sample:
+    """A batch of samples."""
+    views, each = zip(*samples, strict=True)
+    return torch.stack(views), Target(*(torch.stack(part) for part in zip(*each, strict=True)))
+
+
+def _layer(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    convolution = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+class Detector(nn.Module):
+    """Three levels, brought together on the grid of the first (0.5 M parameters)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        first, second, third = WIDTHS
+        levels = zip((CHANNELS, first, second), WIDTHS, DEPTHS, strict=True)
+        self.levels = nn.ModuleList(
+            nn.Sequential(_layer(i, o, 2), *(_layer(o, o) for _ in range(depth))) for i, o, depth in levels
+        )
+        self.up = nn.ModuleList(
+            nn.Sequential(
+                nn.ConvTranspose2d(width, first, scale, scale, bias=False), nn.BatchNorm2d(first), nn.ReLU(inplace=True)
+            )
+            for width, scale in ((second, 2), (third, 4))
+        )
+        self.head = nn.Sequential(_layer(3 * first, 48), nn.Conv2d(48, len(CLASSES) + REGRESSED, 1))
+        nn.init.constant_(self.head[1].bias[: len(CLASSES)], RARE_HEAT)
+
+    def forward(self, views: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits of the heat (B, classes, n, n) and values (B, REGRESSED, n, n) of views (B, CHANNELS, 2n, 2n)."""
+        found = []
+        x = views
+        for level in self.levels:
+            x = level(x)
+            found.append(x)
+        joined = torch.cat([found[0], *(up(x) for up, x in zip(self.up, found[1:], strict=True))], 1)
+        out = self.head(joined).float()
+        return out[:, : len(CLASSES)], out[:, len(CLASSES) :]
+
+
+def answer(network: nn.Module, views: Tensor) -> tuple[Tensor, Tensor]:
+    """The network on views (B, 2n, 2n, CHANNELS) uint8, in bfloat16. The first layer is normalised, so that the scale
+    of its input does not matter."""
+    with torch.autocast("cpu", torch.bfloat16):
+        logits, values = network(views.to(torch.bfloat16).permute(0, 3, 1, 2))
+    return logits, values
+
+
+def loss_of(logits: Tensor, values: Tensor, target: Target) -> Tensor:
+    """CenterPoint's focal loss of the heat, and the absolute error of the values around centres."""
+    p, log_p, log_q = logits.sigmoid(), F.logsigmoid(logits), F.logsigmoid(-logits)
+    centre = target.heat == 1
+    heat = torch.where(centre, (1 - p) ** 2 * log_p, (1 - target.heat) ** 4 * p**2 * log_q)
+    error = (values - target.values).abs() * target.weight[:, None]
+    return -heat.sum() / centre.sum().clamp(min=1) + error.sum() / target.weight.sum().clamp(min=1)
+
+
+def train(network: Detector, batches: Iterable[Sample], iterations: int, rate: float, name: str) -> list[float]:
+    """Train a network in place; the loss of every iteration. AdamW, one cycle of the learning rate."""
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network.train()
+    optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=iterations)
+    losses: list[float] = []
+    bar = tqdm(islice(batches, iterations), name, iterations, mininterval=5, unit="iteration")
+    for views, target in bar:
+        loss = loss_of(*answer(network, views), target)
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 10.0)
+        optimizer.step()
+        schedule.step()
+        losses.append(loss.item())
+        bar.set_postfix(loss=f"{np.mean(losses[-20:]):.3f}", refresh=False)
+    return losses
+
+
+def settled(network: Detector, batches: Iterable[Sample]) -> Detector:
+    """A copy whose statistics of the batch normalisation are those of some batches, of labelled scans in every arm."""
+    network = deepcopy(network)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.reset_running_stats()
+            module.momentum = None  # the mean over all batches
+    network.train()
+    with torch.no_grad():
+        for views, _ in batches:
+            answer(network, views)
+    return network.eval()
+
+
+def detect(network: Detector, views: Callable[[int], Tensor], count: int) -> list[Found]:
+    """The boxes that a network in evaluation mode finds in views 0 to ``count`` - 1."""
+    every = []
+    with torch.no_grad():
+        for i in range(count):
+            logits, values = answer(network, views(i)[None])
+            every.append(decode(logits[0].sigmoid(), values[0]))
+    return every

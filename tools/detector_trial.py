@@ -1,0 +1,239 @@
+"""Does a detector gain from synthetic scans? Trained on 30 labelled scans of one town, tested on two others.
+
+    python tools/detector_trial.py WORK [--arm real --arm gt_sampling ...] [--seeds 3] [--iterations 1600]
+                                        [--layout-model CHECKPOINT] [--minutes M] [--out TABLE.md]
+
+All arms have the same network, iterations, augmentation (turned, mirrored, scaled) and test. Half of each batch of an
+arm with synthetic scans is synthetic. Each seed has its own 30 scans of the town, the same in every arm. Scans and
+finished trainings are kept in WORK: the same command resumes. docs/research/detectors.md has the protocol.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from detector import pools
+from detector.bev import view
+from detector.classes import CLASSES
+from detector.network import Detector, Sample, collate, detect, sample, settled, train
+from detector.scores import Truth, precisions
+from tqdm import tqdm
+
+from lidar_synth import MixedScans, ObjectBank, Source, load_generator, make_policy
+from lidar_synth.files.disk import write_file
+from lidar_synth.labels.augment import Augmentation, compose, flip_x, flip_y, scale, yaw
+from lidar_synth.mixing import Sources
+from lidar_synth.proof.machine import machine
+from lidar_synth.train.segmentation import endless_batches
+
+LABELLED, TRAIN_TOWN = 30, 7
+TESTED, TEST_TOWNS = 40, (8, 9)
+"""Tested scans of each town."""
+LAYOUT_TOWNS = (20, 21)
+UNBOXED_MODEL = "town-dense"
+BATCH, RATE = 2, 3e-3
+SETTLING = 24
+"""Batches of labelled scans for the statistics of the batch normalisation."""
+PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
+"""Maximum number of objects that GT sampling pastes into a scan."""
+BASE = "gt_sampling"
+"""The arm with which the others are compared."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One of the compared trainings.
+
+    Args:
+        title: its row in the table.
+        budget: the labels that it uses besides the 30 scans.
+        pool: of the synthetic half of each batch, a name of ``Work.pool``; "" for none.
+        labels: the label policy of these scans.
+        pasted: whether objects of the 30 scans are pasted into all scans.
+    """
+
+    title: str
+    budget: str
+    pool: str = ""
+    labels: str = "boxes"
+    pasted: bool = False
+
+
+_MODEL = "the generator's: 6,000 scans of the town of seed 0 with point labels"
+_LAYOUT = "the generator's: 6,000 scans of the town of seed 0 with point labels and boxes; layouts of other towns"
+_TOWN = "boxes of the town scans"
+ARMS = {
+    "real": Arm("labelled scans only", "none"),
+    "gt_sampling": Arm("GT sampling", "none", pasted=True),
+    "unboxed": Arm("unconditional scans with unboxed objects, objects pasted", _MODEL, "unboxed", "mix"),
+    "closed": Arm("unconditional scans without unboxed objects, objects pasted", _MODEL, "closed", "mix"),
+    "layout": Arm("layout scans", _LAYOUT, "layout"),
+    "layout_gt": Arm("layout scans, GT sampling", _LAYOUT, "layout", pasted=True),
+    "town": Arm("town scans of the same layouts (upper bound)", _TOWN, "town"),
+    "town_gt": Arm("town scans of the same layouts, GT sampling (upper bound)", _TOWN, "town", pasted=True),
+}
+
+
+class Work:
+    """The folder of the trial: scans, and results of the trainings.
+
+    Args:
+        folder: where they are kept.
+        iterations: of each training.
+        count: number of synthetic scans of a pool.
+        model: the layout model's checkpoint.
+    """
+
+    def __init__(self, folder: Path, iterations: int, count: int, model: str | None) -> None:
+        self.folder, self.iterations, self.count, self.model = folder, iterations, count, model
+        self.pool = cache(self._pool)
+
+    @property
+    def tag(self) -> str:
+        """Names the layout model in files."""
+        if self.model is None:
+            raise SystemExit("arms with layout scans need --layout-model CHECKPOINT")
+        return load_generator(self.model).hash[:8]
+
+    def labelled(self, seed: int) -> Source:
+        """The labelled scans of a seed."""
+        return pools.streets(self.folder / "pools" / f"labelled-{seed}", TRAIN_TOWN, LABELLED * seed, LABELLED)
+
+    def tested(self) -> list[Source]:
+        """The tested scans of each town."""
+        return [pools.streets(self.folder / "pools" / f"test-{t}", t, 0, TESTED, every_box=True) for t in TEST_TOWNS]
+
+    def _pool(self, name: str) -> Source:
+        folder = self.folder / "pools" / f"{name}-{self.count}"
+        if name == "unboxed":
+            return pools.unconditional(folder, self.count, UNBOXED_MODEL)
+        if name == "closed":
+            return pools.without_unboxed(folder, self.pool("unboxed"))
+        if name == "layout":
+            model = str(self.model)
+            return pools.laid_out(folder.with_name(f"{name}-{self.tag}-{self.count}"), model, self.pool("town"))
+        towns = [folder.with_name(f"town-{t}-{self.count}") for t in LAYOUT_TOWNS]
+        parts = [pools.streets(f, t, 0, self.count // 2) for f, t in zip(towns, LAYOUT_TOWNS, strict=True)]
+        return Sources(*parts)
+
+    def result(self, arm: str, seed: int) -> Path:
+        """The file of a finished training."""
+        key = f"{arm}-{self.tag}" if ARMS[arm].pool == "layout" else arm
+        return self.folder / f"results-{self.iterations}" / f"{key}-{seed}.json"
+
+
+def mixture(arm: Arm, labelled: Source, pool: Source | None, seed: int, count: int) -> MixedScans:
+    """The training set of an arm, of ``count`` samples, as a user of the package makes it."""
+    objects = ObjectBank.from_scans(labelled)
+    there = {name: most for name, most in PASTED.items() if name in objects.boxes.names}
+    options: dict[str, Any] = {"objects": objects, "count": there, "turn": 180.0, "clear": False}
+    steps: list[Augmentation] = [partial(yaw, limit=45), flip_x, flip_y, scale]
+    if arm.pasted:
+        steps.insert(0, make_policy("mix", fields=frozenset({"label", "boxes"}), **options))
+    return MixedScans(
+        labelled, pool, 0.5 if pool is not None else 0, arm.labels,
+        label_options=options if arm.labels == "mix" else None, seed=seed, epoch_size=count, balanced=True,
+        augment=compose(steps), augment_real=True, to_sample=sample, collate=collate,
+        unboxed="keep",  # the pools are baked without unboxed objects, except the one that shows their harm
+    )  # fmt: skip
+
+
+def run(work: Work, name: str, seed: int, test: Callable[[Detector], list[float]]) -> dict[str, Any]:
+    """Train and test one detector."""
+    arm, labelled = ARMS[name], work.labelled(seed)
+    pool = work.pool(arm.pool) if arm.pool else None
+    start = time.process_time()
+    torch.manual_seed(seed)
+    network = Detector()
+    mixed = mixture(arm, labelled, pool, seed, work.iterations * BATCH)
+    losses = train(network, endless_batches(mixed, BATCH), work.iterations, RATE, f"{name} {seed}")
+    seconds = time.process_time() - start
+    base = mixture(ARMS["real"], labelled, None, seed, SETTLING * BATCH)
+    found = test(settled(network, _one_epoch(base)))
+    parts = [round(float(np.mean(part)), 3) for part in np.array_split(losses, 10) if len(part)]
+    return {"arm": name, "seed": seed, "ap": found, "losses": parts, "seconds": round(seconds, 1)}
+
+
+def _one_epoch(mixed: MixedScans) -> Iterator[Sample]:
+    batches = endless_batches(mixed, BATCH)
+    return (next(batches) for _ in range(SETTLING))
+
+
+def make_test(work: Work) -> Callable[[Detector], list[float]]:
+    """The test of a network: average precision of every class on all tested scans."""
+    scans = [source[i] for source in work.tested() for i in range(len(source))]
+    truths = [Truth.of(scan) for scan in tqdm(scans, "tested boxes", unit="scan")]
+    counts = [sum(int(t.wanted[t.classes == c].sum()) for t in truths) for c in range(len(CLASSES))]
+    print(f"{len(scans)} tested scans; boxes: {dict(zip(CLASSES, counts, strict=True))}", flush=True)
+
+    def test(network: Detector) -> list[float]:
+        return precisions(detect(network, lambda i: view(scans[i].points, scans[i].reflectance), len(scans)), truths)
+
+    return test
+
+
+def report(results: Mapping[str, Mapping[int, list[float]]]) -> str:
+    """A Markdown table of the finished trainings: {arm: {seed: AP of every class}}."""
+    names = [*CLASSES, "mean"]
+    lines = [f"| half of each batch, besides the 30 scans | {' | '.join(names)} | mean - GT sampling | seeds |"]
+    lines.append("|---|" + "---:|" * (len(names) + 2))
+    base = {seed: np.mean(ap) for seed, ap in results.get(BASE, {}).items()}
+    for name, found in results.items():
+        table = 100 * np.array([[*ap, np.mean(ap)] for ap in found.values()])
+        paired = [100 * (np.mean(ap) - base[seed]) for seed, ap in found.items() if seed in base]
+        cells = [_spread(column) for column in table.T]
+        difference = _spread(paired, "+") if name != BASE and paired else "-"
+        lines.append(f"| {ARMS[name].title} | {' | '.join(cells)} | {difference} | {len(found)} |")
+    lines += ["", "| | labels used besides those of the 30 scans |", "|---|---|"]
+    return "\n".join([*lines, *(f"| {ARMS[name].title} | {ARMS[name].budget} |" for name in results)])
+
+
+def _spread(values: Any, sign: str = "") -> str:
+    """Mean ± standard deviation over seeds."""
+    spread = f" ± {np.std(values, ddof=1):.1f}" if len(values) > 1 else ""
+    return f"{np.mean(values):{sign}.1f}{spread}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path, help="folder for scans and results")
+    parser.add_argument("--arm", action="append", choices=ARMS, help="by default all; layout arms only with a model")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--iterations", type=int, default=1600)
+    parser.add_argument("--pool", type=int, default=200, help="synthetic scans of each kind")
+    parser.add_argument("--layout-model", metavar="CHECKPOINT")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="no training begins after these")
+    parser.add_argument("--out", type=Path, help="file for the table")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    start = time.monotonic()
+    work = Work(given.work, given.iterations, given.pool, given.layout_model)
+    arms = [n for n in ARMS if (n in given.arm if given.arm else given.layout_model or ARMS[n].pool != "layout")]
+    test: Callable[[Detector], list[float]] | None = None
+    for seed, name in ((seed, name) for seed in range(given.seeds) for name in arms):
+        if (path := work.result(name, seed)).exists() or time.monotonic() - start > 60 * given.minutes:
+            continue
+        test = test or make_test(work)
+        found = run(work, name, seed, test)
+        write_file(path, json.dumps(found).encode())
+        print(f"{name}, seed {seed}: AP {np.round(100 * np.array(found['ap']), 1)}", flush=True)
+    results = {}
+    for name in arms:
+        paths = {seed: work.result(name, seed) for seed in range(given.seeds)}
+        kept = {seed: json.loads(path.read_text())["ap"] for seed, path in paths.items() if path.exists()}
+        results |= {name: kept} if kept else {}
+    text = f"{report(results)}\n\n{given.iterations} iterations of {BATCH}; {machine()}; {time.strftime('%Y-%m-%d')}"
+    print(text)
+    if given.out:
+        given.out.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
