@@ -6,6 +6,7 @@
     channels  all channels of one generated scan
     map       scans generated from one label map
     camera    scans generated from camera images
+    layout    scans generated from layouts, with boxes
     paste     a generated scan before and after the town's objects replaced its own
     sensors   one street as three sensors see it
 
