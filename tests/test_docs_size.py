@@ -50,7 +50,7 @@ LIMITS = {
     "docs/models/town-dense.md": 130,
     "docs/models/town-semantic.md": 190,
     "docs/models/town-camera.md": 190,
-    "docs/models/town-layout.md": 140,
+    "docs/models/town-layout.md": 160,
     "docs/models/skin-pandar64.md": 140,
     "docs/gallery.md": 90,
 }

@@ -159,7 +159,7 @@ def test_the_layout_of_a_scan_shows_what_the_scan_does(town: Any) -> None:
 
     layout, seen = layout_of(town), project(town, town.sensor, ["label"])
     image = layout_image(layout, town.sensor)
-    assert layout.boxes.names == town.boxes.names and abs(layout.ground[0] + 1.73) < 0.3
+    assert set(layout.boxes.names) == set(town.boxes.names) and abs(layout.ground[0] + 1.73) < 0.3
     for name, classes, least in (
         ("ground", ("road", "sidewalk", "terrain", "parking", "other-ground"), 0.85),
         ("building", ("building",), 0.4),
@@ -171,6 +171,14 @@ def test_the_layout_of_a_scan_shows_what_the_scan_does(town: Any) -> None:
         assert np.median(np.abs(depth_of(image) - seen.range)[cells]) < 0.6, name
     boxed = np.isin(seen.label, [TRAIN_ID["car"], TRAIN_ID["truck"], TRAIN_ID["person"]])
     assert (image[0][boxed] >= CODES["Car"]).mean() > 0.9
+
+
+def test_the_layout_of_a_scan_has_the_boxes_within_the_range(town: Any) -> None:
+    inside = town.boxes[np.hypot(*town.boxes.values[:, :2].T) <= 80]
+    assert layout_of(town).boxes.names == inside.names
+    values = inside.values.copy()
+    values[0, :2] = 80.5, 0  # its nearer half is within 80 m
+    assert layout_of(replace(town, boxes=replace(inside, values=values))).boxes.names == inside.names[1:]
 
 
 def test_a_scan_without_labels_has_ground_and_outlines(town: Any) -> None:

@@ -31,7 +31,8 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
 
     Args:
         scan: N points and boxes. Ground and outlines are those of its labels; a scan without labels has the plane of
-            its lowest returns, and outlines of what stands on it.
+            its lowest returns, and outlines of what stands on it. Of the boxes, ``known_boxes`` within the sensor's
+            range are used.
         reach: of the ground, metres; by default the sensor's range.
 
     Raises:
@@ -48,7 +49,9 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
     label = scan.label if scan.label is not None and (scan.label != IGNORE).any() else None
     ground = _plane(_lowest(scan.points) if label is None else scan.points[GROUND[label]], scan.id)
     outlines = list(_unlabelled(scan, ground) if label is None else _labelled(scan.points, label))
-    return Layout(known_boxes(scan.boxes), ground, outlines, reach or scan.sensor.range_max, scan.id)
+    boxes = known_boxes(scan.boxes)
+    boxes = boxes[np.hypot(*boxes.values[:, :2].T) <= scan.sensor.range_max]
+    return Layout(boxes, ground, outlines, reach or scan.sensor.range_max, scan.id)
 
 
 def known_boxes(boxes: Boxes) -> Boxes:
