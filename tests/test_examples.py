@@ -101,7 +101,7 @@ def test_every_new_name_of_the_package_needs_an_example(monkeypatch: pytest.Monk
 def test_every_name_of_the_documents_has_an_example() -> None:
     pages = [ROOT / "README.md", *ROOT.glob("docs/start/*.md"), *ROOT.glob("docs/how-to/**/*.md")]
     named = set().union(*(named_in(page.read_text()) for page in pages))
-    assert {"MixedScans", "load_config", "Taxonomy"} <= named
+    assert {"MixedScans", "load_layout", "Taxonomy"} <= named
     assert named <= {name.rsplit(".", 1)[1] for name in public_names()[2:]}
 
 
