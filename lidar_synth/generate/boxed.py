@@ -30,7 +30,7 @@ def boxes_of(given: Any, count: int) -> list[Boxes] | None:
     each = list(given) if isinstance(given, Sequence) else [given] * count
     if not all(isinstance(one, Scan | Layout) and one.boxes is not None for one in each):
         return None
-    return [one.boxes if isinstance(one, Layout) else known_boxes(one.boxes) for one in each]
+    return [one.boxes if isinstance(one, Layout) else known_boxes(one) for one in each]
 
 
 def with_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:

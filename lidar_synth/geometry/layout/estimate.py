@@ -31,8 +31,7 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
 
     Args:
         scan: N points and boxes. Ground and outlines are those of its labels; a scan without labels has the plane of
-            its lowest returns, and outlines of what stands on it. Of the boxes, ``known_boxes`` within the sensor's
-            range are used.
+            its lowest returns, and outlines of what stands on it. Its boxes are ``known_boxes``.
         reach: of the ground, metres; by default the sensor's range.
 
     Raises:
@@ -49,15 +48,15 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
     label = scan.label if scan.label is not None and (scan.label != IGNORE).any() else None
     ground = _plane(_lowest(scan.points) if label is None else scan.points[GROUND[label]], scan.id)
     outlines = list(_unlabelled(scan, ground) if label is None else _labelled(scan.points, label))
-    boxes = known_boxes(scan.boxes)
-    boxes = boxes[np.hypot(*boxes.values[:, :2].T) <= scan.sensor.range_max]
-    return Layout(boxes, ground, outlines, reach or scan.sensor.range_max, scan.id)
+    return Layout(known_boxes(scan), ground, outlines, reach or scan.sensor.range_max, scan.id)
 
 
-def known_boxes(boxes: Boxes) -> Boxes:
-    """The boxes of known classes; of overlapping ones the first, and none around the sensor."""
-    keep = np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)
-    boxes = boxes[keep]
+def known_boxes(scan: Scan) -> Boxes:
+    """The boxes of a scan with boxes that its layout has: of known classes, within the sensor's range, of overlapping
+    ones the first, and none around the sensor."""
+    assert scan.boxes is not None
+    boxes = scan.boxes[np.hypot(*scan.boxes.values[:, :2].T) <= scan.sensor.range_max]
+    boxes = boxes[np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)]
     later = {j for _, j in overlaps(boxes)}
     return boxes[[i for i in range(len(boxes)) if i not in later]] if later else boxes
 
