@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lidar_synth import Layout, Town, layout_of, load_layout, load_sensor
+from lidar_synth.datasets.classes import BOXED
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.evaluate.layouts import layout_agreement, rays_of_boxes
 from lidar_synth.geometry.layout import CODES, Outline, layout_image
@@ -18,6 +19,7 @@ from lidar_synth.geometry.layout.raster import depth_of
 from lidar_synth.geometry.scan import Boxes
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import turned, widened
+from lidar_synth.labels.objects import LABELS
 
 SMALL = Sensor("small", 64, 1.45, 80.0, rows=16, fov_up=3.0, fov_down=-25.0)
 LASERS = Sensor("lasers", 64, 1.45, 80.0, elevations=tuple(np.linspace(2, -24, 16)), heights=(0.2,) * 16)
@@ -260,6 +262,10 @@ def test_an_invalid_file_is_refused(text: str, tmp_path: Path) -> None:
 def test_an_unknown_class_is_refused() -> None:
     with pytest.raises(DataError, match="boxes of 'Bicycle'; expected classes of Car, Van"):
         Layout(Boxes(np.float32([[9, 0, -1, 1, 1, 1, 0]]), ("Bicycle",)))
+
+
+def test_the_classes_with_boxes_are_those_of_the_boxes_of_detectors() -> None:
+    assert set(BOXED) == set(LABELS.values())
 
 
 def test_touching_boxes_are_accepted_and_stacked_ones_refused() -> None:

@@ -92,13 +92,24 @@ def _matches(
 
 
 def _mean_average_precision(found: Sequence[tuple[float, list[float]]], boxes: int, distances: int) -> float:
-    """Area under precision over recall, where precision is the best at that recall or a higher one."""
-    if not found:
-        return 0.0
-    ordered = sorted(found, key=lambda one: -one[0])
-    areas = []
-    for k in range(distances):
-        hits = np.cumsum([one[1][k] for one in ordered])
-        precision = np.maximum.accumulate((hits / np.arange(1, len(hits) + 1))[::-1])[::-1]
-        areas.append(float((precision * np.diff(hits, prepend=0)).sum() / boxes))
-    return float(np.mean(areas))
+    """Mean over the distances."""
+    confidence: NDArray[np.float64] = np.array([one[0] for one in found], np.float64)
+    hits: NDArray[np.float64] = np.array([one[1] for one in found], np.float64).reshape(-1, distances)
+    return float(np.mean([average_precision(confidence, one, boxes) for one in hits.T]))
+
+
+def average_precision(
+    confidence: NDArray[np.floating], hits: NDArray[np.floating] | NDArray[np.integer], boxes: int
+) -> float:
+    """Area under precision over recall, where precision is the best at that recall or a higher one.
+
+    Args:
+        confidence: (D,) of detections.
+        hits: (D,) 1 for those that match a box, else 0.
+        boxes: number of boxes; without any, NaN.
+    """
+    if not boxes:
+        return float("nan")
+    right = np.cumsum(hits[np.argsort(-confidence, kind="stable")])
+    precision = np.maximum.accumulate((right / np.arange(1, len(right) + 1))[::-1])[::-1]
+    return float((precision * np.diff(right, prepend=0)).sum() / boxes)

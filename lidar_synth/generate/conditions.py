@@ -26,7 +26,7 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.parsing import read_picture
 from lidar_synth.geometry.layout import CHANNELS, CODES, Layout, layout_image, layout_of
-from lidar_synth.geometry.layout.layout import DEPTH_STEP, OUTLINES
+from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -207,9 +207,9 @@ class LayoutImage:
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
         """Without outlines, and with the ground up to a distance that u tells, as most users' files are."""
         code, ground = values[:, :1], CODES["ground"]
-        depth = (256 * values[:, 1:2].float() + values[:, 2:3]) * DEPTH_STEP
+        depth = depths_of(values)[:, None]
         reach = 5 * 16 ** u.to(depth).view(-1, 1, 1, 1)  # 5 to 80 m
-        kept = (code > max(CODES[kind] for kind in OUTLINES)) | ((code == ground) & (depth < reach))
+        kept = (code >= CODES["Car"]) | ((code == ground) & (depth < reach))
         return torch.where(kept, values, 0)
 
 

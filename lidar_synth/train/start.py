@@ -21,7 +21,7 @@ from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.generator import find_model
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.models import build_network, network_class
-from lidar_synth.train.config import Data, Network, Run, TrainConfig
+from lidar_synth.train.config import PARENTS, Data, Network, Run, TrainConfig
 
 
 def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
@@ -168,8 +168,7 @@ def _recordings(data: Data, sensor: Sensor) -> Recordings:
 
 def provenance_of(config: Run) -> dict[str, Any]:
     """What a checkpoint says of its making; the checkpoints that it was made from stand beside, by their hash."""
-    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "held_out"}
-    beside |= {"init", "teacher", "weaker", "codec"}
+    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "held_out", *PARENTS}
     return {
         "data": config.data.describe(),
         "data_licence": config.data.licence,

@@ -14,6 +14,7 @@ from detector.bev import REACH, Found
 from detector.classes import LEAST
 from detector.pools import classes_of, detected, points_in
 from lidar_synth import Boxes, Scan
+from lidar_synth.evaluate.detection import average_precision
 
 OVERLAP = (0.5, 0.25, 0.25)
 """Minimum intersection over union of the footprints of cars, pedestrians and cyclists."""
@@ -70,22 +71,6 @@ def matched(
                 free[fits.argmax()] = False
                 break
     return result
-
-
-def average_precision(scores: NDArray[np.float32], hits: NDArray[np.int64], wanted: int) -> float:
-    """Area under the interpolated curve of precision over recall.
-
-    Args:
-        scores: (D,) of detections.
-        hits: (D,) 1 for right ones.
-        wanted: number of boxes that have to be found.
-    """
-    if not wanted:
-        return float("nan")
-    right = np.cumsum(hits[np.argsort(-scores, kind="stable")])
-    precision = right / np.arange(1, len(right) + 1)
-    best = np.maximum.accumulate(precision[::-1])[::-1]
-    return float((np.diff(right / wanted, prepend=0) * best).sum())
 
 
 def footprint_ious(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:

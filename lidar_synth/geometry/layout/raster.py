@@ -3,6 +3,7 @@
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from lidar_synth.geometry.layout.layout import CHANNELS, CHORD_STEP, CODES, DEPTH_STEP, Layout
 from lidar_synth.geometry.sensor import Sensor
@@ -43,6 +44,11 @@ def depth_of(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(..., H, W) metres of layout images (..., 5, H, W); 0 where nothing is known."""
     high, low = image[..., 1, :, :].astype(np.float32), image[..., 2, :, :].astype(np.float32)
     return np.asarray((high * 256 + low) * np.float32(DEPTH_STEP), np.float32)
+
+
+def depths_of(images: Tensor) -> Tensor:
+    """``depth_of`` for tensors: (B, H, W) metres of layout images (B, 5, H, W) uint8."""
+    return (256 * images[:, 1].float() + images[:, 2]) * DEPTH_STEP
 
 
 def _walls(layout: Layout) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

@@ -8,7 +8,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.layout.layout import CHANNELS, CHORD_STEP, CODES, DEPTH_STEP
+from lidar_synth.geometry.layout.layout import CHANNELS, CHORD_STEP, CODES
+from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.models.convolution import Residual, check_shape, pair, reduced
 from lidar_synth.models.network import Encoder
 
@@ -74,8 +75,7 @@ class LayoutEncoder(Encoder):
         """(B, F, H, W), channels last in memory."""
         dtype = next(self.body.parameters()).dtype
         codes = F.one_hot(image[:, 0].long(), len(CODES)).to(dtype)
-        high, low, chord, along = image[:, 1:].float().unbind(1)
-        depth = (256 * high + low) * DEPTH_STEP
+        depth, chord, along = depths_of(image), image[:, 3].float(), image[:, 4].float()
         known, near = depth > 0, depth.clamp(min=_NEAREST)
         through = (chord > 0) & known
         values = [

@@ -6,12 +6,10 @@ import torch
 from torch import Tensor
 
 from lidar_synth.datasets.classes import BOXED
-from lidar_synth.geometry.layout.layout import CHANNELS, CHORD_STEP, CODES, DEPTH_STEP, OUTLINES
+from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES
+from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.models.surface_codec.blocks import to_patches
-
-_FIRST_BOX = len(OUTLINES) + 2  # the codes of boxes come after "unknown", "ground" and the outlines
-assert CODES["Car"] == _FIRST_BOX and CHANNELS[:4] == ("class", "depth_high", "depth_low", "chord")
 
 
 class Bounds(NamedTuple):
@@ -41,11 +39,10 @@ def bounds_of(layout: Tensor, columns: int, patch: tuple[int, int], codes: int, 
         codes: number of classes.
         normalisation: of the ranges.
     """
-    code, high, low, chord = layout[:, :4].float().unbind(1)
-    boxed, blank = code >= _FIRST_BOX, (code == 0).all(2).all(1)[:, None, None]
-    depth = (256 * high + low) * DEPTH_STEP
+    code, depth, chord = layout[:, 0], depths_of(layout), layout[:, 3] * CHORD_STEP
+    boxed, blank = code >= CODES["Car"], (code == 0).all(2).all(1)[:, None, None]
     near = torch.where(boxed, normalisation.encode(depth), 1.0).masked_fill(blank, -1.0)
-    far = torch.where(boxed, normalisation.encode(depth + chord * CHORD_STEP), -1.0).masked_fill(blank, 1.0)
+    far = torch.where(boxed, normalisation.encode(depth + chord), -1.0).masked_fill(blank, 1.0)
     shape = (*near.shape[:2], columns, -1)
     ranges = torch.stack([near.reshape(shape).amin(3), far.reshape(shape).amax(3)], 1)
     kinds = torch.isin(torch.arange(codes, device=layout.device), torch.tensor(BOXED, device=layout.device))
