@@ -54,7 +54,7 @@ def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
     values = result.values
     assert values["tested_places"] == ["00, place 1", "00, place 2"] and values["pairs"] == 2
     keys = [row["key"] for row in values["arms"]]
-    assert keys == ["real", "longer", "exchange", "town-50", "skin-50", "pretrain", "paste", "together"]
+    assert keys == ["real", "longer", "exchange", "town-50", "skin-50", "pretrain", "pretrain-skin", "paste"]
     for row in values["arms"]:
         assert 0 < row["miou"] < 100 and row["minutes"] > 0 and "5 labelled scans" in row["budget"]
         assert row["interval"] is None  # two places

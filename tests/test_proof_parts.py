@@ -13,6 +13,7 @@ import torch.nn.functional as F
 import yaml
 from conftest import random_scan
 from proofs import SENSOR, Scans, drives, job
+from safetensors.torch import load_file
 from scipy import stats
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
@@ -36,7 +37,7 @@ from lidar_synth.proof.scores import (
     require_labels,
     t_quantile,
 )
-from lidar_synth.proof.trial import reference, turned
+from lidar_synth.proof.trial import pretrain, pretraining_seconds, reference, turned
 
 
 def test_wrapped_padding_is_circular_padding() -> None:
@@ -114,6 +115,22 @@ def test_the_reference_trainer_learns_and_repeats_itself(name: str, tmp_path: Pa
     assert first.losses[-1] < first.losses[0]
     steps = [step for step, _ in first.curve]
     assert steps == sorted(set(steps)) and steps[-1] == 20 and np.array_equal(first.curve[-1][1], first.table)
+
+
+def test_a_shared_pretraining_changes_nothing(tmp_path: Path, one_thread: None) -> None:
+    whole = job("pretrain", tmp_path, iterations=20)
+    pretrain(whole, tmp_path / "start.safetensors")
+    assert 0 < pretraining_seconds(tmp_path / "start.safetensors") < 60
+    other = replace(whole, real=whole.real[::-1], start=tmp_path / "start.safetensors")
+    shared = reference(replace(other, real=whole.real))
+    assert np.array_equal(reference(whole).table, shared.table)
+    assert [step for step, _ in shared.curve] == [15, 18, 20]
+    pretrain(other, tmp_path / "other.safetensors")  # the labelled scans do not matter
+    assert equal(load_file(tmp_path / "other.safetensors"), load_file(tmp_path / "start.safetensors"))
+
+
+def equal(some: dict[str, torch.Tensor], others: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(some[name], others[name]) for name in some | others)
 
 
 def test_turning_keeps_every_return_in_a_cell() -> None:

@@ -11,9 +11,10 @@ def prove(
     out: Annotated[Path, typer.Option(help="folder of the page and of all that is needed to resume")] = Path("proof"),
     minutes: Annotated[float | None, typer.Option(min=1, help="limit of the time [none]")] = None,
     labelled: Annotated[int | None, typer.Option(min=1, help="labelled scans of a training [all, at most 200]")] = None,
-    arm: Annotated[list[str] | None, typer.Option(help="a training to compare, repeatable [all]")] = None,
+    arm: Annotated[list[str] | None, typer.Option(help="a training to compare, repeatable [exchange, pretrain]")]
+    = None,
     ratio: Annotated[list[float] | None, typer.Option(help="share of synthetic scans, repeatable [0.5]")] = None,
-    iterations: Annotated[int, typer.Option(min=10, help="of each training")] = 500,
+    iterations: Annotated[int, typer.Option(min=10, help="of each training")] = 1000,
     batch: Annotated[int, typer.Option(min=1, help="scans of an iteration")] = 4,
     seeds: Annotated[int, typer.Option(min=1, help="repetitions of each training")] = 2,
     places: Annotated[str, typer.Option(help="how places are told apart: auto | drive | pose | stretch")] = "auto",
@@ -39,19 +40,19 @@ def prove(
     \b
     Examples:
       lidar-synth prove SemanticKITTI --labelled 24 --minutes 60
-      lidar-synth prove SemanticKITTI --arm exchange --arm skin --arm pretrain --ratio 0.25 --ratio 0.5 --dry-run
+      lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain --ratio 0.25 --ratio 0.5 --dry-run
     """
     import os
 
     from lidar_synth.formats import open_scans
-    from lidar_synth.proof import ARMS, CommandTrainer, ProofSettings, reference
+    from lidar_synth.proof import CommandTrainer, ProofSettings, reference
     from lidar_synth.proof import prove as run
     from lidar_synth.proof.plan import describe, make_plan
 
     settings = ProofSettings(
-        labelled=labelled, arms=tuple(arm or ARMS), ratios=tuple(ratio or (0.5,)), iterations=iterations, batch=batch,
-        seeds=seeds, places=places, synthetic=synthetic, model=model, classes=classes, only=tuple(only or ()),
-        columns=None if trainer else 512,
+        labelled=labelled, arms=tuple(arm or ProofSettings.arms), ratios=tuple(ratio or (0.5,)), iterations=iterations,
+        batch=batch, seeds=seeds, places=places, synthetic=synthetic, model=model, classes=classes,
+        only=tuple(only or ()), columns=None if trainer else 512,
     )  # fmt: skip
     source = open_scans(root, sensor=sensor, split=split)
     if dry_run:

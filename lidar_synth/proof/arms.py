@@ -1,7 +1,7 @@
 """The trainings that are compared. Each is an *arm*: one or more stages, each with a mixture of its own.
 
-All arms have the same network, batch size, augmentation, optimiser and schedule of the learning rate, and the same
-number of iterations, except where an arm's ``iterations`` says so. To add an arm, add one entry to ``ARMS``.
+All arms have the same network, batch size, augmentation and optimiser, and the same number of iterations, except where
+an arm's ``iterations`` says so. Each stage has one cycle of the learning rate. To add an arm, enter it in ``ARMS``.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,6 +26,7 @@ class Stage:
         pool: of the synthetic scans: a name of ``POOLS``, or ``REAL``.
         labels: their label policy.
         options: of the policy. ``objects: True`` stands for the pasted objects of the pool ``skin``.
+        rate: the highest learning rate, as a share of the trainer's own.
     """
 
     share: float = 1.0
@@ -33,6 +34,7 @@ class Stage:
     pool: str = ""
     labels: str = "generated"
     options: Mapping[str, Any] = field(default_factory=dict)
+    rate: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,15 @@ _TOWN = "labels of the town, which cost nothing"
 GENERATOR_BUDGET = "what the generator was trained on"
 _SKIN = f"{_TOWN}; scans of the training places without labels, to learn the skin"
 
+PRETRAINING = 0.75
+"""Share of the iterations on synthetic scans alone, in the arms that begin with them."""
+
+
+def _then_real(pool: str) -> tuple[Stage, Stage]:
+    """Synthetic scans first, then half real ones, at a lower learning rate."""
+    return Stage(PRETRAINING, 1, pool), Stage(1 - PRETRAINING, 0.5, pool, rate=0.25)
+
+
 ARMS: dict[str, Arm] = {
     "real": Arm("real scans only", lambda ratio: (Stage(),), synthetic=False),
     "longer": Arm("real scans only, twice as long", lambda ratio: (Stage(),), iterations=2, synthetic=False),
@@ -86,19 +97,16 @@ ARMS: dict[str, Arm] = {
         "with generated scans", lambda ratio: (Stage(1, ratio, "generator"),), swept=True,
         budget=GENERATOR_BUDGET,
     ),
-    "pretrain": Arm(
-        "town in your skin first, real last",
-        lambda ratio: (Stage(0.5, 1, "skin"), Stage(0.5)), budget=_SKIN,
+    "pretrain": Arm("the town first, then half your scans", lambda ratio: _then_real("town"), budget=_TOWN),
+    "pretrain-skin": Arm(
+        "the town in your skin first, then half your scans", lambda ratio: _then_real("skin"), budget=_SKIN,
+    ),
+    "pretrain-generator": Arm(
+        "generated scans first, then half your scans", lambda ratio: _then_real("generator"), budget=GENERATOR_BUDGET,
     ),
     "paste": Arm(
         "real scans, rare objects pasted",
         lambda ratio: (Stage(1, 0.5, REAL, "mix", _RARE),), budget=_SKIN,
-    ),
-    "together": Arm(
-        "town first, then exchanged, real last",
-        lambda ratio: (
-            Stage(0.4, 1, "skin"), Stage(0.3, 0.5, "skin", "mix", _EXCHANGE), Stage(0.3, 0.5, REAL, "mix", _EXCHANGE)
-        ), budget=_SKIN,
     ),
 }  # fmt: skip
 """Arms by name."""
@@ -137,6 +145,12 @@ class Row:
     def stages(self) -> tuple[Stage, ...]:
         """The stages of the training."""
         return self.arm.stages(0.5 if self.ratio is None else self.ratio)
+
+    @property
+    def pretraining(self) -> Stage | None:
+        """The first of several stages if it has no real scan, so that all labelled scans can share it."""
+        first, *later = self.stages()
+        return first if later and first.ratio == 1 else None
 
 
 def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:

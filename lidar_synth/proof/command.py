@@ -30,9 +30,10 @@ class CommandTrainer:
 
     ``{job}`` in it stands for a YAML file with ``seed``, ``batch``, ``iterations``; ``real``, the folder of the
     labelled scans; ``stages``, one after the other, each with ``iterations``, ``ratio``, ``synthetic`` (a folder, or
-    null), ``labels`` and ``label_options``, which are arguments of ``MixedScans``; ``held_out``, a folder of scans
-    without labels; and ``predictions``, the folder to write one ``NNNNNN.label`` to for each of them. All folders of
-    scans have SemanticKITTI's layout, and predictions its values: (N,) uint32, one for each point.
+    null), ``labels`` and ``label_options``, which are arguments of ``MixedScans``, and ``rate``, its learning rate as a
+    share of yours; ``held_out``, a folder of scans without labels; and ``predictions``, the folder to write one
+    ``NNNNNN.label`` to for each of them. All folders of scans have SemanticKITTI's layout, and predictions its values:
+    (N,) uint32, one for each point.
 
     Args:
         command: the words of the command, as a shell would split them.
@@ -84,7 +85,7 @@ def describe(job: Job) -> dict[str, Any]:
         stages.append({
             "iterations": iterations, "ratio": float(stage.ratio),
             "synthetic": None if not stage.ratio or folder is None else str(folder.resolve()),
-            "labels": stage.labels, "label_options": options,
+            "labels": stage.labels, "label_options": options, "rate": stage.rate,
         })  # fmt: skip
     home = job.folder.resolve()
     folders = {name: str(home / name) for name in ("real", "held_out", "predictions")}

@@ -94,6 +94,11 @@ class ProofPlan:
         indices = [i for name, members in self.places.items() if name != place for i in members]
         return _spread(indices, MOST_SKIN_SCANS)
 
+    def seconds(self, row: Row) -> float:
+        """Expected seconds of the iterations of a training, without a pretraining that it shares with others."""
+        shared = row.pretraining.share if row.pretraining and self.step else 0
+        return self.settings.iterations * row.arm.iterations * (1 - shared) * self.step
+
     def identity(self) -> dict[str, Any]:
         """Plain values that determine every training, to tell whether one that exists may be kept."""
         own = asdict(self.settings)
@@ -179,7 +184,12 @@ def recordings_of_scans(source: Source, names: Sequence[str]) -> Recordings:
 def expected_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
     """The time that some pairs take, with the pools that they need."""
     settings, pools = plan.settings, {pool for row in plan.rows for pool in row.arm.pools()}
-    seconds = sum(settings.iterations * row.arm.iterations for row in plan.rows) * plan.step * OVERHEAD * len(pairs)
+    seconds = sum(map(plan.seconds, plan.rows)) * len(pairs)
+    for row in plan.rows:
+        if (stage := row.pretraining) is not None:
+            starts = len(pairs) if stage.pool == "skin" else len({seed for _, seed in pairs})
+            seconds += starts * stage.share * settings.iterations * plan.step
+    seconds *= OVERHEAD
     town = settings.synthetic * TOWN_SECONDS
     if "skin" in pools:
         for place in {place for place, _ in pairs}:

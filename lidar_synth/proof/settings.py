@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.proof.arms import ARMS
 
 MOST_LABELLED = 200
 """Labelled scans that are trained on if no number is given."""
@@ -38,13 +37,13 @@ class ProofSettings:
         >>> from lidar_synth import ProofSettings
         >>> settings = ProofSettings(labelled=24, arms=("exchange", "skin", "pretrain"), ratios=(0.25, 0.5))
         >>> settings.iterations, settings.seeds
-        (500, 2)
+        (1000, 2)
     """
 
     labelled: int | None = None
-    arms: tuple[str, ...] = tuple(ARMS)
+    arms: tuple[str, ...] = ("exchange", "pretrain")
     ratios: tuple[float, ...] = (0.5,)
-    iterations: int = 500
+    iterations: int = 1000
     batch: int = 4
     seeds: int = 2
     places: str = "auto"

@@ -3,7 +3,8 @@
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -28,9 +29,10 @@ from lidar_synth.proof.plan import Pair, ProofPlan, make_plan
 from lidar_synth.proof.pools import PoolTask, make_pool, read_objects, read_pool, refuse_leaks, seconds_of, town_seed
 from lidar_synth.proof.settings import ProofSettings
 from lidar_synth.proof.summary import Proof, Results, summarise
-from lidar_synth.proof.trial import Job, Outcome, Trainer, reference, run_trainer
+from lidar_synth.proof.trial import Job, Outcome, Trainer, pretrain, pretraining_seconds, reference, run_trainer
 
-STUDY, RUNS, POOLS, JOBS, PAGE, RESULTS = "study.json", "runs", "pools", "jobs", "index.html", "results.json"
+STUDY, RUNS, POOLS, STARTS, JOBS = "study.json", "runs", "pools", "starts", "jobs"
+PAGE, RESULTS = "index.html", "results.json"
 
 
 @dataclass(frozen=True)
@@ -62,18 +64,28 @@ class Trainings:
         """The folder of a pool: one for all places, but for skins, which must not know the place that is tested on."""
         return self.pools / (kind if kind != "skin" else f"skin-{sorted(self.plan.places).index(place):03d}")
 
+    def start(self, row: Row, pair: Pair) -> Path | None:
+        """The file of the reference network after the row's pretraining, which all places of a seed share."""
+        stage, (place, seed) = row.pretraining, pair
+        if stage is None or self.trainer is not reference:
+            return None
+        return self.out / STARTS / f"{row.key}-{self.pool_folder(stage.pool, place).name}-{seed}.safetensors"
+
+    def pretrain(self, task: tuple[Row, Pair]) -> None:
+        """Write the file of ``start``."""
+        path = self.start(*task)
+        assert path is not None
+        with _one_thread():
+            pretrain(self._job(*task), path)
+
     def __call__(self, task: tuple[Row, Pair]) -> bool:
         """Train and write the outcome, unless the time is over; returns whether it did."""
         row, pair = task
-        expected = self.plan.step * self.plan.settings.iterations * row.arm.iterations
+        expected = self.plan.seconds(row)
         if self.deadline is not None and time.time() + expected > self.deadline:
             return False
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with _one_thread():
             outcome = run_trainer(self.trainer, self._job(row, pair))
-        finally:
-            torch.set_num_threads(threads)
         write_file(self.path(row, pair), json.dumps(to_values(outcome)).encode())
         return True
 
@@ -91,8 +103,19 @@ class Trainings:
             iterations=round(plan.settings.iterations * row.arm.iterations),
             batch=plan.settings.batch, widths=plan.settings.widths, half=plan.half,
             folder=self.out / JOBS / row.key / self.path(row, pair).stem,
-            pool_folders=folders,
+            pool_folders=folders, start=self.start(row, pair),
         )  # fmt: skip
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute on one thread: the trainings share the cores among them."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 _pool = lru_cache(maxsize=2)(read_pool)
@@ -166,6 +189,7 @@ def prove(
     work = Trainings(plan, loaded, out, Path(pools or out / POOLS), trainer, deadline)
     _make_pools(work, source, progress)
     tasks = [(row, pair) for pair in plan.pairs for row in plan.rows if not work.path(row, pair).is_file()]
+    _pretrain(work, tasks, progress)
     with in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
         for _ in tqdm(done, total=len(tasks), desc="trainings", disable=not progress):
             pass
@@ -247,14 +271,23 @@ def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
             pass
 
 
+def _pretrain(work: Trainings, tasks: Sequence[tuple[Row, Pair]], progress: bool) -> None:
+    """Make the pretrained networks that the trainings begin with."""
+    needed = {path: task for task in tasks if (path := work.start(*task)) is not None and not path.is_file()}
+    with in_processes(work.pretrain, list(needed.values()), min(work.plan.jobs, max(1, len(needed)))) as done:
+        for _ in tqdm(done, total=len(needed), desc="pretraining", disable=not progress):
+            pass
+
+
 def _scans(source: Source, indices: Sequence[int]) -> list[Scan]:
     return [source[i] for i in indices]
 
 
 def _preparation(work: Trainings, row: Row) -> float:
-    """Seconds that the pools of an arm took; the mean over places for skins."""
+    """Seconds that the pools and the pretraining of an arm took; the mean over places for skins."""
     total = 0.0
     for kind in row.arm.pools():
         folders = {work.pool_folder(kind, place) for place, _ in work.plan.pairs}
         total += float(np.mean([seconds_of(folder) for folder in folders]))
-    return total
+    starts = {path for pair in work.plan.pairs if (path := work.start(row, pair)) is not None and path.is_file()}
+    return total + (float(np.mean([pretraining_seconds(path) for path in starts])) if starts else 0.0)

@@ -7,18 +7,21 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.evaluate.segmentation import Images, confusion
+from lidar_synth.files.disk import write_file
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -27,12 +30,13 @@ from lidar_synth.labels.augment import mirrored, rotated
 from lidar_synth.mixing import MixedScans
 from lidar_synth.models.segmenter import RangeSegmenter, segmenter_input
 from lidar_synth.proof.arms import REAL, Row, Stage, policy_of
-from lidar_synth.train.segmentation import endless_batches, train_segmenter
+from lidar_synth.train.segmentation import RATE, endless_batches, train_segmenter
 
 LOOKS = 8
 """Points of the curve of a training."""
 SETTLING, SETTLING_LOOK = 16, 4
 """Batches of real scans over which the statistics of the normalisation are taken, after a training and during it."""
+SECONDS = "seconds"
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,7 @@ class Job:
         half: whether the reference network computes in bfloat16.
         folder: where a trainer may write files.
         pool_folders: {name: folder} of the pools, in SemanticKITTI's layout.
+        start: the reference network after the first stage, if ``pretrain`` has written it.
     """
 
     row: Row
@@ -68,6 +73,7 @@ class Job:
     half: bool
     folder: Path
     pool_folders: dict[str, Path] = field(default_factory=dict)
+    start: Path | None = None
 
     def stages(self) -> Iterator[tuple[Stage, int]]:
         """The stages with their iterations, which add up to ``iterations``."""
@@ -143,25 +149,67 @@ def run_trainer(trainer: Trainer, job: Job) -> Outcome:
 
 def reference(job: Job) -> Outcome:
     """Train the package's range-view segmenter on the grid of the scans, and test it on the held-out scans."""
-    torch.manual_seed(job.seed)
-    sensor = job.held_out[0].sensor
-    height = torch.from_numpy(np.sin(sensor.ray_angles()[0]))
-    network = RangeSegmenter(widths=job.widths)
-    held_out = images(job.held_out, sensor)
+    network, height = _fresh(job)
+    held_out = images(job.held_out, job.held_out[0].sensor)
     looks = {round(job.iterations * part / LOOKS) for part in range(1, LOOKS)} - {job.iterations}
-    curve = []
+    curve: list[tuple[int, NDArray[np.int64]]] = []
+    losses: list[float] = []
+
+    def test(batches: int) -> NDArray[np.int64]:
+        return _test(_settled(network, job, height, batches), held_out, height, job.half)
 
     def watch(step: int) -> None:
-        if step in looks:
-            curve.append((step, _test(_settled(network, job, height, SETTLING_LOOK), held_out, height, job.half)))
+        if done + step in looks:
+            curve.append((done + step, test(SETTLING_LOOK)))
 
-    batches = chain.from_iterable(
-        islice(endless_batches(mixed, job.batch), count) for mixed, count in job.mixtures(collate="range")
-    )
-    losses = train_segmenter(network, batches, height, job.iterations, progress=False, half=job.half, watch=watch)
-    table = _test(_settled(network, job, height, SETTLING), held_out, height, job.half)
+    done = 0
+    for (stage, count), (mixed, _) in zip(job.stages(), job.mixtures(collate="range"), strict=True):
+        if job.start is not None and not done:
+            network.load_state_dict(load_file(job.start))
+            curve.append((count, test(SETTLING_LOOK)))
+        else:
+            losses += _learn(network, job, stage, mixed, count, height, watch)
+        done += count
+    table = test(SETTLING)
     parts = [float(np.mean(part)) for part in np.array_split(losses, 10) if len(part)]
     return Outcome(table, [*curve, (job.iterations, table)], parts)
+
+
+def pretrain(job: Job, path: Path) -> None:
+    """Write the reference network after a job's first stage, which has no real scan, and the seconds that it took.
+
+    Raises:
+        FileError: if it cannot be written.
+    """
+    start = time.monotonic()
+    network, height = _fresh(job)
+    stage, count = next(job.stages())
+    mixed, _ = next(job.mixtures(collate="range"))
+    _learn(network, job, stage, mixed, count, height)
+    state = {name: value.contiguous() for name, value in network.state_dict().items()}
+    write_file(path, save(state, {SECONDS: str(time.monotonic() - start)}))
+
+
+def pretraining_seconds(path: Path) -> float:
+    """How long ``pretrain`` took for a file of its own."""
+    with safe_open(path, "pt") as file:
+        return float(file.metadata()[SECONDS])
+
+
+def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:
+    """A network that has learnt nothing, and the (H, W) sine of the elevations of the grid."""
+    torch.manual_seed(job.seed)
+    return RangeSegmenter(widths=job.widths), torch.from_numpy(np.sin(job.held_out[0].sensor.ray_angles()[0]))
+
+
+def _learn(
+    network: RangeSegmenter, job: Job, stage: Stage, mixed: MixedScans, count: int, height: Tensor,
+    watch: Callable[[int], object] | None = None,
+) -> list[float]:  # fmt: skip
+    """Train one stage; returns its losses."""
+    batches = endless_batches(mixed, job.batch)
+    rate = RATE * stage.rate
+    return train_segmenter(network, batches, height, count, rate, progress=False, half=job.half, watch=watch)
 
 
 def images(scans: Sequence[Scan], sensor: Sensor) -> list[Images]:

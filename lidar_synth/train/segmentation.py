@@ -20,6 +20,9 @@ from lidar_synth.evaluate.segmentation import Images
 from lidar_synth.mixing import MixedScans
 from lidar_synth.models.segmenter import segmenter_input
 
+RATE = 4e-3
+"""The highest learning rate."""
+
 
 def endless_batches(mixed: MixedScans, batch: int, workers: int = 0) -> Iterator[Images]:
     """Epoch after epoch of a mixture.
@@ -49,7 +52,7 @@ def train_segmenter(
     batches: Iterable[Images],
     height: Tensor,
     steps: int,
-    rate: float = 4e-3,
+    rate: float = RATE,
     progress: bool = True,
     half: bool = False,
     watch: Callable[[int], object] | None = None,
