@@ -14,6 +14,7 @@ the first seed in 4 steps, with 95 % intervals. WORK keeps students and trajecto
 
 import argparse
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from model_card import REFERENCE, SEED, Comparison, Measured, table, town
+from model_card import BEND, REFERENCE, SEED, Comparison, Measured, table, town
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
@@ -42,8 +43,10 @@ EULER = 24
 BATCH, TRAJECTORIES, CANDIDATES, RATE, WARM_UP, DECAY = 8, 64, 50, 6e-4, 20, 0.99
 WHOLE = ("reflow", "timestep_distillation")
 """Strategies whose targets are whole trajectories."""
-SHOWN = {"bird's-eye JSD": "JSD", "Fréchet": "Frechet", "squared MMD": "squared MMD", "mIoU, %": "mIoU"}
+SHOWN = {"bird's-eye JSD": "BEV Jensen", "Fréchet": "Frechet", "squared MMD": "squared", "mIoU, %": "mIoU"}
 """{column: the beginning of the measure's name}."""
+ERROR = "error, %"
+"""Squared difference of sampled latents and the teacher's of the same noise in 50 steps, over their variance."""
 
 Grid = tuple[float, ...]
 
@@ -85,23 +88,13 @@ class Ablation:
     pairs: int
     iterations: int
 
-    def velocity(self) -> Callable[..., Tensor]:
-        """The teacher's flow, in bfloat16."""
-        network = self.teacher.network
-
-        def flow(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
-            with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-                return network(y, t.expand(len(y))).float()
-
-        return flow
-
     def selected(self) -> dict[int, Grid]:
         """The selected time grid of each number of steps."""
         path = self.work / "grids.pt"
         if not path.exists():
             shape = self.latents.shape[2:]
             selection = select_timesteps(
-                self.velocity(), shape, max(STEPS), CANDIDATES, TRAJECTORIES, "squared_l2", batch=2 * BATCH
+                velocity(self.teacher), shape, max(STEPS), CANDIDATES, TRAJECTORIES, "squared_l2", batch=2 * BATCH
             )
             times = np.asarray(selection.candidates)
             torch.save({n: times[best_path(selection.costs, n)].tolist() for n in STEPS}, path)
@@ -112,7 +105,12 @@ class Ablation:
         teacher integrates from the point between them, and its mean velocity there, the ``slope``."""
         path = self.work / f"parts-{'-'.join(f'{t:g}' for t in grid)}.safetensors"
         if not path.exists():
-            rng, noise, flow, found = np.random.default_rng(7), torch.Generator().manual_seed(7), self.velocity(), []
+            rng, noise, flow, found = (
+                np.random.default_rng(7),
+                torch.Generator().manual_seed(7),
+                velocity(self.teacher),
+                [],
+            )
             intervals = list(pairwise(grid))
             for part in tqdm(range(self.pairs // BATCH), desc=path.stem, unit="batch"):
                 index = part % len(intervals)
@@ -136,7 +134,7 @@ class Ablation:
         return load_file(path)
 
     def _learn(self, student: Student, seed: int, name: str) -> dict[str, Tensor]:
-        parts, network = self.parts(student.parts), load_generator(self.teacher.name).network.train()
+        parts, network = self.parts(student.parts), deepcopy(self.teacher.network).train()
         average = {k: v.clone() for k, v in network.state_dict().items()}
         optimizers, draws = muon(network, RATE, (0.9, 0.98), 0.01), torch.Generator().manual_seed(seed)
         for step in tqdm(range(self.iterations), desc=name, unit="step"):
@@ -155,11 +153,26 @@ class Ablation:
                 average[k].lerp_(value, 1 - min(DECAY, 1 - 1 / (step / 5 + 1)))
         return average
 
-    def scans(self, student: Student, seed: int, count: int) -> list[Scan]:
-        """Scans of a student."""
-        network = load_generator(self.teacher.name).network
+    def generator(self, student: Student, seed: int) -> Generator:
+        """The student in the place of the teacher."""
+        network = deepcopy(self.teacher.network)
         network.load_state_dict(self.train(student, seed))
-        return sample(replace(self.teacher, network=network.eval()), student.grid, count)
+        return replace(self.teacher, network=network.eval())
+
+    def end(self, generator: Generator, grid: Grid) -> Tensor:
+        """(n, C, h, w) the latents that a flow makes of the same noise."""
+        noise = torch.randn(TRAJECTORIES, *self.latents.shape[2:], generator=torch.Generator().manual_seed(5))
+        return torch.cat([solve(velocity(generator), y, grid, "euler", None) for y in noise.split(BATCH)])
+
+
+def velocity(generator: Generator) -> Callable[..., Tensor]:
+    """The flow, without gradients and in bfloat16."""
+
+    def flow(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+            return generator.network(y, t.expand(len(y))).float()
+
+    return flow
 
 
 def supervision(student: Student, parts: dict[str, Tensor], draws: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
@@ -183,13 +196,15 @@ def sample(generator: Generator, grid: Grid, count: int) -> list[Scan]:
     return [replace(scan, sensor=load_sensor("town")) for scan in made]
 
 
-def row(name: str, steps: int, measured: Sequence[Measured]) -> str:
+def row(name: str, steps: int, measured: Sequence[Measured], errors: Sequence[float]) -> str:
     """Means and standard deviations over the seeds."""
+    columns = [[next(s.value for s in one.scores if s.metric.startswith(start)) for one in measured]
+               for start in SHOWN.values()]  # fmt: skip
+    columns += [[one.classes[BEND] for one in measured], list(errors)]
     cells = []
-    for start in SHOWN.values():
-        values = [next(s.value for s in one.scores if s.metric.startswith(start)) for one in measured]
+    for values in columns:
         spread = f" ± {np.std(values, ddof=1):.2g}" if len(values) > 1 else ""
-        cells.append(f"{np.mean(values):.4g}{spread}")
+        cells.append(f"{np.mean(values):.3g}{spread}")
     return f"| {name} | {steps} | {' | '.join(cells)} |"
 
 
@@ -214,18 +229,21 @@ def main() -> None:
             ablation.train(student, seed)
     real, judge = town(REFERENCE, given.count), load_judge()
     plain, exact = Comparison(real, judge), Comparison(real, judge, given.intervals)
-    lines = [f"| strategy | steps | {' | '.join(SHOWN)} |", f"|---|---:|{'---:|' * len(SHOWN)}"]
-    kept = []
-    for steps in (50, *STEPS):
-        scans = sample(teacher, tuple(uniform_grid(steps)), given.count)
-        lines.append(row("teacher", steps, [plain.measure("teacher", scans)]))
-    for student in every:
-        sets = [ablation.scans(student, seed, given.count) for seed in range(given.seeds)]
-        steps = len(student.grid) - 1
-        lines.append(row(student.strategy, steps, [plain.measure(student.strategy, scans) for scans in sets]))
-        print(lines[-1], flush=True)
+    columns = (*SHOWN, BEND, ERROR)
+    lines = [f"| strategy | steps | {' | '.join(columns)} |", f"|---|---:|{'---:|' * len(columns)}"]
+    kept, whole = [], ablation.end(teacher, uniform_grid(50))
+
+    def add(name: str, generators: Sequence[Generator], grid: Grid) -> None:
+        steps, sets = len(grid) - 1, [sample(generator, grid, given.count) for generator in generators]
+        errors = [100 * float((ablation.end(g, grid) - whole).square().mean() / whole.var()) for g in generators]
+        lines.append(row(name, steps, [plain.measure(name, scans) for scans in sets], errors))
         if steps == max(STEPS):
-            kept.append(exact.measure(student.strategy, sets[0]))
+            kept.append(exact.measure(name, sets[0]))
+
+    for steps in (50, *STEPS):
+        add("teacher", [teacher], uniform_grid(steps))
+    for student in every:
+        add(student.strategy, [ablation.generator(student, seed) for seed in range(given.seeds)], student.grid)
     print("\n".join(lines), f"\n\nSeed 0, {max(STEPS)} steps:\n\n{table(kept)}")
 
 
