@@ -1,7 +1,7 @@
 """Does a layout model do what its layouts say? Figures and images of unseen layouts.
 
     python tools/layout_quality.py NAME=MODEL[:STEPS] ... [--count 64] [--seed 1] [--guidance 1] [--picture OUT.png]
-                                   [--dump OUT.json]
+                                   [--dump OUT.json] [--intervals 200]
 
 Layouts are those of scans of a town that no model was trained on, each from another stretch of road. The first row is
 the town's own scans: boxes are larger than objects, so that some of their rays return from behind. Unconditional and
@@ -72,13 +72,14 @@ def main() -> None:
     parser.add_argument("--guidance", type=float, default=1.0, help="of layout models")
     parser.add_argument("--distances", action="store_true", help="compare the sets of scans, too (slow)")
     parser.add_argument("--picture", type=Path, help="PNG of the first model's scans")
+    parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
     parser.add_argument("--dump", type=Path, help="JSON of the counts")
     given = parser.parse_args()
 
     town = Town(given.seed, "hdl64e_lasers", given.count * STRETCH_FRAMES, interval=2.0, motion=False)
     real = [town[i * STRETCH_FRAMES] for i in tqdm(range(given.count), desc="town", unit="scan")]
     layouts = [layout_of(scan) for scan in real]
-    comparison = Comparison(real, load_judge()) if given.distances else None
+    comparison = Comparison(real, load_judge(), given.intervals) if given.distances else None
     counts: dict[str, Any] = {"the town's own scans": layout_agreement(real, layouts, real)}
     distances: list[Measured] = []
     for i, text in enumerate(given.models):
