@@ -22,27 +22,40 @@ from lidar_synth.geometry.scan import Boxes, Scan
 
 CLASSES = ("Pedestrian", "Cyclist", "Car", "Van", "Truck", "Person_sitting", "Tram", "Misc")
 """The classes of ``KittiDataset``, in its order."""
+ORDERS = ("uniform", "sequential")
 
 
-def semantic_kitti_list(root: str | Path, out: str | Path, split: str = "train") -> Path:
+def semantic_kitti_list(
+    root: str | Path, out: str | Path, split: str = "train", share: float = 1.0, order: str = "uniform"
+) -> Path:
     """Write the list of a SemanticKITTI folder; its paths are relative to ``root``.
 
     Args:
         root: the folder that holds ``sequences``.
         out: the list's file, ``.json`` or ``.pkl``.
         split: ``train`` or ``val``.
+        share: of the scans of each sequence, above 0 and up to 1; at least one scan.
+        order: which scans these are: ``uniform``, evenly spread, as in LaserMix (Kong et al., CVPR 2023), or
+            ``sequential``, the first ones, so that most places are never seen.
 
     Raises:
-        ConfigError: on another name of ``out``.
+        ConfigError: on another name of ``out``, share or order.
         DataError, FileError: if the scans cannot be found, or the list cannot be written.
     """
-    scans = SemanticKITTI(root, split)
+    if not 0 < share <= 1:
+        raise ConfigError(f"share {share}", "a number above 0 and up to 1, such as 0.1")
+    if order not in ORDERS:
+        raise ConfigError(f"order {order!r}", " or ".join(ORDERS))
+    names = [name.split("/") for name in SemanticKITTI(root, split).ids]
     entries = []
-    for number, (sequence, frame) in enumerate(name.split("/") for name in scans.ids):
-        base = f"sequences/{sequence}"
-        entry: dict[str, Any] = {"sample_idx": number, "sample_id": f"{sequence}{frame}"}
-        entry["lidar_points"] = {"lidar_path": f"{base}/velodyne/{frame}.bin", "num_pts_feats": 4}
-        entries.append(entry | {"pts_semantic_mask_path": f"{base}/labels/{frame}.label"})
+    for sequence in dict.fromkeys(sequence for sequence, _ in names):
+        frames = [frame for other, frame in names if other == sequence]
+        count, base = max(1, round(share * len(frames))), f"sequences/{sequence}"
+        chosen = range(count) if order == "sequential" else np.arange(count) * len(frames) // count
+        for frame in (frames[i] for i in chosen):
+            entry: dict[str, Any] = {"sample_idx": len(entries), "sample_id": f"{sequence}{frame}"}
+            entry["lidar_points"] = {"lidar_path": f"{base}/velodyne/{frame}.bin", "num_pts_feats": 4}
+            entries.append(entry | {"pts_semantic_mask_path": f"{base}/labels/{frame}.label"})
     return write_list(out, "SemanticKITTI", entries, {})
 
 

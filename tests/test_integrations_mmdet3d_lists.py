@@ -134,6 +134,22 @@ def test_a_lists_file_is_what_its_name_says(tmp_path: Path, make: Any) -> None:
         make(root, tmp_path / "list.txt")
 
 
+def test_a_share_of_semantic_kitti_is_spread_or_at_the_beginning_of_each_sequence(tmp_path: Path) -> None:
+    root = semantic_kitti(tmp_path / "sk", 10)
+
+    def frames(**options: Any) -> list[str]:
+        entries = json.loads(semantic_kitti_list(root, tmp_path / "list.json", **options).read_text())["data_list"]
+        assert [e["sample_idx"] for e in entries] == list(range(len(entries)))
+        return [e["sample_id"][-1] for e in entries]
+
+    assert frames() == frames(order="sequential") == list("0123456789")
+    assert frames(share=0.3) == list("036") and frames(share=0.3, order="sequential") == list("012")
+    assert frames(share=0.01) == frames(share=0.01, order="sequential") == ["0"]
+    for wrong in ({"share": 0}, {"share": 1.5}, {"order": "random"}):
+        with pytest.raises(ConfigError, match="share|order 'random'; expected uniform or sequential"):
+            frames(**wrong)
+
+
 def test_two_runs_that_share_a_list_have_their_own_epochs(scans: Path, tmp_path: Path) -> None:
     real = semantic_kitti_list(semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json")
     write_infos(tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk")
