@@ -14,6 +14,7 @@ sys.path.append(str(ROOT / "tools"))
 
 from detector.bev import CELL, CHANNELS, REACH, SLICES, Found, decode, targets, view
 from detector.scores import Truth, average_precision, footprint_ious, matched, precisions
+from streets import street
 
 from lidar_synth import Boxes, Scan, load_sensor
 
@@ -163,6 +164,17 @@ def test_a_trial_from_scans_to_table(
     monkeypatch.setattr(trial, "run", None)  # a second run trains nothing
     trial.main()
     assert "| GT sampling |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("arm", "shares"), [("layout_first", [8, 8, 8, 4]), ("layout_gt", [16])])
+def test_synthetic_scans_come_first_or_in_half_of_each_batch(trial: ModuleType, arm: str, shares: list[int]) -> None:
+    labelled, pool = [street(i) for i in range(2)], [street(10 + i) for i in range(2)]
+    mixed = trial.mixture(trial.ARMS[arm], labelled, pool, 0, 32)
+    found = []
+    for epoch in range(len(shares)):
+        mixed.set_epoch(epoch)
+        found.append(sum(mixed.domain(i) for i in range(len(mixed))))
+    assert found == shares
 
 
 def test_layout_arms_need_a_model(trial: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

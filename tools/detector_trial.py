@@ -39,6 +39,8 @@ TESTED, TEST_TOWNS = 40, (8, 9)
 LAYOUT_TOWNS = (20, 21)
 UNBOXED_MODEL = "town-dense"
 BATCH, RATE = 2, 3e-3
+PHASES = 4
+"""Epochs of a training, of which an arm with synthetic scans first has them alone in all but the last."""
 SETTLING = 24
 """Batches of labelled scans for the statistics of the batch normalisation."""
 PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
@@ -57,6 +59,7 @@ class Arm:
         pool: of the synthetic half of each batch, a name of ``Work.pool``; "" for none.
         labels: the label policy of these scans.
         pasted: whether objects of the 30 scans are pasted into all scans.
+        first: whether the first three quarters of the training have synthetic scans alone.
     """
 
     title: str
@@ -64,6 +67,7 @@ class Arm:
     pool: str = ""
     labels: str = "boxes"
     pasted: bool = False
+    first: bool = False
 
 
 _MODEL = "the generator's: 6,000 scans of the town of seed 0 with point labels"
@@ -76,8 +80,10 @@ ARMS = {
     "closed": Arm("unconditional scans without unboxed objects, objects pasted", _MODEL, "closed", "mix"),
     "layout": Arm("layout scans", _LAYOUT, "layout"),
     "layout_gt": Arm("layout scans, GT sampling", _LAYOUT, "layout", pasted=True),
+    "layout_first": Arm("layout scans first, GT sampling", _LAYOUT, "layout", pasted=True, first=True),
     "town": Arm("town scans of the same layouts (upper bound)", _TOWN, "town"),
     "town_gt": Arm("town scans of the same layouts, GT sampling (upper bound)", _TOWN, "town", pasted=True),
+    "town_first": Arm("these first, GT sampling (upper bound)", _TOWN, "town", pasted=True, first=True),
 }
 
 
@@ -137,9 +143,11 @@ def mixture(arm: Arm, labelled: Source, pool: Source | None, seed: int, count: i
     steps: list[Augmentation] = [partial(yaw, limit=45), flip_x, flip_y, scale]
     if arm.pasted:
         steps.insert(0, make_policy("mix", fields=frozenset({"label", "boxes"}), **options))
+    share = {0: 1.0, PHASES - 1: 0.5} if arm.first else 0.5
     return MixedScans(
-        labelled, pool, 0.5 if pool is not None else 0, arm.labels,
-        label_options=options if arm.labels == "mix" else None, seed=seed, epoch_size=count, balanced=True,
+        labelled, pool, share if pool is not None else 0, arm.labels,
+        label_options=options if arm.labels == "mix" else None, seed=seed, balanced=True,
+        epoch_size=count // PHASES if arm.first else count,
         augment=compose(steps), augment_real=True, to_sample=sample, collate=collate,
         unboxed="keep",  # the pools are baked without unboxed objects, except the one that shows their harm
     )  # fmt: skip
