@@ -55,8 +55,8 @@ def what_was_done(values: Values) -> str:
     return (
         f"The same small network was trained in {len(values['arms'])} ways on the same {values['labelled']} labelled "
         f"scans, and tested on places that it had not seen: each of {len(values['tested_places'])} places was left out "
-        f"in turn, with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have the same iterations, "
-        "augmentation and schedule, unless the table says otherwise. mIoU is the mean over classes of the share of "
+        f"in turn, with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have the same iterations "
+        "and augmentation, unless the table says otherwise. mIoU is the mean over classes of the share of "
         "correctly labelled returns (intersection over union)."
     )
 
