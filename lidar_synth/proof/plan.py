@@ -35,7 +35,7 @@ from lidar_synth.train.segmentation import train_segmenter
 Pair = tuple[str, int]
 """The place that is left out, and the seed."""
 
-FORMAT = "lidar-synth-proof/1"
+FORMAT = "lidar-synth-proof/2"
 TOWN_SECONDS, SKIN_SECONDS, GENERATOR_SECONDS = 0.5, 1.5, 1.0
 """Processor time for a scan of the town, a scan that a skin is learnt from, and a generated scan."""
 OVERHEAD = 1.3
