@@ -47,7 +47,7 @@ def semantic_kitti_list(
     if order not in ORDERS:
         raise ConfigError(f"order {order!r}", " or ".join(ORDERS))
     names = [name.split("/") for name in SemanticKITTI(root, split).ids]
-    entries = []
+    entries: list[dict[str, Any]] = []
     for sequence in dict.fromkeys(sequence for sequence, _ in names):
         frames = [frame for other, frame in names if other == sequence]
         count, base = max(1, round(share * len(frames))), f"sequences/{sequence}"
