@@ -134,7 +134,7 @@ class Ablation:
         return load_file(path)
 
     def _learn(self, student: Student, seed: int, name: str) -> dict[str, Tensor]:
-        parts, network = self.parts(student.parts), deepcopy(self.teacher.network).train()
+        parts, network = self.parts(student.parts), deepcopy(self.teacher.network).train().requires_grad_(True)
         average = {k: v.clone() for k, v in network.state_dict().items()}
         optimizers, draws = muon(network, RATE, (0.9, 0.98), 0.01), torch.Generator().manual_seed(seed)
         for step in tqdm(range(self.iterations), desc=name, unit="step"):
@@ -186,7 +186,7 @@ def supervision(student: Student, parts: dict[str, Tensor], draws: torch.Generat
     elif student.strategy not in WHOLE:  # u selects the interval
         u = (parts["interval"][picks] + u) / (len(student.grid) - 1)
     example = STRATEGIES[student.strategy](lambda y, t, c: slope, y0, y1, u, student.grid, 1, None)
-    return example.y, example.t, example.v
+    return example.y, example.t, example.velocity
 
 
 def sample(generator: Generator, grid: Grid, count: int) -> list[Scan]:
