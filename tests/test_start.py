@@ -3,13 +3,14 @@
 from pathlib import Path
 
 import pytest
+import torch
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import load_checkpoint
 from lidar_synth.generate.generator import find_model
-from lidar_synth.train import TrainConfig, load_config, run
+from lidar_synth.train import TrainConfig, load_config, precision, run
 from lidar_synth.train.start import start_networks
 
 
@@ -22,18 +23,34 @@ def test_a_shipped_model_is_a_start_by_its_name(monkeypatch: pytest.MonkeyPatch,
         start_networks(load_config(TrainConfig, "town_teacher", ["init=towns", "codec=null"]))
 
 
+def config(folder: Path, chosen: str) -> TrainConfig:
+    short = ["recipe.iterations=2", "recipe.batch=1", "data.town=2", "samples.every=0"]
+    return load_config(TrainConfig, "town_tiny", [*short, f"output={folder}", f"precision={chosen}"])
+
+
+@pytest.fixture(params=[True, False], ids=["faster in bfloat16", "slower in bfloat16"])
+def faster(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether the processor is faster in bfloat16."""
+    monkeypatch.setattr(precision, "faster_in_bfloat16", lambda: request.param)
+    return request.param
+
+
+@pytest.mark.skipif(torch.cuda.is_available() or torch.backends.mps.is_available(), reason="a GPU has bfloat16")
+def test_bfloat16_is_for_processors_that_are_faster_with_it(faster: bool) -> None:
+    assert precision.computed("bf16") == ("bf16" if faster else "no")
+    assert precision.computed("no") == "no"
+
+
 @pytest.mark.slow
-def test_runs_of_one_process_may_differ_in_precision(tmp_path: Path) -> None:
-    short = ["recipe.iterations=1", "recipe.batch=1", "data.town=2", "samples.every=0"]
-
-    def config(name: str, precision: str) -> TrainConfig:
-        return load_config(TrainConfig, "town_tiny", [*short, f"output={tmp_path / name}", f"precision={precision}"])
-
-    for precision in ("bf16", "no"):
-        assert run(config(precision, precision)).exists()
+def test_runs_of_one_process_may_differ_in_precision(faster: bool, tmp_path: Path) -> None:
+    made = {name: load_checkpoint(run(config(tmp_path / name, name))) for name in ("bf16", "no")}
+    weights = [dict(checkpoint.networks["velocity"].named_parameters()) for checkpoint in made.values()]
+    same = all(torch.equal(weights[0][name], value) for name, value in weights[1].items())
+    assert same is not faster, "the same weights where both were trained in float32"
     AcceleratorState._reset_state()
     mine = Accelerator(mixed_precision="no")  # the caller's own stays as it is
-    with pytest.raises(ConfigError, match="precision=bf16, where this process has set up Accelerate with 'no'"):
-        run(config("refused", "bf16"))
-    assert run(config("same", "no")).exists() and mine.mixed_precision == "no"
+    if faster:
+        with pytest.raises(ConfigError, match="precision=bf16, where this process has set up Accelerate with 'no'"):
+            run(config(tmp_path / "refused", "bf16"))
+    assert run(config(tmp_path / "same", "no")).exists() and mine.mixed_precision == "no"
     AcceleratorState._reset_state()

@@ -36,6 +36,7 @@ from lidar_synth.flow.timesteps import best_path, select_timesteps
 from lidar_synth.generate.generator import Generator, load_generator
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.train.optimizers import muon
+from lidar_synth.train.precision import faster_in_bfloat16
 
 STEPS = (4, 2, 1)
 EULER = 24
@@ -139,7 +140,7 @@ class Ablation:
         optimizers, draws = muon(network, RATE, (0.9, 0.98), 0.01), torch.Generator().manual_seed(seed)
         for step in tqdm(range(self.iterations), desc=name, unit="step"):
             y, t, v = supervision(student, parts, draws)
-            with torch.autocast("cpu", torch.bfloat16):
+            with torch.autocast("cpu", torch.bfloat16, enabled=faster_in_bfloat16()):
                 predicted = network(y, t)
             (predicted.float() - v).square().mean().backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -166,10 +167,10 @@ class Ablation:
 
 
 def velocity(generator: Generator) -> Callable[..., Tensor]:
-    """The flow, without gradients and in bfloat16."""
+    """The flow, without gradients."""
 
     def flow(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=faster_in_bfloat16()):
             return generator.network(y, t.expand(len(y))).float()
 
     return flow

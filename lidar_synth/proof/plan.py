@@ -30,6 +30,7 @@ from lidar_synth.proof.places import Places, choose, find_places, names_of
 from lidar_synth.proof.pools import MOST_SKIN_SCANS, SKIN_STREETS
 from lidar_synth.proof.scores import GROUPS, Groups, groups_of, require_labels
 from lidar_synth.proof.settings import MOST_LABELLED, ProofSettings
+from lidar_synth.train.precision import faster_in_bfloat16
 from lidar_synth.train.segmentation import train_segmenter
 
 Pair = tuple[str, int]
@@ -281,16 +282,11 @@ def _step(scans: list[Scan], settings: ProofSettings, half: bool | None) -> tupl
     height = torch.from_numpy(np.sin(sensor.ray_angles()[0]))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    work, seconds = {}, {}
-    for precision in (True, False) if half is None else (half,):
-        network = RangeSegmenter(widths=settings.widths)
-        times: list[tuple[float, float]] = []
-
-        def watch(step: int, times: list[tuple[float, float]] = times) -> None:
-            times.append((time.process_time(), time.perf_counter()))
-
-        train_segmenter(network, [batch] * 4, height, 4, progress=False, half=precision, watch=watch)
-        work[precision], seconds[precision] = np.diff(times, axis=0).min(0).tolist()
+    half = faster_in_bfloat16() if half is None else half
+    times: list[float] = []
+    train_segmenter(
+        RangeSegmenter(widths=settings.widths), [batch] * 4, height, 4, progress=False, half=half,
+        watch=lambda step: times.append(time.perf_counter()),
+    )  # fmt: skip
     torch.set_num_threads(threads)
-    best = min(work, key=lambda precision: work[precision])  # other programs of the machine do not change this
-    return best, seconds[best]
+    return half, float(np.diff(times).min())

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
+from torch.optim.swa_utils import update_bn
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
@@ -233,17 +234,12 @@ def _settled(network: RangeSegmenter, job: Job, height: Tensor, batches: int) ->
 
     Those of the training are of real and synthetic scans together, and the test has only real ones.
     """
-    network = deepcopy(network)
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.reset_running_stats()
-            module.momentum = None
-    network.train()
     mixed = MixedScans(
         list(job.real), ratio=0, seed=job.seed, epoch_size=SETTLING * job.batch, augment=turned, augment_real=True,
         collate="range",
     )  # fmt: skip
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=job.half):
-        for batch in islice(endless_batches(mixed, job.batch), batches):
-            network(segmenter_input(batch["range"], batch["reflectance"], height))
+    some = islice(endless_batches(mixed, job.batch), batches)
+    network = deepcopy(network)
+    with torch.autocast("cpu", torch.bfloat16, enabled=job.half):
+        update_bn((segmenter_input(batch["range"], batch["reflectance"], height) for batch in some), network)
     return network.eval()

@@ -36,6 +36,7 @@ from lidar_synth.train.data import Batches
 from lidar_synth.train.held_out import Watch, open_watch
 from lidar_synth.train.loop import Record, steps
 from lidar_synth.train.plan import TrainingPlan, make_plan, open_data
+from lidar_synth.train.precision import computed
 from lidar_synth.train.resume import check_parents, check_resumed
 from lidar_synth.train.state import STATE, Training
 from lidar_synth.viz import write_view
@@ -103,14 +104,14 @@ def _accelerator(config: Run) -> Iterator["Accelerator"]:
         hint = "pip install 'lidar_synth[train]'"
         raise LibraryError("Accelerate is not installed", "the extra 'train'", hint) from error
 
-    by_caller = is_initialized()
-    if by_caller and AcceleratorState().mixed_precision != config.precision:
+    by_caller, precision = is_initialized(), computed(config.precision)
+    if by_caller and AcceleratorState().mixed_precision not in (config.precision, precision):
         given = f"precision={config.precision}, where this process has set up Accelerate with"
         raise ConfigError(f"{given} {AcceleratorState().mixed_precision!r}", "the same precision, or a new process")
     # Without cpu=True, Accelerate treats the processes of torchrun on a machine without GPU as separate runs.
     gpu = torch.cuda.is_available() or torch.xpu.is_available() or torch.backends.mps.is_available()
     try:
-        yield Accelerator(mixed_precision=config.precision, cpu="LOCAL_RANK" in os.environ and not gpu)
+        yield Accelerator(mixed_precision=precision, cpu="LOCAL_RANK" in os.environ and not gpu)
     finally:
         if not by_caller:
             AcceleratorState._reset_state()

@@ -8,12 +8,14 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.optim.swa_utils import update_bn
 from tqdm import tqdm
 
 from detector.bev import CHANNELS, REGRESSED, Found, Target, decode, targets, view
 from detector.classes import CLASSES
 from detector.pools import classes_of, detected
 from lidar_synth import Scan
+from lidar_synth.train.precision import faster_in_bfloat16
 
 PIXEL = 0.8
 """Side of a pixel of the output, metres."""
@@ -74,11 +76,19 @@ class Detector(nn.Module):
 
 
 def answer(network: nn.Module, views: Tensor) -> tuple[Tensor, Tensor]:
-    """The network on views (B, 2n, 2n, CHANNELS) uint8, in bfloat16. The first layer is normalised, so that the scale
-    of its input does not matter."""
-    with torch.autocast("cpu", torch.bfloat16):
-        logits, values = network(views.to(torch.bfloat16).permute(0, 3, 1, 2))
+    """The network on views (B, 2n, 2n, CHANNELS) uint8. The first layer is normalised, so that the scale of its input
+    does not matter."""
+    with _precision():
+        logits, values = network(_input(views))
     return logits, values
+
+
+def _input(views: Tensor) -> Tensor:
+    return views.to(torch.bfloat16 if faster_in_bfloat16() else torch.float32).permute(0, 3, 1, 2)
+
+
+def _precision() -> torch.autocast:
+    return torch.autocast("cpu", torch.bfloat16, enabled=faster_in_bfloat16())
 
 
 def loss_of(logits: Tensor, values: Tensor, target: Target) -> Tensor:
@@ -113,14 +123,8 @@ def train(network: Detector, batches: Iterable[Sample], iterations: int, rate: f
 def settled(network: Detector, batches: Iterable[Sample]) -> Detector:
     """A copy whose statistics of the batch normalisation are those of some batches, of labelled scans in every arm."""
     network = deepcopy(network)
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.reset_running_stats()
-            module.momentum = None  # the mean over all batches
-    network.train()
-    with torch.no_grad():
-        for views, _ in batches:
-            answer(network, views)
+    with _precision():
+        update_bn((_input(views) for views, _ in batches), network)
     return network.eval()
 
 

@@ -117,7 +117,7 @@ class Run(Section):
         data: the scans.
         recipe: the optimisation.
         seed: seed of the order of the data, the noise and the timesteps.
-        precision: "no" = float32, or "bf16".
+        precision: "no" = float32; "bf16" = bfloat16, except on a processor that is slower in it than in float32.
         compile: whether to use ``torch.compile``.
         gradient_checkpointing: whether to save memory at the cost of time.
         save_every: iterations between two saves.
