@@ -1,5 +1,6 @@
 """The parts of ``prove``: places, arms, scores and intervals, the plan, a trainer as a command, the page."""
 
+import re
 import shlex
 import sys
 from collections import Counter
@@ -24,10 +25,11 @@ from lidar_synth.labels.exchange import thinned
 from lidar_synth.models.segmenter import CircularConv, _Wrapped
 from lidar_synth.proof import ARMS, CommandTrainer, ProofSettings
 from lidar_synth.proof.arms import rows
+from lidar_synth.proof.budget import expected_minutes, within
 from lidar_synth.proof.command import describe
 from lidar_synth.proof.drawing import ticks
 from lidar_synth.proof.places import APART, SPLITS, choose, clusters, find_places
-from lidar_synth.proof.plan import expected_minutes, make_plan
+from lidar_synth.proof.planning import make_plan
 from lidar_synth.proof.scores import (
     FEWEST_PLACES,
     GROUPS,
@@ -205,16 +207,20 @@ def test_a_plan_is_paired_and_tests_on_places_left_out() -> None:
 
 
 def test_a_plan_keeps_to_its_minutes_by_whole_pairs_and_places_come_before_seeds() -> None:
-    whole, _ = make_plan(drives(4, 5), SMALL, None, 1)
+    whole, _ = make_plan(drives(4, 5), replace(SMALL, iterations=100), None, 1)
     plan = replace(whole, step=6.0)
-    from lidar_synth.proof.plan import _within
-
     minutes = expected_minutes(plan, plan.pairs[:3]) + 0.01
-    short = _within(plan, minutes)
+    short = within(plan, minutes)
     assert short.pairs == plan.pairs[:3] and short.minutes <= minutes
     assert {seed for _, seed in plan.pairs[:4]} == {0}
-    with pytest.raises(ConfigError, match="1 of at least 2 places can be tested; expected about"):
-        _within(plan, expected_minutes(plan, plan.pairs[:1]) + 0.01)
+    few = expected_minutes(plan, plan.pairs[:1]) + 0.01
+    with pytest.raises(ConfigError, match="1 of at least 2 places can be tested; expected about") as refused:
+        within(plan, few)
+    [iterations] = re.findall(r"--iterations (\d+)", str(refused.value))
+    fewer = replace(plan, settings=replace(plan.settings, iterations=int(iterations)))
+    assert within(fewer, few).pairs == plan.pairs[:2]
+    with pytest.raises(ConfigError, match=r"fewer arms \(--arm\)\.$"):
+        within(plan, 0.001)
 
 
 def scans_with(**changes: object) -> Scans:

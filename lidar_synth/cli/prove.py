@@ -47,7 +47,8 @@ def prove(
     from lidar_synth.formats import open_scans
     from lidar_synth.proof import CommandTrainer, ProofSettings, reference
     from lidar_synth.proof import prove as run
-    from lidar_synth.proof.plan import describe, make_plan
+    from lidar_synth.proof.plan import describe
+    from lidar_synth.proof.planning import make_plan
 
     settings = ProofSettings(
         labelled=labelled, arms=tuple(arm or ProofSettings.arms), ratios=tuple(ratio or (0.5,)), iterations=iterations,

@@ -162,3 +162,9 @@ def choose(places: Places, without: str, count: int | None, rng: np.random.Gener
     order = [piles[i] for i in rng.permutation(len(piles))]
     dealt = [pile[n] for n in range(max(map(len, order))) for pile in order if n < len(pile)]
     return sorted(dealt[:count])
+
+
+def spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the indices, evenly spread."""
+    picks = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
+    return [indices[i] for i in picks]

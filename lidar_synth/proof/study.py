@@ -25,7 +25,8 @@ from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels import ObjectBank
 from lidar_synth.proof.arms import Row
 from lidar_synth.proof.page import write_page
-from lidar_synth.proof.plan import Pair, ProofPlan, make_plan
+from lidar_synth.proof.plan import Pair, ProofPlan
+from lidar_synth.proof.planning import make_plan
 from lidar_synth.proof.pools import PoolTask, make_pool, read_objects, read_pool, refuse_leaks, seconds_of, town_seed
 from lidar_synth.proof.settings import ProofSettings
 from lidar_synth.proof.summary import Proof, Results, summarise
