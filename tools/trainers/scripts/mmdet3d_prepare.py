@@ -3,13 +3,16 @@
     python tools/trainers/scripts/mmdet3d_prepare.py OUT --kitti KITTI --semantic-kitti DATASET --nuscenes NUSCENES
         [--frame NUSCENES_FRAME]
 
-Datasets are copied to OUT/data, where the stock configurations look for them; run the trainer in OUT. The synthetic
-scans are from the town. ``--frame`` names a folder of one real nuScenes key frame with the trainer's ``info.json``.
+Datasets are copied to OUT/data, where the stock configurations look for them; run the trainer in OUT. KITTI is mixed
+with generated scans of its own layouts, which have boxes, the other datasets with scans of the town. ``--frame`` names
+a folder of one real nuScenes key frame with the trainer's ``info.json``.
 """
 
 import argparse
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -47,10 +50,10 @@ def kitti(out: Path, scans: int) -> None:
     write_planes(root, "trainval")
     for split in ("train", "val"):
         kitti_list(root, root / f"kitti_infos_{split}.pkl", split)
-    made = town(out / "synthetic", scans, "town")
     where = {"data_root": root, "points": "training/velodyne_reduced"}
-    write_infos(out / "data" / "kitti_mixed", root / "kitti_infos_train.pkl", MIX | {"synthetic": made}, **where)
-    objects = ObjectBank.from_scans(open_scans(made))
+    settings = MIX | {"synthetic": layouts(out / "layouts", scans, root), "labels": "boxes"}
+    write_infos(out / "data" / "kitti_mixed", root / "kitti_infos_train.pkl", settings, **where)
+    objects = ObjectBank.from_scans(open_scans(town(out / "synthetic", scans, "town")))
     write_gt_database(objects, root, origin="bottom", folder="kitti_gt_database", infos="kitti_dbinfos_train.pkl")
 
 
@@ -86,6 +89,14 @@ def town(out: Path, scans: int, sensor: str) -> Path:
     """A folder of synthetic scans of the town."""
     if not out.is_dir():
         convert(Town(seed=2, sensor=sensor, scans=scans), WRITERS["npz"](out))
+    return out
+
+
+def layouts(out: Path, scans: int, kitti: Path) -> Path:
+    """A bank of generated scans with boxes, those of KITTI's scans."""
+    if not out.is_dir():
+        bake = [sys.executable, "-m", "lidar_synth", "bake", out, "--model", "town-layout", "--count", str(scans)]
+        subprocess.run([*bake, "--condition", kitti, "--condition-layout", "kitti_object"], check=True)
     return out
 
 
