@@ -23,16 +23,17 @@ pip() { "$python" -m pip install --disable-pip-version-check --quiet --constrain
 pip --no-deps mmengine==0.10.7 mmdet==3.3.0 mmdet3d==1.4.0 nuscenes-devkit==1.2.0 lyft_dataset_sdk==0.0.8
 # Headless: the other build of OpenCV needs libGL.
 pip --no-deps opencv-python-headless
-# pandas: lyft_dataset_sdk, which mmdet3d's evaluation imports. Without torch's wheel of torchvision mmengine still works.
+# pandas: lyft_dataset_sdk, which mmdet3d's evaluation imports. setuptools: mmengine imports its pkg_resources. Without
+# torch's wheel of torchvision mmengine still works.
 pip --only-binary :all: addict yapf termcolor regex rich terminaltables shapely six pycocotools trimesh plyfile \
-    scikit-image scikit-learn scipy pyquaternion cachetools fire packaging prettytable pandas
+    scikit-image scikit-learn scipy pyquaternion cachetools fire packaging prettytable pandas 'setuptools<80'
 
 if [ "${2:-}" = --ops ]; then
     "$python" -m pip uninstall --yes --quiet mmcv-lite
     if [ -n "$wheel" ]; then
         pip --no-deps "$wheel"
     else
-        pip 'setuptools<80' wheel ninja
+        pip wheel ninja
         MMCV_WITH_OPS=1 FORCE_CUDA=0 pip --no-deps --no-build-isolation mmcv==2.1.0
     fi
 else
@@ -44,6 +45,9 @@ fi
 import sys
 from importlib.metadata import version
 
+from mmengine.utils import is_installed  # what reads a stock configuration
+
+assert is_installed("mmdet3d")
 if sys.argv[1] == "--ops":
     import mmdet3d.apis, mmdet3d.datasets, mmdet3d.evaluation, mmdet3d.models, mmdet3d.visualization  # noqa: E401, F401
     import nuscenes.eval.detection.evaluate  # noqa: F401

@@ -18,7 +18,7 @@ def prove(
     batch: Annotated[int, typer.Option(min=1, help="scans of an iteration")] = 4,
     seeds: Annotated[int, typer.Option(min=1, help="repetitions of each training")] = 2,
     places: Annotated[str, typer.Option(help="how places are told apart: auto | drive | pose | stretch")] = "auto",
-    model: Annotated[str, typer.Option(help="of the arm 'generator': a name or a file")] = "town",
+    model: Annotated[str, typer.Option(help="of the arms with a generator: a name or a file")] = "town-dense",
     synthetic: Annotated[int, typer.Option(min=1, help="synthetic scans of each kind")] = 150,
     classes: Annotated[str, typer.Option(help="pooled classes: auto | semantic_kitti | pandaset | kitti360 | nuscenes")]
     = "auto",

@@ -23,7 +23,7 @@ class ProofSettings:
         places: how places are found: "auto" or a name of ``SPLITS``.
         tested: largest number of scans of a place that are tested on, evenly spread.
         synthetic: scans of a pool.
-        model: of the arm "generator": a name or a path.
+        model: of the arms with a generator: a name or a path.
         columns: of the grid that the reference network sees; None keeps scans as they are, for your own trainer.
         widths: channels of the reference network by level.
         classes: how classes are pooled: a name of ``GROUPS``; "auto" takes that of the dataset's layout.
@@ -49,7 +49,7 @@ class ProofSettings:
     places: str = "auto"
     tested: int = 20
     synthetic: int = 150
-    model: str = "town"
+    model: str = "town-dense"
     columns: int | None = 512
     widths: tuple[int, ...] = (16, 32, 64, 96)
     classes: str = "auto"

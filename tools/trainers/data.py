@@ -90,9 +90,17 @@ class Data:
 
     @cached_property
     def bank(self) -> Path:
-        """A bank of eight scans of the shipped generator ``town``."""
-        out = self.folder / "bank"
-        bake = [sys.executable, "-m", "lidar_synth", "bake", out, "--count", "8"]
+        """A bank of eight scans of the shipped generator ``town``, on 64 x 1024 cells."""
+        return self._bank("bank", "town")
+
+    @cached_property
+    def dense_bank(self) -> Path:
+        """A bank of eight scans of ``town-dense``, on 64 x 2048 cells."""
+        return self._bank("dense_bank", "town-dense")
+
+    def _bank(self, name: str, model: str) -> Path:
+        out = self.folder / name
+        bake = [sys.executable, "-m", "lidar_synth", "bake", out, "--model", model, "--count", "8"]
         subprocess.run(bake, check=True, stdout=subprocess.DEVNULL)
         return out
 

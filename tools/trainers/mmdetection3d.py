@@ -42,7 +42,7 @@ def rows(trial: Trial) -> Iterator[Row]:
     configs, env = dict(RUNS), ENVIRONMENT | {"PYTHONPATH": str(SCRIPTS)}
     if os.environ.get("FRNET_ROOT"):
         env |= {"PYTHONPATH": f"{SCRIPTS}:{trial.tree('FRNET_ROOT')}", "FRNET_ROOT": str(trial.tree("FRNET_ROOT"))}
-        trial.install(python, "setuptools<80", "wheel")
+        trial.install(python, "wheel")
         trial.install(python, "torch-scatter", options=["--no-build-isolation"])
     else:
         del configs["frnet_semantickitti.py"]
