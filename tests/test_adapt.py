@@ -21,7 +21,7 @@ from small_models import write as write_pixel_model
 from lidar_synth import Town, adapt, load_generator, load_sensor, open_scans
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate.leakage import measured, overlap, seen_by
+from lidar_synth.evaluate.leakage import measured, overlap, seen_by, town
 from lidar_synth.formats import WRITERS, layout_of
 from lidar_synth.generate.checkpoint import (
     CODEC,
@@ -41,6 +41,7 @@ from lidar_synth.geometry.sensor import Sensor, sensor_yaml
 from lidar_synth.models import build_network
 from lidar_synth.train.adaptation import card
 from lidar_synth.train.adaptation.scans import split
+from lidar_synth.train.adaptation.stages import TOWN_SEED
 from lidar_synth.train.held_out import read_history
 
 TINY = load_sensor(Path(__file__).parent.parent / "configs" / "tiny_sensor.yaml")
@@ -131,6 +132,12 @@ def test_every_stage_keeps_the_weights_with_the_least_loss_on_held_out_scans(ada
         assert facts["held_out_loss"] == min(losses)
         assert facts["iterations"] == history[losses.index(min(losses))].step
         assert len(losses) - 1 - losses.index(min(losses)) <= SHORT["held_out"]["patience"] + 1
+
+
+def test_the_autoencoder_rehearses_the_town(adapted: Path) -> None:
+    facts = read_header(adapted.with_suffix(".adapt") / "codec" / "codec.safetensors")[0].provenance
+    assert facts["rehearsal"]["town"] == 4 and facts["data"]["layout"] == "range"
+    assert overlap(seen_by(facts), town(TOWN_SEED))
 
 
 def test_the_provenance_has_the_scans_and_a_test_on_them_is_refused(adapted: Path, scans: Path, tmp_path: Path) -> None:

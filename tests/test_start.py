@@ -8,6 +8,7 @@ from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.evaluate.leakage import overlap, seen_by, town
 from lidar_synth.generate.checkpoint import load_checkpoint
 from lidar_synth.generate.generator import find_model
 from lidar_synth.train import TrainConfig, load_config, precision, run
@@ -26,6 +27,19 @@ def test_a_shipped_model_is_a_start_by_its_name(monkeypatch: pytest.MonkeyPatch,
 def config(folder: Path, chosen: str) -> TrainConfig:
     short = ["recipe.iterations=2", "recipe.batch=1", "data.town=2", "samples.every=0"]
     return load_config(TrainConfig, "town_tiny", [*short, f"output={folder}", f"precision={chosen}"])
+
+
+@pytest.mark.slow
+def test_rehearsed_scans_are_learnt_from_too_and_named(tmp_path: Path) -> None:
+    plain = run(config(tmp_path / "plain", "no"))
+    both = config(tmp_path / "both", "no").model_dump(mode="json")
+    both |= {"rehearsal": {"town": 2, "seed": 5, "licence": "MIT"}, "output": str(tmp_path / "both")}
+    rehearsed = run(TrainConfig.model_validate(both))
+    weights = [load_checkpoint(path).networks["velocity"].state_dict() for path in (plain, rehearsed)]
+    assert any(not torch.equal(weights[0][name], value) for name, value in weights[1].items())
+    facts = load_checkpoint(rehearsed).header.provenance
+    assert facts["rehearsal"]["seed"] == 5 and (facts["data"]["seed"], facts["data"]["town"]) == (0, 2)
+    assert overlap(seen_by(facts), town(5)) and overlap(seen_by(facts), town(0))
 
 
 @pytest.fixture(params=[True, False], ids=["faster in bfloat16", "slower in bfloat16"])

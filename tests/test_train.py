@@ -1,6 +1,7 @@
 """Training: data that follow from their position, schedules, the state through a kill, the loop."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from lidar_synth.train import (
     SCHEDULES,
     Batch,
     Batches,
+    Conditioning,
     Recipe,
     Training,
     cache_scans,
@@ -36,6 +38,7 @@ from lidar_synth.train import (
     student_task,
     teacher_task,
 )
+from lidar_synth.train.data import InTurns
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 TENSORS = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow"])
@@ -134,6 +137,16 @@ def test_what_stands_at_a_position_does_not_depend_on_the_others(batches: Batche
     for i, position in enumerate(range(7, 13)):
         alone = batches([position])
         assert all(torch.equal(a[i], b[0]) for a, b in zip(together[:3], alone[:3], strict=True))
+
+
+def test_two_sequences_take_turns(batches: Batches) -> None:
+    other = replace(batches, seed=4)
+    both = InTurns(batches, other)(range(3, 8))
+    for i, position in enumerate(range(3, 8)):
+        alone = (batches, other)[position % 2]([position // 2])
+        assert all(torch.equal(a[i], b[0]) for a, b in zip(both[:3], alone[:3], strict=True))
+    with pytest.raises(ConfigError, match="rehearsal for a model with the condition 'semantic'"):
+        InTurns(replace(batches, roll=False, conditioning=Conditioning("semantic")), other)
 
 
 @given(epoch=st.integers(0, 50))

@@ -14,7 +14,7 @@ def adapt(
     licence: Annotated[str, typer.Option(help="licence of the scans, which the checkpoint states")]
     = "that of the scans",
     sensor: Annotated[str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")] = None,
-    town: Annotated[int, typer.Option(min=0, help="scans of the town, cast through the sensor, to begin with")] = 400,
+    town: Annotated[int, typer.Option(min=0, help="scans of the town, as your sensor sees it, to learn too")] = 400,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and do nothing")] = False,
 ) -> None:  # fmt: skip
     """Adapts a model to your sensor and your streets: autoencoder, flow and student.

@@ -143,6 +143,33 @@ class Batches:
         return _where(draws[:, 3] < about.dropout, blank(about.name, cond), cond) if about.dropout else cond
 
 
+@dataclass(frozen=True)
+class InTurns:
+    """The samples of two sequences in turns: at even positions those of the first one.
+
+    Raises:
+        ConfigError: on samples with a condition.
+    """
+
+    first: Batches
+    second: Batches
+
+    def __post_init__(self) -> None:
+        if self.first.conditioning is not None:
+            raise ConfigError(f"rehearsal for a model with the condition {self.first.conditioning.name!r}", "none")
+
+    @property
+    def tensors(self) -> TensorFormat:
+        """Layout of the network's tensors."""
+        return self.first.tensors
+
+    def __call__(self, positions: Sequence[int]) -> Batch:
+        """The samples at these positions."""
+        parts = [(self.first, self.second)[p % 2]([p // 2]) for p in positions]
+        y0, y1, u = (torch.cat(values) for values in list(zip(*parts, strict=True))[:3])
+        return Batch(y0, y1, u)
+
+
 def _where(chosen: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """Per sample, a where ``chosen`` (B,) is true, else b; both (B, ...)."""
     return torch.where(chosen.to(b.device).view(-1, *[1] * (b.ndim - 1)), a, b)

@@ -118,4 +118,5 @@ def open_watch(config: Run, plan: TrainingPlan, training: Training, accelerator:
     assert config.held_out is not None
     # What was measured after the last saved state is measured again.
     known = [m for m in read_history(config.output) if m.step <= training.step]
-    return Watch(config, plan, open_data(config, plan, accelerator.device, config.held_out.data), accelerator, known)
+    data = open_data(config, plan, accelerator.device, config.held_out.data, "held_out")
+    return Watch(config, plan, data, accelerator, known)

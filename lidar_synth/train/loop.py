@@ -16,7 +16,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.flow.distill import STRATEGIES, every_piece
 from lidar_synth.flow.path import METRICS, TIMESTEPS, Example, Metric, Velocity, flow_matching, velocity_loss
 from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
-from lidar_synth.train.data import Batch, Batches, micro_batches
+from lidar_synth.train.data import Batch, Batches, InTurns, micro_batches
 from lidar_synth.train.schedules import SCHEDULES
 from lidar_synth.train.state import Training
 
@@ -83,7 +83,7 @@ def weighted(metric: Metric, weights: Mapping[str, float], tensors: TensorFormat
 
 
 def steps(
-    training: Training, task: Task, batches: Batches, accelerator: "Accelerator", loss: Loss = velocity_loss
+    training: Training, task: Task, batches: Batches | InTurns, accelerator: "Accelerator", loss: Loss = velocity_loss
 ) -> Iterator[Record]:
     """Train to the end of the recipe, step by step.
 

@@ -175,9 +175,12 @@ def _codec_of(networks: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
     return {CODEC: networks[CODEC]} if CODEC in networks else {}
 
 
-def open_data(config: Run, plan: TrainingPlan, device: torch.device, data: Data | None = None) -> Batches:
-    """The batches of the run, or of other ``data``; the scans are projected once and cached."""
-    given, name = (config.data, "cache") if data is None else (data, "held_out")
+def open_data(
+    config: Run, plan: TrainingPlan, device: torch.device, data: Data | None = None, folder: str = "cache"
+) -> Batches:
+    """The batches of the run, or of other ``data``; the scans are projected once and cached, in a ``folder`` of the run
+    where the data names none."""
+    given = config.data if data is None else data
     sensor, tensors = plan.header.sensor, plan.header.tensors
     conditioning, channels, others = None, set(tensors.channels), {}
     for name, options in plan.header.conditioning.items():
@@ -189,15 +192,15 @@ def open_data(config: Run, plan: TrainingPlan, device: torch.device, data: Data 
             channels.add("label")
         else:
             others[condition.field] = Other(shape, _reader(name, sensor, shape, options))
-    folder = given.cache or config.output / name
+    kept = given.cache or config.output / folder
     source = given.open(sensor)
-    cache = cache_scans(source, sensor, channels, folder, given.describe(), others=others)
+    cache = cache_scans(source, sensor, channels, kept, given.describe(), others=others)
     codec = plan.codec() if plan.autoencoder is not None else None
     batches = Batches(cache, tensors, config.seed, given.flip, given.roll, device, codec, conditioning)
     if codec is None or not given.latents:
         return batches
     made_by = network_hash(plan.parts(plan.network)[CODEC])
-    return replace(batches, latents=cache_latents(cache, tensors, codec, device, folder, made_by))
+    return replace(batches, latents=cache_latents(cache, tensors, codec, device, kept, made_by))
 
 
 def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, Any]) -> Callable[[Any], Any]:

@@ -32,7 +32,7 @@ from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.train.autoencoder import Autoencoding, reconstruct, reconstruction_figures
 from lidar_synth.train.config import DistillConfig, Run, TrainConfig
-from lidar_synth.train.data import Batches
+from lidar_synth.train.data import Batches, InTurns
 from lidar_synth.train.held_out import Watch, open_watch
 from lidar_synth.train.loop import Record, steps
 from lidar_synth.train.plan import TrainingPlan, make_plan, open_data
@@ -128,13 +128,17 @@ def _train(
     """The loop with logs and saved states."""
     with accelerator.main_process_first():
         data = open_data(config, plan, accelerator.device)
+        batches: Batches | InTurns = data
+        if config.rehearsal is not None:
+            others = open_data(config, plan, accelerator.device, config.rehearsal, "rehearsal")
+            batches = InTurns(data, replace(others, seed=config.seed + 1))
     training.began = time.monotonic()  # preparing the data is no training
     log = _Log(config, training.step, minutes is not None) if accelerator.is_main_process else None
     watch = open_watch(config, plan, training, accelerator) if config.held_out and log is not None else None
     if watch is not None and not watch.measured:
         _save(config, plan, training, data, watch)
     end = math.inf if minutes is None else time.monotonic() + 60 * minutes
-    for record in steps(training, plan.task, data, accelerator, plan.loss):
+    for record in steps(training, plan.task, batches, accelerator, plan.loss):
         # All processes stop at the same step, whose clock ever is ahead.
         stops = time.monotonic() > end or (watch is not None and watch.exhausted)
         late = accelerator.reduce(torch.tensor(float(stops), device=accelerator.device)).item() > 0

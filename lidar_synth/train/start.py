@@ -151,6 +151,8 @@ def with_recordings(config: Run, header: Header) -> Header:
     seen = inherited(header.provenance) | _recordings(config.data, header.sensor)
     if config.held_out is not None:  # they chose the weights
         seen |= _recordings(config.held_out.data, header.sensor)
+    if config.rehearsal is not None:
+        seen |= _recordings(config.rehearsal, header.sensor)
     return replace(header, provenance=header.provenance | {"seen": seen.to_list()})
 
 
@@ -168,8 +170,9 @@ def _recordings(data: Data, sensor: Sensor) -> Recordings:
 
 def provenance_of(config: Run) -> dict[str, Any]:
     """What a checkpoint says of its making; the checkpoints that it was made from stand beside, by their hash."""
-    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "held_out", *PARENTS}
-    return {
+    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "held_out", "rehearsal", *PARENTS}
+    more = {} if config.rehearsal is None else {"rehearsal": config.rehearsal.describe()}
+    return more | {
         "data": config.data.describe(),
         "data_licence": config.data.licence,
         "licence": config.licence,

@@ -1,27 +1,85 @@
-"""Time of a labelled scan by model, steps and columns, against a large matrix product.
+"""Time and memory of a labelled scan by model, steps and columns, against a large matrix product.
 
     python tools/bench/scans.py [MODEL ...] [--rounds N] [--threads N] [--busy]
 
 MODEL is a shipped model or a checkpoint, by default "town". Each scan is generated from its noise to points with
-labels. All measurements take turns. With --busy, processor time replaces wall-clock time, for a machine that does other
-work.
+labels. All measurements of the first table take turns. With --busy, processor time replaces wall-clock time, for a
+machine that does other work. The second table has the peak memory of a process that generates scans one by one, and how
+many scans one process of one thread for each core generate together, as those of ``bake --engine processes`` do.
 """
 
 import argparse
+import os
+import resource
 import time
 from itertools import count
+from multiprocessing import get_context
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from timing import print_table, time_in_turns
 
-from lidar_synth.generate.generator import load_generator
+from lidar_synth import Generator, load_generator
 
 STEPS = (4, 2, 1)
+TOGETHER = 6
+"""Scans of each process in the second table."""
+
+
+class Kind(NamedTuple):
+    """What is generated."""
+
+    model: str
+    columns: int
+    steps: int
+
+    def __str__(self) -> str:
+        return f"{Path(self.model).stem}, 64 x {self.columns}, {self.steps} steps"
+
+    def generator(self) -> Generator:
+        """A generator with these columns."""
+        return load_generator(self.model, columns=self.columns)
+
+
+def kinds(models: list[str]) -> list[Kind]:
+    """All columns and steps of the models."""
+    found = []
+    for model in models:
+        generator = load_generator(model)
+        widths = getattr(generator.autoencoder, "widths", (generator.sensor.columns,))
+        found += [Kind(model, width, steps) for width in widths for steps in STEPS]
+    return found
+
+
+def _start(barrier: Barrier) -> None:
+    global _barrier
+    _barrier = barrier
+    torch.set_num_threads(1)
+
+
+def _alone(kind: Kind) -> tuple[float, float]:
+    """Scans per second of this process, beside others that began at the same time; its peak memory in megabytes."""
+    generator = kind.generator()
+    generator.scans(0, [0], steps=kind.steps)
+    _barrier.wait()
+    start = time.perf_counter()
+    for index in range(1, TOGETHER + 1):
+        generator.scans(0, [index], steps=kind.steps)
+    return TOGETHER / (time.perf_counter() - start), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
+def together(kind: Kind) -> tuple[float, float]:
+    """Scans per second of one process for each core, and the peak memory of one of them in megabytes."""
+    cores, context = os.cpu_count() or 1, get_context("spawn")
+    with context.Pool(cores, _start, (context.Barrier(cores),)) as pool:
+        found = pool.map(_alone, [kind] * cores, chunksize=1)
+    return sum(rate for rate, _ in found), max(memory for _, memory in found)
 
 
 def main() -> None:
-    """Prints the table."""
+    """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", nargs="*", default=["town"])
     parser.add_argument("--rounds", type=int, default=10)
@@ -31,17 +89,20 @@ def main() -> None:
     torch.set_num_threads(given.threads)
     a, index = torch.randn(4096, 4096), count()
     calls = {"product of 4096 x 4096 (137 GFLOP)": lambda: a @ a}
-    for model in given.model:
-        generator = load_generator(model)
-        for width in getattr(generator.autoencoder, "widths", (generator.sensor.columns,)):
-            narrow = load_generator(model, columns=width)
-            for steps in STEPS:
-                name = f"{Path(model).stem}, 64 x {width}, {steps} steps"
-                calls[name] = lambda narrow=narrow, steps=steps: narrow.scans(0, [next(index)], steps=steps)
+    for kind in kinds(given.model):
+        generator = kind.generator()
+        calls[str(kind)] = lambda g=generator, k=kind: g.scans(0, [next(index)], steps=k.steps)
     seconds = time_in_turns(calls, given.rounds, time.process_time if given.busy else time.perf_counter)
     what = "processor time" if given.busy else "wall time"
     title = f"A labelled scan on the CPU, {given.threads} threads, float32, {what}; torch {torch.__version__}"
-    print_table(title, seconds, next(iter(calls)))
+    base = next(iter(calls))
+    print_table(title, seconds, base)
+    cores = os.cpu_count()
+    print(f"\n| {cores} processes of one thread | scans/s | scans in the time of a product | MB of each |")
+    print("|---|---:|---:|---:|")
+    for kind in kinds(given.model):
+        rate, memory = together(kind)
+        print(f"| {kind} | {rate:.2f} | {rate * seconds[base]:.1f} | {memory:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -137,7 +137,8 @@ def adapt(
         minutes: limit of the time of all trainings.
         licence: of the scans, and therefore of the weights.
         sensor: of the scans, if it is not the one that they or their layout name.
-        town: number of scans of the town, cast through the sensor, on which the flow is trained first; 0 = none.
+        town: number of scans of the town, cast through the sensor, on which the flow is trained first, and which the
+            autoencoder learns beside yours, so that it does not forget classes that yours lack; 0 = none.
         overrides: {name of a stage: values of its recipe}.
         progress: show bars.
 

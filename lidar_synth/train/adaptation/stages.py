@@ -45,7 +45,7 @@ class Stage(NamedTuple):
 
 STAGES = {
     "labels": Stage("adapt_codec", 0.2, True, "the autoencoder learns to label scans, on the town"),
-    "codec": Stage("adapt_codec", 0.35, False, "the autoencoder, on your scans"),
+    "codec": Stage("adapt_codec", 0.35, False, "the autoencoder, on your scans and the town"),
     "flow_town": Stage("adapt_flow", 0.2, True, "the flow, on the town as your sensor sees it"),
     "flow": Stage("adapt_flow", 0.25, False, "the flow, on your scans"),
     "student": Stage("adapt_student", 0.2, False, "the student of few steps, on your scans"),
@@ -147,6 +147,9 @@ class Work:
         if name == "student":
             grid = self.header.time_grid
             return values | {"teacher": str(start), "grid": list(grid), "intervals": len(grid) - 1}
+        if name == "codec" and self.town:
+            town = self._town(TOWN_SEED, self.town)
+            values["rehearsal"] = town | {"flip": True, "roll": True}
         if name == "labels":
             values["losses"] = {"unlabelled": UNLABELLED}
         return values | {"init": str(start)}

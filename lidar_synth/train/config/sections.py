@@ -123,6 +123,8 @@ class Run(Section):
         save_every: iterations between two saves.
         samples: pictures of samples.
         held_out: scans for early stopping; None = train to the end.
+        rehearsal: scans that take the place of every other sample, so that a network that starts from another one does
+            not forget what it has learnt from scans like these; None = ``data`` alone. Not for conditional models.
     """
 
     output: Path
@@ -136,6 +138,7 @@ class Run(Section):
     save_every: Count = 1000
     samples: Samples = Samples()
     held_out: HeldOut | None = None
+    rehearsal: Data | None = None
 
 
 class Network(Section):
