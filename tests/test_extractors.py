@@ -1,6 +1,7 @@
 """Feature extractors: the published archives with random weights, against numbers that the peers' own code gave."""
 
 import importlib
+import itertools
 import json
 import shutil
 import sys
@@ -182,10 +183,12 @@ def test_the_images_of_r2flow(peer: dict[str, NDArray[np.float32]], scan: Scan) 
 
 
 def test_the_images_of_lidm_move_the_returns_that_lidm_moves(peer: dict[str, NDArray[np.float32]], scan: Scan) -> None:
-    """Rounding decides which cell a corner belongs to, so that another processor may differ in a few cells."""
+    """Rounding decides which cell a corner belongs to: on another processor 4 % of the cells have been others, next to
+    those of the peer."""
     image = PREPARATIONS["lidm"].image(scan, False).reshape(5, -1)
     ours, theirs = set(np.flatnonzero(image[0] > 0)), set(peer["lidm cells"].tolist())
-    assert len(ours ^ theirs) <= 0.01 * len(theirs)
+    assert len(ours ^ theirs) <= 0.1 * len(theirs)
+    assert ours - theirs <= neighbours(theirs) and theirs - ours <= neighbours(ours)
     before = set(np.flatnonzero(PREPARATIONS["r3dpa"].image(scan, False)[0] > 0))
     assert len(ours) < len(before) and len(ours - before) > 0.1 * len(before)  # moved to the next row or column
     both = np.array(sorted(ours & theirs))
@@ -193,6 +196,12 @@ def test_the_images_of_lidm_move_the_returns_that_lidm_moves(peer: dict[str, NDA
     same = np.isclose(image[:4, both], expected, rtol=1e-5).all(0)
     assert same.mean() > 0.99
     assert (image[:, image[0] <= 0] == -1).all()
+
+
+def neighbours(cells: set[int]) -> set[int]:
+    """The cells next to some of 64 x 1024, and they themselves."""
+    near = itertools.product((-1, 0, 1), (-1, 0, 1))
+    return {(cell // 1024 + row) * 1024 + (cell + column) % 1024 for row, column in near for cell in cells}
 
 
 def test_the_images_of_r3dpa(scan: Scan) -> None:

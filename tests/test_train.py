@@ -15,7 +15,7 @@ from conftest import random_scan
 from hypothesis import given
 from torch import Tensor, nn
 
-from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.flow.distill import STRATEGIES
 from lidar_synth.flow.path import METRICS, Example
 from lidar_synth.flow.solvers import uniform_grid
@@ -295,29 +295,6 @@ def test_every_weight_is_moved_once_at_the_rate_of_the_schedule(
     assert sorted(map(id, moved)) == sorted(map(id, training.network.parameters()))
     record = next(steps(training, teacher_task(), batches, accelerator))
     assert {group["lr"] for o in training.optimizers for group in o.param_groups} == {record.rate} == {2.5e-3}
-
-
-def test_a_step_of_muon_turns_all_directions_alike() -> None:
-    """The update of a matrix has singular values that are about equal, whatever its gradient's are."""
-    network = transformer()
-    muon = OPTIMIZERS["muon"](network, 0.1, (0.9, 0.99), 0.0)[0]
-    weight = muon.param_groups[0]["params"][0]
-    before = weight.detach().clone()
-    u, _, v = torch.linalg.svd(torch.randn(weight.shape), full_matrices=False)
-    weight.grad = u * torch.logspace(0, -1, u.shape[1]) @ v
-    muon.step()
-    values = torch.linalg.svdvals(before - weight.detach())
-    assert values.max() < 2 * values.min()
-    rms = (before - weight.detach()).square().mean().sqrt()
-    assert 0.1 < rms / 0.1 < 0.4, "as long as a step of AdamW commonly is"
-
-
-def test_muon_refuses_a_network_without_matrices_to_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError, match="optimizer 'muon' for Convolution; expected a transformer"):
-        new_training(optimizer="muon")
-    monkeypatch.delattr(torch.optim, "Muon")
-    with pytest.raises(LibraryError, match=r"expected torch >= 2\.9\. Or optimizer: adamw"):
-        OPTIMIZERS["muon"](transformer(), 0.1, (0.9, 0.99), 0.0)
 
 
 def test_the_average_follows_the_weights(batches: Batches, accelerator: Accelerator) -> None:

@@ -5,14 +5,17 @@ which share the weights among them and all run at the schedule's rate; enter it 
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
+from torch.overrides import TorchFunctionMode
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.models.hdit.transformer import ContextAttention, SelfAttention
 from lidar_synth.models.layers import GatedFeedForward
+from lidar_synth.train.precision import faster_in_bfloat16
 
 BLOCKS = (SelfAttention, ContextAttention, GatedFeedForward)
 """Modules whose linear layers Muon moves."""
@@ -38,10 +41,29 @@ def muon(network: nn.Module, rate: float, betas: tuple[float, float], decay: flo
         raise ConfigError(f"optimizer 'muon' for {type(network).__name__}", "a transformer such as hdit, or adamw")
     chosen = {id(p) for p in matrices}
     rest = [p for p in network.parameters() if id(p) not in chosen]
+    kind = torch.optim.Muon if matrices[0].device.type != "cpu" or faster_in_bfloat16() else _in_float32()
     return [
-        torch.optim.Muon(matrices, rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw"),
+        kind(matrices, rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw"),
         torch.optim.AdamW(rest, rate, betas, weight_decay=decay),
     ]
+
+
+def _in_float32() -> "type[torch.optim.Muon]":
+    """Torch's Muon, which multiplies in bfloat16, made to multiply in float32."""
+
+    class Muon(torch.optim.Muon):
+        def step(self, closure: Any = None) -> Any:
+            with _Float32():
+                return super().step(closure)  # type: ignore[no-untyped-call]
+
+    return Muon
+
+
+class _Float32(TorchFunctionMode):
+    """``Tensor.bfloat16()`` gives a copy in the tensor's own precision."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return args[0].clone() if func is Tensor.bfloat16 else func(*args, **(kwargs or {}))
 
 
 def _matrices(network: nn.Module) -> list[Tensor]:
