@@ -27,7 +27,7 @@ from lidar_synth.mixing import MixedScans
 VARIABLE = "LIDAR_SYNTH_MIX"
 """Environment variable with the YAML file of settings, for trainers whose configuration allows no further keys."""
 
-OPTIONS = ("synthetic", "ratio", "labels", "seed", "reuse", "epoch_size", "label_options", "unboxed")
+OPTIONS = ("synthetic", "ratio", "labels", "seed", "reuse", "epoch_size", "label_options", "unboxed", "as_sensor")
 """Keys of the settings: the source of synthetic scans, and arguments of ``MixedScans``."""
 
 

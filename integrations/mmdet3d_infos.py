@@ -110,10 +110,11 @@ def _read(real: str | Path) -> Any:
 
 
 def _complete(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings with defaults, and with an absolute path to the synthetic scans."""
+    """The settings with defaults, and with absolute paths to the synthetic scans and a sensor."""
     settings = {"synthetic": settings.get("synthetic"), "ratio": 0.25, "labels": "generated", "seed": 0} | settings
-    if isinstance(settings["synthetic"], str | Path) and Path(settings["synthetic"]).exists():
-        settings["synthetic"] = str(Path(settings["synthetic"]).resolve())
+    for name in ("synthetic", "as_sensor"):
+        if isinstance(where := settings.get(name), str | Path) and Path(where).exists():
+            settings[name] = str(Path(where).resolve())
     return settings
 
 

@@ -57,6 +57,12 @@ def write_plan(settings: Mapping[str, Any], out: str | Path, *, real: int, epoch
             "unboxed: keep, too",
             "The reader cannot remove objects without a box; MixedScans does, where the package is installed.",
         )
+    if settings.get("as_sensor") is not None:
+        raise ConfigError(
+            f"as_sensor: {settings['as_sensor']} for a plan file",
+            "none",
+            "The reader takes a bank's scans as they are; other sensors need the package in the trainer's environment.",
+        )
     if epochs < 1 or real < 1 or Path(out).suffix != ".npz":
         raise ConfigError(f"{real} real samples and {epochs} epochs in {out}", "at least one of each, in a .npz file")
     if not is_bank(settings.get("synthetic", "")):

@@ -301,6 +301,7 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
     [
         ({"labels": "mix"}, "labels='mix'.*generated, condition, boxes, none"),
         ({"label_options": {"kind": "polar"}}, "no option but threshold"),
+        ({"as_sensor": "vlp16"}, "as_sensor: vlp16 for a plan file; expected none"),
         ({"labels": "boxes"}, "labels=.boxes. for a plan file; expected unboxed: keep"),
         ({"labels": "pseudo"}, "labels='pseudo'"),
         ({"synthetic": "town"}, "synthetic: town; expected a bank. lidar-synth bake OUT"),

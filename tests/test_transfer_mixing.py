@@ -1,11 +1,14 @@
 """A bank of one sensor serves the trainer of another: ``MixedScans(as_sensor=...)``."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from blocks import record
+from lidar_synth.integrations.mixture import mix
 from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError
@@ -39,6 +42,17 @@ def test_synthetic_scans_become_scans_of_the_real_sensor(scans: tuple[list[Scan]
             assert np.array_equal(sample.points, expected.points)
         else:
             assert np.array_equal(sample.points, real[int(sample.id[1:])].points)
+
+
+def test_the_settings_of_an_adapter_name_the_sensor(scans: tuple[list[Scan], list[Scan]], tmp_path: Path) -> None:
+    values = THEIRS.to_dict()
+    path = tmp_path / "theirs.yaml"
+    path.write_text(yaml.safe_dump({values.pop("name"): values}))
+    mixed = mix(3, {"synthetic": scans[1], "ratio": 0.5, "as_sensor": str(path)}, lambda scan, rng: scan)
+    made = [sample for sample in map(mixed.__getitem__, range(len(mixed))) if isinstance(sample, Scan)]
+    assert len(made) == 3
+    for scan in made:
+        assert np.array_equal(scan.points, Transfer(THEIRS)(scans[1][int(scan.id[1:])]).points)
 
 
 @pytest.mark.parametrize("workers", [0, 2])
