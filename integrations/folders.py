@@ -17,11 +17,11 @@ from lidar_synth.formats import KITTIObject
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA, KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
-from lidar_synth.formats.writer import Writer
+from lidar_synth.formats.writer import Writer, claim
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
 
-MANIFEST = "mixture.csv"
+MANIFEST, SETTINGS = "mixture.csv", ".mixture.json"
 
 
 def export_mixture(
@@ -50,7 +50,8 @@ def export_mixture(
         Number of scans written by this run.
 
     Raises:
-        ConfigError: on another layout, or a mixture whose samples are not scans.
+        ConfigError: on another layout, a mixture whose samples are not scans, or a folder with another
+            mixture or epoch.
         DataError: on a scan without labels (``"semantic_kitti"``) or boxes (``"kitti"``).
         FileError: if the folder cannot be written.
     """
@@ -58,6 +59,8 @@ def export_mixture(
         raise ConfigError(f"layout {layout!r}", "'semantic_kitti' or 'kitti'")
     root = Path(out)
     camera = calibration or OBJECT_CAMERA
+    claim(root / SETTINGS, {"plan": mixed.plan(epoch).hash, "layout": layout, "projection": camera.projection.tolist(),
+                            "camera_from_sensor": camera.camera_from_sensor.tolist()})  # fmt: skip
     writer: Writer = SemanticKITTIWriter(root) if layout == "semantic_kitti" else KITTIObjectWriter(root)
     rows, written = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"], 0
     for position in tqdm(range(mixed.length(epoch)), unit="scan", disable=not progress):

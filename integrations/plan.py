@@ -51,12 +51,6 @@ def write_plan(settings: Mapping[str, Any], out: str | Path, *, real: int, epoch
             f"{', '.join(POLICIES)}, and no option but threshold",
             "The reader takes a bank's own labels; other policies need the package in the trainer's environment.",
         )
-    if labels == "boxes" and settings.get("unboxed") != "keep":
-        raise ConfigError(
-            "labels='boxes' for a plan file",
-            "unboxed: keep, too",
-            "The reader cannot remove objects without a box; MixedScans does, where the package is installed.",
-        )
     if settings.get("as_sensor") is not None:
         raise ConfigError(
             f"as_sensor: {settings['as_sensor']} for a plan file",
@@ -68,6 +62,12 @@ def write_plan(settings: Mapping[str, Any], out: str | Path, *, real: int, epoch
     if not is_bank(settings.get("synthetic", "")):
         raise ConfigError(f"synthetic: {settings.get('synthetic')}", "a bank", "lidar-synth bake OUT writes one.")
     mixed = mix(real, settings, lambda scan, rng: scan)
+    if "boxes" in mixed.synthetic[0].fields and labels != "none" and settings.get("unboxed") != "keep":
+        raise ConfigError(
+            f"labels={labels!r} of a bank with boxes for a plan file",
+            "unboxed: keep, too",
+            "The reader cannot remove objects without a box; MixedScans does, where the package is installed.",
+        )
     plans = [mixed.plan(epoch) for epoch in range(epochs)]
     arrays = {f"epoch-{plan.epoch}": np.stack(plan.at(np.arange(len(plan))), 1) for plan in plans}
     values = {

@@ -1,5 +1,6 @@
 """Scan surgery, against worlds whose exact scan is known: without the object, and with it elsewhere."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pasting import assert_nothing_shares_a_ray
+from streets import kitti
 from typer.testing import CliRunner
 from worlds import CAR, WALL, car, cast, wall
 
@@ -224,6 +226,23 @@ def test_the_flow_draws_the_hole_and_nothing_else() -> None:
     assert len(new - before) > 0.5 * len(filled - before) and not filled - before <= new
     for result in (by_geometry, drawn):
         assert edit.measure([result]).objects == 0
+
+
+def test_the_command_line_keeps_the_calibration(tmp_path: Path) -> None:
+    """KITTI's ``testing`` has no boxes; its scans are passed on."""
+    root = kitti(tmp_path / "kitti", 2)
+    for folder in ("velodyne", "calib", "image_2"):
+        (root / "testing" / folder).mkdir(parents=True)
+        for path in (root / "training" / folder).glob("000000.*"):
+            shutil.copy(path, root / "testing" / folder)
+    command = ["edit", "remove", str(root), str(tmp_path / "out"), "--name", "Car", "--to", "kitti_object"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output + str(result.exception)
+    given, edited = open_scans(root), open_scans(tmp_path / "out")
+    assert given.ids == edited.ids
+    for index in range(len(given)):
+        a, b = given.calibration(index), edited.calibration(index)
+        assert np.allclose(a.projection, b.projection) and np.allclose(a.camera_from_sensor, b.camera_from_sensor)
 
 
 def test_the_command_line_edits_scans(tmp_path: Path) -> None:

@@ -201,6 +201,8 @@ def test_a_mixture_as_semantic_kitti(mixed: MixedScans, tmp_path: Path) -> None:
     rows = list(csv.reader((tmp_path / "out" / MANIFEST).read_text().splitlines()[1:]))
     assert [int(row[1]) for row in rows] == [mixed.domain(i) for i in range(5)]
     assert export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 0
+    with pytest.raises(ConfigError, match="was filled with .*plan.* or choose another folder"):
+        export_mixture(mixed, tmp_path / "out", "semantic_kitti", epoch=1, progress=False)
 
 
 def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:
@@ -230,7 +232,9 @@ def test_scans_without_labels_are_not_exported(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="has no label.*label policy"):
         export_mixture(mixed, tmp_path, "semantic_kitti", progress=False)
     with pytest.raises(ConfigError, match="to_sample"):
-        export_mixture(MixedScans(real, Scans("s", 3, street(0).sensor, 1)), tmp_path, "kitti", progress=False)
+        export_mixture(
+            MixedScans(real, Scans("s", 3, street(0).sensor, 1)), tmp_path / "kitti", "kitti", progress=False
+        )
     with pytest.raises(ConfigError, match="'semantic_kitti' or 'kitti'"):
         export_mixture(mixed, tmp_path, "kitti360")  # type: ignore[arg-type]
 

@@ -340,6 +340,15 @@ def test_a_policy_of_ones_own_is_taken_as_it_is(synthetic: Scan) -> None:
         make_policy(own, threshold=0.5)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_mixed_scans_lose_their_times(kind: str, synthetic: Scan, real: list[Scan]) -> None:
+    """PandaSet's scans have times; those of two scans count from different moments."""
+    timed = [replace(scan, time=np.linspace(0, 0.1, len(scan), dtype=np.float32)) for scan in (synthetic, *real)]
+    policy = make_policy("mix", real=timed[1:], fields=FIELDS | {"time"}, kind=kind)
+    mixed = policy(timed[0], keyed_rng(4, 1))
+    assert mixed.time is None and len(mixed) != len(synthetic)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_real_scans_as_the_labelled_side(kind: str, real_scans: Path, synthetic: Scan) -> None:

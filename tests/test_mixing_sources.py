@@ -20,7 +20,10 @@ from lidar_synth.formats import KITTI360, SemanticKITTI
 from lidar_synth.generate.generator import Generator, load_generator
 from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry.transfer import Mount, SeenAs, Transfer
 from lidar_synth.mixing import Generated, MixedScans, Sources, make_synthetic
+from lidar_synth.mixing.sources import identity_of
+from lidar_synth.town import Town
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
@@ -44,6 +47,22 @@ def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> 
             assert np.allclose(item["points"][:, :3], scan.points, atol=1e-3)
             assert np.array_equal(item["label"], scan.label)
     assert train.mixture.synthetic[0].identity.startswith(f"generated:{generator.hash}:11:")
+
+
+def test_sources_that_differ_have_different_plans() -> None:
+    """A state of one mixture cannot be loaded into the other."""
+    towns = [Town(0, scans=50), Town(1, scans=50), Town(0, scans=50, interval=2.0), Town(0, scans=49)]
+    transfers = [Transfer(load_sensor("vlp16")), Transfer(load_sensor("vlp16"), Mount(0.5))]
+    seen = [SeenAs(towns[0], transfers[0]), SeenAs(towns[1], transfers[0]), SeenAs(towns[0], transfers[1]),
+            SeenAs(towns[0], transfers[0], seed=1)]  # fmt: skip
+    assert len({identity_of(source) for source in (*towns, *seen)}) == 8
+    assert identity_of(Town(0, scans=50)) == identity_of(towns[0])
+    assert identity_of(SeenAs(Town(0, scans=50), transfers[0])) == identity_of(seen[0])
+    scans = Scans("a", 3, load_sensor("hdl64e_kitti"))
+    scans.ids = ("a", "b", "c")  # type: ignore[attr-defined]
+    before = identity_of(SeenAs(scans, transfers[0]))
+    scans.ids = ("a", "b", "d")  # type: ignore[attr-defined]
+    assert before != identity_of(SeenAs(scans, transfers[0]))
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from typing import Any
 import browsers
 import numpy as np
 import pytest
-from proofs import drives, write_town
+from proofs import SENSOR, drives, write_town
 from small_models import write as write_model
 from typer.testing import CliRunner
 
@@ -19,11 +19,12 @@ from lidar_synth.cli import app
 from lidar_synth.datasets.classes import PANDASET
 from lidar_synth.datasets.recordings import frames_of
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.generate.checkpoint import load_checkpoint, save_checkpoint
+from lidar_synth.evaluate.leakage import content_of, contents
+from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, save_checkpoint
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.proof import ARMS, Job, Proof, pools
-from lidar_synth.proof.pools import refuse_leaks
+from lidar_synth.proof.pools import PoolTask, make_pool, refuse_leaks
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
@@ -142,6 +143,28 @@ def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(tm
     with pytest.raises(ConfigError, match=r"2011_10_03_drive_0027 \(frame 2\)"):
         refuse_leaks(str(path), frames_of("semantic_kitti", ["00/000002", "01/000000"]))
     refuse_leaks(str(path), frames_of("semantic_kitti", ["00/000003", "01/000000"]))
+
+
+def test_a_generator_that_saw_the_tested_scans_in_another_folder_is_refused(tmp_path: Path) -> None:
+    scans = drives(3, 2)
+    saved = load_checkpoint(write_model(tmp_path / "mine.safetensors"))
+    provenance = {**saved.header.provenance, "seen": contents([content_of(scans[0])]).to_list()}
+    save_checkpoint(tmp_path / "mine.safetensors", replace(saved.header, provenance=provenance), saved.networks)
+    settings = replace(SMALL, arms=("generator",), model=str(tmp_path / "mine.safetensors"))
+    with pytest.raises(ConfigError, match="trained on places that are tested: content"):
+        prove(scans, tmp_path / "out", settings, jobs=1, progress=False)
+
+
+def test_a_pool_of_other_weights_is_not_reused(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "mine.safetensors")
+    task = PoolTask("generator", tmp_path / "pool", SENSOR, None, 1, 0, str(model), None, ())
+    make_pool(task)
+    saved = load_checkpoint(model)
+    for weight in saved.networks[VELOCITY].parameters():
+        weight.data.mul_(0.5)
+    save_checkpoint(model, saved.header, saved.networks)
+    with pytest.raises(ConfigError, match="was filled with .*checkpoint"):
+        make_pool(task)
 
 
 def test_the_shipped_generator_is_not_measured_on_its_own_town(town: Path, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError, ProcessError
 from lidar_synth.evaluate.segmentation import class_ious
 from lidar_synth.geometry.projection import project
+from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.exchange import thinned
 from lidar_synth.models.segmenter import CircularConv, _Wrapped
 from lidar_synth.proof import ARMS, CommandTrainer, ProofSettings
@@ -298,6 +299,29 @@ def test_a_command_trains_on_the_mixture_of_its_file(name: str, tmp_path: Path) 
     label = np.concatenate([scan.label for scan in task.held_out])
     road = TRAIN_ID["road"]
     assert table.sum() == (label != 255).sum() == table[:, road].sum() and table[road, road] == (label == road).sum()
+
+
+def test_the_command_pastes_what_the_reference_pastes(tmp_path: Path) -> None:
+    task = job("paste", tmp_path)
+    [stage] = describe(task)["stages"]
+    assert stage["label_options"]["count"] == {"Pedestrian": 3}
+    assert ObjectBank.load(stage["label_options"]["objects"]).boxes.names == task.objects.boxes.names
+
+
+@pytest.mark.parametrize("classes", GROUPS)
+def test_returns_without_a_prediction_are_errors_in_every_pool(classes: str, tmp_path: Path) -> None:
+    program = (
+        "import sys, yaml, pathlib, numpy as np; job = yaml.safe_load(open(sys.argv[1])); "
+        "out = pathlib.Path(job['predictions']); out.mkdir(); "
+        "n = len(np.fromfile(next(pathlib.Path(job['held_out']).rglob('*.bin')), 'f4')) // 4; "
+        "(out / '000000.label').write_bytes(bytes(4 * n))"
+    )
+    task = job("real", tmp_path)
+    [scan] = task.held_out
+    everything = replace(scan, label=np.arange(len(scan)).astype(np.uint8) % len(NAMES))
+    task = replace(task, held_out=[everything])
+    table = CommandTrainer(shlex.join([sys.executable, "-c", program, "{job}"]))(task)
+    assert table.sum() == len(scan) and np.nanmax(group_ious(table, groups_of(classes))) == 0
 
 
 FAILING = {

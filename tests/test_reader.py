@@ -302,7 +302,6 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
         ({"labels": "mix"}, "labels='mix'.*generated, condition, boxes, none"),
         ({"label_options": {"kind": "polar"}}, "no option but threshold"),
         ({"as_sensor": "vlp16"}, "as_sensor: vlp16 for a plan file; expected none"),
-        ({"labels": "boxes"}, "labels=.boxes. for a plan file; expected unboxed: keep"),
         ({"labels": "pseudo"}, "labels='pseudo'"),
         ({"synthetic": "town"}, "synthetic: town; expected a bank. lidar-synth bake OUT"),
         ({"unknown": 1}, "settings .'unknown'"),
@@ -315,6 +314,14 @@ def test_mixtures_that_need_the_package_in_the_trainer_are_refused(
     with pytest.raises(ConfigError, match=message):
         write_plan({"synthetic": bank, "ratio": 0.5, **settings}, tmp_path / "plan.npz", real=4, epochs=1)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("labels", ["boxes", "generated", "condition"])
+def test_a_plan_of_boxes_says_that_the_reader_keeps_unboxed_objects(cases: Path, tmp_path: Path, labels: str) -> None:
+    settings = {"synthetic": str(cases / "banks" / "boxes" / "bank"), "ratio": 0.5, "labels": labels}
+    with pytest.raises(ConfigError, match="of a bank with boxes for a plan file; expected unboxed: keep"):
+        write_plan(settings, tmp_path / "plan.npz", real=4, epochs=1)
+    write_plan(settings | {"unboxed": "keep"}, tmp_path / "plan.npz", real=4, epochs=1)
 
 
 @pytest.mark.slow

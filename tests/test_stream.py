@@ -70,6 +70,28 @@ def test_without_end_epochs_follow_one_another(workers: int) -> None:
     assert list(islice(load(stream, workers), 5)) == cut(sequence()[45:65], 4)
 
 
+class Refreshed(Endless):
+    """Remembers the epochs that it was told, as a pool that is refreshed does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[int] = []
+
+    def set_epoch(self, epoch: int) -> None:
+        self.told.append(epoch)
+
+    def expect(self, numbers: object) -> None:
+        pass
+
+
+def test_without_end_the_synthetic_source_hears_of_every_epoch() -> None:
+    source = Refreshed()
+    scans = MixedScans(Scans("r", 9), source, 0.4, to_sample=name)
+    list(islice(iter(MixedStream(scans)), 40))
+    assert source.told == [0, 1, 2]
+    assert scans.epoch == 0  # that of the data set stays
+
+
 @pytest.mark.parametrize("endless", [False, True])
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_ranks_and_workers_divide_the_stream(ranks: int, endless: bool) -> None:

@@ -53,15 +53,18 @@ def remove_objects(
         raise ConfigError(f"--box {box}, --name {name}", "one of the two")
     scans = open_scans(source)
     writer, count = _writer(out, to), 0
+    writer.carry(scans)
     for index in range(len(scans)) if scan is None else [_number(scan, len(scans))]:
         given = scans[index]
         numbers = list(box or ()) if not name else _named(given, name)
         edited = remove(given, numbers, model=model, seed=seed) if numbers else given
         count += len(numbers)
-        writer.write(edited, index, name=given.id)
+        writer.write(edited, index, name=given.id, calibration=scans.calibration(index))
     writer.finish()
     if name and not count:
-        raise ConfigError(f"--name {', '.join(name)}", "the class of some box in these scans")
+        raise ConfigError(
+            f"--name {', '.join(name)}", "the class of some box in these scans, such as KITTI's or the town's"
+        )
     print(f"{out}: {count} objects removed")
 
 
@@ -120,7 +123,8 @@ def _edit_one(source: Path, out: Path, number: int, to: str, change: Any) -> Non
     given = scans[_number(number, len(scans))]
     edited = change(given)
     writer = _writer(out, to)
-    writer.write(edited, number, name=given.id)
+    writer.carry(scans)
+    writer.write(edited, number, name=given.id, calibration=scans.calibration(number))
     writer.finish()
     box = edited.boxes.values[-1]
     inside = int(edited.boxes.contain(edited.points)[-1].sum())
@@ -143,11 +147,8 @@ def _number(scan: int, count: int) -> int:
 
 
 def _named(scan: "Scan", names: list[str]) -> list[int]:
-    from lidar_synth.errors import DataError
-
-    if scan.boxes is None:
-        raise DataError(f"scan {scan.id!r} has no boxes", "scans with boxes, such as KITTI's or the town's")
-    return [i for i, name in enumerate(scan.boxes.names) if name in names]
+    """The numbers of the boxes with some names; none in a scan without boxes, as in KITTI's ``testing``."""
+    return [] if scan.boxes is None else [i for i, name in enumerate(scan.boxes.names) if name in names]
 
 
 def _pose(text: str) -> list[float]:

@@ -17,7 +17,8 @@ def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
 
     The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of the first scan.
     Labels, confidence (1 for labels of scans without confidence) and instances are always set; instances of the other
-    scans are renumbered. Rings are set if the first scan has them, boxes if any scan has them.
+    scans are renumbered. Rings are set if the first scan has them, boxes if any scan has them; times are dropped, as
+    each scan has its own moment.
     """
     parts = [_complete(scan)]
     used = _last_instance(parts[0])
@@ -30,7 +31,9 @@ def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
         names.append("ring")
     together: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in ("points", *names)}
     boxes = [p.boxes for p in parts if p.boxes is not None]
-    return replace(scan, **together, raw_label=None, boxes=joined(boxes) if boxes else None, domain=SYNTHETIC)
+    return replace(
+        scan, **together, raw_label=None, time=None, boxes=joined(boxes) if boxes else None, domain=SYNTHETIC
+    )
 
 
 def _complete(scan: Scan) -> Scan:

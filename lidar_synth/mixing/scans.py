@@ -225,10 +225,14 @@ class MixedScans(Dataset[Any]):
         MixingPlan(self.mixture, epoch)
         self.current.set(epoch)
         if get_worker_info() is None:
-            for source in self.synthetic:
-                if hasattr(source, "set_epoch"):
-                    source.set_epoch(epoch)
+            self.tell_sources(epoch)
             self.expect(epoch)
+
+    def tell_sources(self, epoch: int) -> None:
+        """Set the epoch of the synthetic sources that have one, such as a ``RollingBank`` with ``refresh``."""
+        for source in self.synthetic:
+            if hasattr(source, "set_epoch"):
+                source.set_epoch(epoch)
 
     def plan(self, epoch: int | None = None) -> MixingPlan:
         """The plan of an epoch, by default the current one; the main process logs its hash once."""

@@ -109,6 +109,8 @@ class MixedStream(IterableDataset[Any]):
                 check_pass(begin, self.scans.epoch)
             while number >= (end := first + self.scans.length(epoch)):
                 epoch, first, announced = epoch + 1, end, 0
+                if worker == 0:
+                    self.scans.tell_sources(epoch)
             if worker == 0 and number >= announced:
                 ahead = chain.from_iterable(self._batches(begin, position, number))
                 self.scans.expect(epoch, (n - first for n in takewhile(end.__gt__, ahead) if n >= number))

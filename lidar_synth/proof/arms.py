@@ -176,6 +176,11 @@ def policy_of(stage: Stage, real: Any, objects: ObjectBank | None, fields: froze
         objects: those to paste.
         fields: the fields of the synthetic scans.
     """
+    return make_policy(stage.labels, real=real, fields=fields, **options_of(stage, real, objects))
+
+
+def options_of(stage: Stage, real: Any, objects: ObjectBank | None) -> dict[str, Any]:
+    """The options of the label policy of a stage; arguments as for ``policy_of``."""
     options = dict(stage.options)
     if options.pop("objects", False):
         assert objects is not None
@@ -183,4 +188,4 @@ def policy_of(stage: Stage, real: Any, objects: ObjectBank | None, fields: froze
         options |= {"objects": objects, "count": {name: most for name, most in RARE.items() if name in there}}
     elif options.get("kind") == "exchange" and real[0].instance is None:
         options["objects"] = 0  # PolarMix turns whole objects, which needs instances
-    return make_policy(stage.labels, real=real, fields=fields, **options)
+    return options

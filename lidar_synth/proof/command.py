@@ -11,12 +11,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
+from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError, ProcessError
 from lidar_synth.files.disk import read_values, write_file
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.proof.arms import REAL
+from lidar_synth.labels import ObjectBank
+from lidar_synth.proof.arms import REAL, options_of
 from lidar_synth.proof.pools import OBJECTS
 from lidar_synth.proof.trial import Job
 
@@ -79,8 +80,8 @@ def describe(job: Job) -> dict[str, Any]:
     stages = []
     for stage, iterations in job.stages():
         folder = job.folder / "real" if stage.pool == REAL else job.pool_folders.get(stage.pool)
-        options = dict(stage.options)
-        if options.get("objects") is True:
+        options = options_of(stage, list(job.real), job.objects)
+        if isinstance(options.get("objects"), ObjectBank):
             options["objects"] = str((job.pool_folders["skin"] / OBJECTS).resolve())
         stages.append({
             "iterations": iterations, "ratio": float(stage.ratio),
@@ -112,8 +113,8 @@ def _table(scans: Sequence[Scan], folder: Path) -> NDArray[np.int64]:
             raise DataError(f"{path} with {len(raw)} predictions", f"{len(scan)}, one for each point")
         predicted = SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16), str(path))
         valid = scan.label != IGNORE
-        # A return without a prediction is an error: it counts as another class.
-        wrong = np.where(scan.label == 0, 1, 0)
+        # A return without a prediction is an error: it counts as a class with which its own is never pooled.
+        wrong = np.where(scan.label == TRAIN_ID["road"], TRAIN_ID["car"], TRAIN_ID["road"])
         given = np.where(predicted == IGNORE, wrong, predicted)
         pairs = scan.label[valid].astype(np.int64) * count + given[valid]
         table += np.bincount(pairs, minlength=count * count).reshape(count, count)

@@ -40,7 +40,7 @@ def differences(arms: Sequence[Mapping[str, Any]]) -> str:
             parts.append(f'<line x1="{x(a):.1f}" x2="{x(b):.1f}" y1="{y:.1f}" y2="{y:.1f}" stroke="{colour}" '
                          'stroke-width="5" stroke-opacity=".35" stroke-linecap="round"/>')  # fmt: skip
         parts += [f'<circle cx="{x(v):.1f}" cy="{y:.1f}" r="2.5" fill="{colour}" fill-opacity=".45"/>'
-                  for v in row["by_place"].values() if low <= v <= high]  # fmt: skip
+                  for v in row["by_place"].values() if v is not None and low <= v <= high]  # fmt: skip
         parts.append(f'<circle cx="{x(row["difference"]):.1f}" cy="{y:.1f}" r="6" fill="{colour}"/>')
     return "".join([*parts, "</svg>"])
 

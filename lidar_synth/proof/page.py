@@ -113,7 +113,8 @@ def _places(values: Values) -> str:
     base = values["arms"][0]
     rows = []
     for place in values["tested_places"]:
-        cells = [_cell(place), _cell(f"{base['miou_by_place'][place]:.1f}")]
+        miou = base["miou_by_place"][place]
+        cells = [_cell(place), _cell("–" if miou is None else f"{miou:.1f}")]
         cells += [_cell(signed(row["by_place"][place])) for row in arms]
         rows.append(f"<tr>{''.join(cells)}</tr>")
     return _grid(["place", f"{base['title']}, mIoU", *(row["title"] for row in arms)], rows)

@@ -7,21 +7,22 @@ continued where it stopped.
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidar_synth.datasets.recordings import Recordings
+from lidar_synth.datasets.recordings import CONTENT, Recordings
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate.leakage import overlap, seen_by, town
+from lidar_synth.evaluate.leakage import content_of, contents, overlap, seen_by, town
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
 from lidar_synth.formats.writer import claim
-from lidar_synth.generate.generator import Generator, load_generator
+from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.generate.generator import Generator, find_model, load_generator
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer import Transfer
@@ -111,10 +112,10 @@ def make_pool(task: PoolTask) -> Path:
         ConfigError: if the folder holds another pool.
         DataError, FileError: if it cannot be made or written.
     """
-    if (task.folder / DONE).is_file():
-        return task.folder
     start = time.monotonic()
     claim(task.folder / SETTINGS, _settings(task))
+    if (task.folder / DONE).is_file():
+        return task.folder
     writer = SemanticKITTIWriter(task.folder)
     made, boxed = 0, []
     for scan in POOLS[task.kind](task):
@@ -143,18 +144,22 @@ def read_objects(folder: Path) -> ObjectBank | None:
     return ObjectBank.load(folder / OBJECTS) if (folder / OBJECTS).is_file() else None
 
 
-def refuse_leaks(model: str, tested: Recordings) -> Generator:
+def refuse_leaks(model: str, tested: Recordings, scans: Iterable[Scan] = ()) -> Generator:
     """Load a generator, and refuse one that was trained on the places that are tested.
 
     Args:
         model: its name or path.
         tested: the recordings of the tested scans.
+        scans: those of them that are known by their content only; read if the generator has learnt from such scans.
 
     Raises:
         ConfigError: if it was; the message names drives and frames.
     """
     generator = load_generator(model)
-    if shared := overlap(seen_by(generator.header.provenance), tested):
+    seen = seen_by(generator.header.provenance)
+    if any(dataset == CONTENT for dataset, _ in seen.drives):
+        tested = tested | contents(map(content_of, scans))
+    if shared := overlap(seen, tested):
         raise ConfigError(
             f"generator {model!r}, which was trained on places that are tested: {shared}",
             "a generator that has never seen them",
@@ -175,7 +180,7 @@ def _settings(task: PoolTask) -> dict[str, Any]:
     grid = None if task.grid is None else task.grid.to_dict()
     plain = {"kind": task.kind, "sensor": task.sensor.to_dict(), "grid": grid, "count": task.count}
     if task.kind == "generator":
-        return plain | {"model": task.model}
+        return plain | {"model": task.model, "checkpoint": read_header(find_model(task.model))[1]}
     learnt = hashlib.sha256("\n".join(task.learnt).encode()).hexdigest()
     return plain | {"seed": task.town_seed} | ({"learnt_from": learnt} if task.kind == "skin" else {})
 

@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from lidar_synth.datasets.recordings import PLACES
 from lidar_synth.errors import DataError
 from lidar_synth.evaluate.leakage import seen_by
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json
-from lidar_synth.formats import open_scans
+from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.formats.convert import in_processes
 from lidar_synth.formats.writer import claim
 from lidar_synth.geometry.scan import Scan, Source
@@ -32,7 +33,7 @@ from lidar_synth.proof.settings import ProofSettings
 from lidar_synth.proof.summary import Proof, Results, summarise
 from lidar_synth.proof.trial import Job, Outcome, Trainer, pretrain, pretraining_seconds, reference, run_trainer
 
-STUDY, RUNS, POOLS, STARTS, JOBS = "study.json", "runs", "pools", "starts", "jobs"
+STUDY, GENERATOR, RUNS, POOLS, STARTS, JOBS = "study.json", "generator.json", "runs", "pools", "starts", "jobs"
 PAGE, RESULTS = "index.html", "results.json"
 
 
@@ -182,7 +183,8 @@ def prove(
     plan, loaded = make_plan(source, settings or ProofSettings(), minutes, jobs, _precision(out))
     seen = ""
     if any("generator" in row.arm.pools() for row in plan.rows):
-        generator = refuse_leaks(plan.settings.model, plan.recordings)
+        generator = refuse_leaks(plan.settings.model, plan.recordings, _nameless(source, plan))
+        claim(out / GENERATOR, {"model": plan.settings.model, "checkpoint": generator.hash})
         seen = str(seen_by(generator.header.provenance)) or "scans that its file does not name"
     named = getattr(trainer, "command", getattr(trainer, "__name__", type(trainer).__name__))
     claim(out / STUDY, plan.identity() | {"trainer": named})
@@ -278,6 +280,14 @@ def _pretrain(work: Trainings, tasks: Sequence[tuple[Row, Pair]], progress: bool
     with in_processes(work.pretrain, list(needed.values()), min(work.plan.jobs, max(1, len(needed)))) as done:
         for _ in tqdm(done, total=len(needed), desc="pretraining", disable=not progress):
             pass
+
+
+def _nameless(source: Source, plan: ProofPlan) -> Iterator[Scan]:
+    """The scans of the tested places, unless their names say which recordings they are of."""
+    if isinstance(source, ScanFiles) and layout_of(source.root) in PLACES:
+        return
+    for place in dict.fromkeys(place for place, _ in plan.pairs):
+        yield from (source[i] for i in plan.places[place])
 
 
 def _scans(source: Source, indices: Sequence[int]) -> list[Scan]:

@@ -127,7 +127,8 @@ def _arm(
 ) -> dict[str, Any]:
     """A row of the table, as plain values."""
     difference = scores[row] - base
-    by_place = np.nanmean(difference, 1)
+    by_place, scored = np.nanmean(difference, 1), np.nanmean(scores[row], 1)
+    judged = by_place[~np.isnan(by_place)]  # a place may have none of the classes
     outcomes = [outcomes[row] for outcomes in found.values()]
     first = row.name == BASE
     seconds = float(np.mean([outcome.seconds for outcome in outcomes]))
@@ -136,14 +137,18 @@ def _arm(
         "miou": _mean(scores[row]),
         "difference": None if first else _mean(difference),
         "interval": None if first else interval(difference),
-        "better_in": "" if first else f"{int((by_place > 0).sum())} of {len(by_place)} places",
-        "by_place": dict(zip(places, by_place.tolist(), strict=True)),
-        "miou_by_place": dict(zip(places, np.nanmean(scores[row], 1).tolist(), strict=True)),
+        "better_in": "" if first else f"{int((judged > 0).sum())} of {len(judged)} places",
+        "by_place": dict(zip(places, map(_known, by_place), strict=True)),
+        "miou_by_place": dict(zip(places, map(_known, scored), strict=True)),
         "iou": _class_ious(plan, outcomes),
         "curve": _curve(plan, outcomes), "loss": [o.losses for o in outcomes if o.losses][:1],
         "budget": _budget(plan, row), "minutes": (seconds + preparation) / 60, "training_seconds": seconds,
         "preparation_seconds": preparation, "iterations": round(plan.settings.iterations * row.arm.iterations),
     }  # fmt: skip
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
 
 
 def _budget(plan: ProofPlan, row: Row) -> str:
@@ -181,7 +186,7 @@ def _chosen_elsewhere(plan: ProofPlan, scores: Mapping[Row, NDArray[np.float64]]
         return None
     gains = np.stack([scores[row] - base for row in rows])
     means = np.nanmean(gains, 2)
-    picked = [int(np.argmax(np.delete(means, place, 1).mean(1))) for place in range(len(base))]
+    picked = [int(np.argmax(np.nanmean(np.delete(means, place, 1), 1))) for place in range(len(base))]
     chosen = np.stack([gains[arm, place] for place, arm in enumerate(picked)])
     return {"difference": _mean(chosen), "interval": interval(chosen), "arms": [rows[i].key for i in picked]}
 

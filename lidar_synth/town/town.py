@@ -4,6 +4,8 @@ to scan, among static and moving objects. Stretches lie a kilometre apart in the
 accumulating scans by pose never mixes two of them.
 """
 
+import hashlib
+import json
 from collections import OrderedDict
 from dataclasses import asdict
 from pathlib import Path
@@ -118,6 +120,12 @@ class Town:
         """Plain values that determine the scans, apart from their number."""
         plain = {"seed": self.seed, "interval": self.interval, "sensor": self.sensor.to_dict()}
         return {**plain, "noise": asdict(self._noise), "motion": self._motion, "skin": self.skin and self.skin.digest}
+
+    @property
+    def identity(self) -> str:
+        """A text that tells it from other towns."""
+        digest = hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()
+        return f"town:{len(self)}:{digest[:16]}"
 
     @property
     def calibration(self) -> Calibration:

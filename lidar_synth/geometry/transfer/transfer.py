@@ -1,5 +1,6 @@
 """``Transfer``: what another sensor on another mount would have recorded of the same scene."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
@@ -164,6 +165,14 @@ class SeenAs:
     def __init__(self, source: Source, transfer: Transfer, seed: int = 0) -> None:
         self.source, self.transfer, self.seed = source, transfer, seed
         self.sensor = transfer.target
+
+    @property
+    def identity(self) -> str:
+        """A text that tells it from other sources: the source, or the names of its scans, transfer and seed."""
+        names = "\n".join(map(str, getattr(self.source, "ids", ())))
+        source = getattr(self.source, "identity", "") or f"{type(self.source).__name__}:{len(self)}:{names}"
+        text = f"{source} as {self.transfer.identity}, seed {self.seed}"
+        return f"{type(self).__name__}:{len(self)}:{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
     def __len__(self) -> int:
         return len(self.source)

@@ -48,6 +48,8 @@ def figures(work: Work, made: Checkpoint) -> dict[str, Any]:
     train, held = work.scans.images(TRAIN), work.scans.images(HELD)
     if CODEC in made.networks:
         found["reconstruction"] = _reconstruction(made, held)
+        if not work.scans.labelled:  # their labels are the autoencoder's own
+            found["reconstruction"].pop("label_accuracy", None)
     found["nearest"] = _nearest(made, train, held)
     return found
 
