@@ -1,5 +1,6 @@
 """Baking: every engine writes the same bytes; invalid settings are refused before any work."""
 
+import hashlib
 import itertools
 import re
 import shutil
@@ -106,7 +107,9 @@ def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
     index = bake(plan, progress=False)
     assert index is not None and plan.facts.label_policy == "condition"
     bank, source = Bank(plan.out), open_scans(real)
-    assert bank.facts.condition == {"kind": "semantic", "source": str(real), "layout": None, "split": None}
+    names = hashlib.sha256("\n".join(source.ids).encode()).hexdigest()
+    known = {"kind": "semantic", "source": str(real), "layout": None, "split": None, "content": names}
+    assert bank.facts.condition == known
     [expected] = load_generator(model).range_images(2, [9], [source[0]])
     assert bank.condition(5) == source.ids[0]  # index 9 of 3 conditions
     assert np.allclose(bank.image(5).range, expected.range, atol=1e-3)

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -284,6 +285,22 @@ def test_a_folder_filled_from_something_else_is_refused(tmp_path: Path) -> None:
     (out.root / SETTINGS).write_text("{")
     with pytest.raises(DataError, match="damaged"):
         convert(a, out, progress=False)
+
+
+def test_other_options_of_the_reader_do_not_keep_the_old_scans(tmp_path: Path) -> None:
+    values = np.full((20, 4), 5, "<f4")
+    (tmp_path / "in").mkdir()
+    (values * [1, 1, 0, 10]).astype("<f4").tofile(tmp_path / "in" / "a.bin")
+    out, changed = WRITERS["npz"](tmp_path / "out"), WRITERS["npz"](tmp_path / "changed")
+    convert(open_scans(tmp_path / "in", reflectance_max=65535), out, progress=False)
+    with pytest.raises(ConfigError, match="was filled with .*reflectance_max.*65535.*choose another folder"):
+        convert(open_scans(tmp_path / "in", reflectance_max=255), out, progress=False)
+    target = load_sensor("vlp16")
+    mistaken = open_scans(tmp_path / "in", reflectance_max=255, sensor="vlp16")
+    with suppress(DataError):  # these points are no streets
+        convert(mistaken, changed, as_sensor=target, progress=False)
+    with pytest.raises(ConfigError, match="was filled with"):
+        convert(open_scans(tmp_path / "in", reflectance_max=255), changed, as_sensor=target, progress=False)
 
 
 @pytest.mark.parametrize("options", [{}, {"tr": False}, {"calib": False}, {"times": False}])

@@ -245,6 +245,19 @@ def test_the_command_line_keeps_the_calibration(tmp_path: Path) -> None:
         assert np.allclose(a.projection, b.projection) and np.allclose(a.camera_from_sensor, b.camera_from_sensor)
 
 
+def test_a_moved_object_keeps_its_box_without_pictures(tmp_path: Path) -> None:
+    """The folder ``image_2``, from which the size of the image is known, need not be there."""
+    root = kitti(tmp_path / "kitti", 1)
+    shutil.rmtree(root / "training" / "image_2")
+    [scan] = open_scans(root)
+    box = int(np.argmax([returns_of(scan, scan.boxes[[i]]).sum() for i in range(len(scan.boxes))]))
+    command = ["edit", "move", str(root), str(tmp_path / "out"), "--box", str(box), "--at", "20,0"]
+    result = CliRunner().invoke(app, [*command, "--to", "kitti_object"])
+    assert result.exit_code == 0, result.output + str(result.exception)
+    values = open_scans(tmp_path / "out")[0].boxes.values
+    assert np.abs(values[:, :2] - [20, 0]).sum(1).min() < 0.1
+
+
 def test_the_command_line_edits_scans(tmp_path: Path) -> None:
     writer = WRITERS["npz"](tmp_path / "in")
     writer.write(SCAN, 0)

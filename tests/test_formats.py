@@ -1,6 +1,7 @@
 """Writing and reading back, in every layout and format."""
 
-from dataclasses import fields
+import json
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,8 @@ from lidar_synth.formats import KITTI360, READERS, WRITERS, KITTIObject, Semanti
 from lidar_synth.formats.cloud import STORED
 from lidar_synth.formats.png import RangePNG
 from lidar_synth.formats.range_images import RangeImages
-from lidar_synth.geometry.projection import locate, project
-from lidar_synth.geometry.scan import Boxes, Source
+from lidar_synth.geometry.projection import locate, project, unproject
+from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Source
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.viz.window import import_open3d
 
@@ -237,6 +238,35 @@ def test_range_images_as_plain_arrays(tmp_path: Path, shape: str) -> None:
     source = open_scans(tmp_path, sensor="hdl64e_kitti")
     assert isinstance(source, RangeImages) and same(source.image(0).range, image.range)
     assert len(source[0]) == image.mask.sum()
+
+
+def test_range_images_have_the_sensor_and_the_origin_beside_them(tmp_path: Path) -> None:
+    scan = some_scan(sensor="os1_64")
+    image = project(scan)
+    np.save(tmp_path / "image.npy", image.range)
+    said = {"format": "lidar-synth-scans/1", "sensor": "os1_64", "origins": [{"domain": "synthetic"}]}
+    (tmp_path / "scans.json").write_text(json.dumps(said))
+    for source in (open_scans(tmp_path), open_scans(tmp_path, sensor="os1_64")):
+        [read] = source
+        assert (read.sensor.name, read.domain) == ("os1_64", SYNTHETIC)
+        assert np.abs(read.points - unproject(image).points).max() < 1e-4
+    with pytest.warns(UserWarning, match="says that its scans are of sensor 'os1_64'"):
+        assert open_scans(tmp_path, sensor="hdl64e_kitti").sensor.name == "hdl64e_kitti"
+
+
+@pytest.mark.parametrize("to", ["npz", "range", "webdataset"])
+def test_fields_of_other_types_are_written_in_those_of_files(tmp_path: Path, to: str) -> None:
+    """Reflectances divided by 255 in numpy are float64. Projection takes points in float32 only."""
+    scan = some_scan()
+    kind = np.float32 if to == "range" else np.float64
+    wide = replace(scan, points=scan.points.astype(kind), reflectance=scan.reflectance.astype(np.float64),
+                   label=scan.label.astype(np.int64), raw_label=None)  # fmt: skip
+    write_all(to, tmp_path / "wide", [wide])
+    write_all(to, tmp_path / "same", [replace(scan, raw_label=None)])
+    [a], [b] = open_scans(tmp_path / "wide"), open_scans(tmp_path / "same")
+    assert same(a.points, b.points) and same(a.reflectance, b.reflectance) and same(a.label, b.label)
+    with pytest.raises(DataError, match="label holds 300; expected whole numbers that uint8 can hold"):
+        write_all(to, tmp_path / "bad", [replace(wide, label=np.full(len(scan), 300))])
 
 
 def test_npy_and_other_fields_in_a_folder(tmp_path: Path) -> None:

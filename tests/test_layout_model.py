@@ -1,5 +1,6 @@
 """A model of layouts from its condition to a trainer: boxes and instances through scans, banks and mixtures."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -154,6 +155,22 @@ def test_banks_with_boxes_are_split_merged_and_repaired(bank: Path, model: Path,
     assert Bank(tmp_path / "plain").index.sources[0].format == FORMAT
     with pytest.raises(ConfigError, match="holds"):
         merge([opened, Bank(tmp_path / "plain")], tmp_path / "mixed", progress=False)
+
+
+def test_changed_layouts_are_refused_when_a_bake_resumes_or_is_repaired(
+    model: Path, folder: Path, tmp_path: Path
+) -> None:
+    own = tmp_path / "layouts"
+    shutil.copytree(folder, own)
+    bake(plan_in(tmp_path / "bank", model, condition=str(own)), progress=False)
+    (tmp_path / "bank" / "shard-00000.h5").unlink()
+    (own / "one.yaml").write_text(LAYOUTS["two"])
+    with pytest.raises(ConfigError, match="which have changed since the bank was begun"):
+        repair(tmp_path / "bank", str(model), progress=False)
+    with pytest.raises(ConfigError, match="was filled with .*condition_content"):
+        bake(plan_in(tmp_path / "bank", model, condition=str(own)), progress=False)
+    (own / "one.yaml").write_text(LAYOUTS["one"])
+    assert repair(tmp_path / "bank", str(model), progress=False) == {"shard-00000.h5": "regenerated"}
 
 
 def test_a_detector_gets_boxes_from_the_bank_and_from_the_generator(bank: Path, model: Path, folder: Path) -> None:

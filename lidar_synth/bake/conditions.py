@@ -3,12 +3,14 @@
 The dataset of a layout model may be a YAML file of a layout, or a folder of them.
 """
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files.disk import read_file
 from lidar_synth.formats import ScanFiles, open_scans
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.layout import Layout
@@ -49,6 +51,14 @@ class LayoutFiles:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def contents(self) -> list[bytes]:
+        """The bytes of the files.
+
+        Raises:
+            FileError: if one cannot be read.
+        """
+        return [read_file(file) for file in self._files]
 
     def read(self, index: int) -> Layout:
         """The layout of one file; raises as ``load_layout``."""
@@ -116,6 +126,18 @@ def _check_camera(source: ScanFiles, focal: float | None) -> None:
             f"{focal:.1f} pixels, the focal length that the model was trained with",
             "Crop and resize the images to that field of view, and change the dataset's calibration files accordingly.",
         )
+
+
+def fingerprint(source: ConditionSource | None) -> str | None:
+    """Hash of the layouts, or of the names of a dataset's scans; None for an unconditional model.
+
+    Raises:
+        FileError: if a layout cannot be read.
+    """
+    if source is None:
+        return None
+    parts = source.contents() if isinstance(source, LayoutFiles) else [name.encode() for name in source.ids]
+    return hashlib.sha256(b"\n".join(parts)).hexdigest()
 
 
 def conditions(source: ConditionSource | None, indices: Iterable[int]) -> list[Scan | Layout] | None:

@@ -185,13 +185,12 @@ def _check_empty(out: Path) -> None:
 
 
 def _check_disjoint(banks: Sequence[Bank]) -> None:
-    """Refuse banks that share a scan: the same checkpoint, settings, seed and index."""
-    taken: dict[tuple[str, str, int], list[tuple[int, int, str | Path]]] = {}
+    """Refuse banks that share a scan: the same model, seed and index, by which scans are named."""
+    taken: dict[tuple[str, int], list[tuple[int, int, str | Path]]] = {}
     for bank in banks:
         for entry in bank.index.shards:
             facts = bank.index.sources[entry.source]
-            how = str([facts.settings.get(key) for key in ("steps", "solver")])
-            others = taken.setdefault((facts.checkpoint, how, entry.seed), [])
+            others = taken.setdefault((facts.model, entry.seed), [])
             for first, stop, root in others:
                 if entry.first < stop and first < entry.first + entry.scans:
                     raise ConfigError(

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 import lidar_synth
-from lidar_synth.bake.conditions import conditions_for
+from lidar_synth.bake.conditions import conditions_for, fingerprint
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
@@ -70,6 +70,8 @@ def settings_of(facts: Facts) -> dict[str, Any]:
     """All settings that determine the bytes of a bank with these facts, sorted by name."""
     others = {"checkpoint": facts.checkpoint, "fields": list(facts.fields), "compression": facts.compression,
               "layout": facts.layout}  # fmt: skip
+    if facts.condition and "content" in facts.condition:  # banks of earlier versions do not have it
+        others["condition_content"] = facts.condition["content"]
     return dict(sorted((facts.settings | others | facts.software).items()))
 
 
@@ -86,7 +88,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     if job.first + job.count >= 2**63:
         raise ConfigError(f"scans up to index {job.first + job.count}", "less than 2^63")
     generator = load_generator(job.model, columns=job.columns)
-    conditions_for(generator, job.condition, job.condition_layout, job.condition_split)
+    source = conditions_for(generator, job.condition, job.condition_layout, job.condition_split)
     fields = _fields(job, generator.fields)
     software = {"lidar_synth": lidar_synth.__version__, "torch": torch.__version__, "numpy": np.__version__,
                 "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "deflate": deflate.__version__,
@@ -104,7 +106,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     header = generator.header
     labelled = "generated" if "label" in header.channels else "condition"
     reference = {"kind": generator.condition, "source": job.condition, "layout": job.condition_layout,
-                 "split": job.condition_split}  # fmt: skip
+                 "split": job.condition_split, "content": fingerprint(source)}  # fmt: skip
     facts = Facts(
         sensor=generator.sensor, fields=fields, model=generator.name, checkpoint=generator.hash,
         settings=resolved.model_dump(exclude=elsewhere),

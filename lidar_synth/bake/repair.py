@@ -97,6 +97,11 @@ def _index_from_shards(root: Path, damage: Exception) -> Index:
     shards = BakePlan(root, job_of(facts), facts).shards
     if any(other != facts for other, _ in found.values()) or not {e for _, e in found.values()} <= set(shards):
         raise DataError(f"{damage}, and the shards of {root} are of different bakes", "a copy of the index") from damage
+    absent = [entry.file for entry in shards if not (root / entry.file).exists()]
+    if absent and not (root / SETTINGS).is_file():  # the part of a split, too, has the first shards of a bake
+        raise DataError(
+            f"{damage}, and {absent[0]} is not there, nor {SETTINGS}, which a bake leaves", "a copy of the index"
+        ) from damage
     entries = []
     for entry in shards:
         path = root / entry.file

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from lidar_synth.bake.conditions import ConditionSource, condition_names, conditions, open_conditions
+from lidar_synth.bake.conditions import ConditionSource, condition_names, conditions, fingerprint, open_conditions
 from lidar_synth.bake.folder import at_work, finished, publish
 from lidar_synth.bake.job import DTYPES, BakePlan
 from lidar_synth.bake.options import BakeJob
@@ -125,6 +125,13 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
             f"model {job.model!r}, checkpoint {generator.hash[:12]}",
             f"the checkpoint that made the bank's scans, {facts.model} {facts.checkpoint[:12]}",
             "Give its file with --model.",
+        )
+    wanted = (facts.condition or {}).get("content")
+    if wanted is not None and fingerprint(_source(job)) != wanted:
+        raise ConfigError(
+            f"conditions {job.condition}, which have changed since the bank was begun",
+            "the files, or the names of scans, of its first shard",
+            "Restore them, or bake into another folder.",
         )
     return generator
 

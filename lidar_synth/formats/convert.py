@@ -5,6 +5,7 @@ is skipped and reported. Each worker process has its own copy of source and writ
 of the whole folder at the end.
 """
 
+import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -236,10 +237,10 @@ def _settings(source: Source, writer: Writer, change: AsSensor | None, unfold: b
     """The settings that determine which scans are written, as far as the source has them."""
     settings: dict[str, Any] = {"scans": len(source), "writer": type(writer).__name__, "unfold": unfold}
     if isinstance(source, ScanFiles):
-        settings |= {"root": str(source.root.resolve()), "sensor": source.sensor.to_dict()}
-    if change is not None:
-        settings["sensor"] = change.identity
-    return settings
+        names = hashlib.sha256("\n".join(source.ids).encode()).hexdigest()
+        settings |= {"root": str(source.root.resolve()), "sensor": source.sensor.to_dict(), "names": names}
+        settings["options"] = source.options
+    return settings | {"as_sensor": None if change is None else change.identity}
 
 
 Item = TypeVar("Item")

@@ -67,6 +67,10 @@ class Folder(ScanFiles):
         super().__init__(root, ids, sensor, on_bad, stored=_named_sensor(self._paths[0]))
         self._fields, self._reflectance_max = fields, reflectance_max
 
+    @property
+    def options(self) -> dict[str, Any]:
+        return {"fields": self._fields, "reflectance_max": self._reflectance_max}
+
     def read(self, index: int) -> Scan:
         scan = self._decode(self._paths[index])
         scan.id = self.ids[index]

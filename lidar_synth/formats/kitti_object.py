@@ -12,8 +12,9 @@ Layout (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme):
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -124,6 +125,10 @@ class KITTIObject(ScanFiles):
             id=self.ids[index],
         )
 
+    @property
+    def options(self) -> dict[str, Any]:
+        return {"velodyne": self._velodyne}
+
     def calibration(self, index: int) -> Calibration | None:
         part, frame = self.ids[index].split("/")
         path = self.root / part / "calib" / f"{frame}.txt"
@@ -169,8 +174,10 @@ class KITTIObjectWriter(Writer):
         if picture is None:
             width, height = camera.image_size or (1242, 375)
             picture = np.zeros((height, width, 3), np.uint8)
-        write_image(folder / "image_2" / f"{frame}.png", picture)
+        image = folder / "image_2" / f"{frame}.png"
+        write_image(image, picture)
         write_calibration(folder / "calib" / f"{frame}.txt", camera)
+        camera = replace(camera, image_size=png_size(image))  # which boxes are in view depends on it
         if folder.name == "training" and scan.boxes is not None:
             write_label_2(folder / "label_2" / f"{frame}.txt", scan.boxes, camera)
         self._write_points(path, scan)

@@ -49,14 +49,37 @@ def stored_sensor(path: Path) -> Sensor | None:
         return None  # reading the scan will raise the error
 
 
+def stored(arrays: Mapping[str, NDArray[Any]], where: Path | str) -> dict[str, NDArray[Any]]:
+    """The arrays of a scan in the types of files; reflectances divided in numpy, for instance, are float64.
+
+    Args:
+        arrays: points, or fields of ``TYPES``; others stay as they are.
+        where: the file, for errors.
+
+    Raises:
+        DataError: on integers that the type cannot hold, or no numbers.
+    """
+    result = {}
+    for name, values in arrays.items():
+        wanted = np.dtype(TYPES.get(name, values.dtype))
+        if values.dtype.kind not in "biuf":
+            raise DataError(f"{where}: {name} is {values.dtype}", "numbers")
+        cast = np.ascontiguousarray(values, wanted)
+        if wanted.kind in "iu" and not np.array_equal(cast, values):
+            outside = values[cast != values].flat[0]
+            raise DataError(f"{where}: {name} holds {outside}", f"whole numbers that {wanted} can hold")
+        result[name] = cast
+    return result
+
+
 def write_scan(path: Path, scan: Scan) -> None:
     """Write a scan as ``.npz``; ``decode_scan`` is the inverse.
 
     Raises:
+        DataError: as ``stored``.
         FileError: if it cannot be written.
     """
-    arrays = {"points": np.ascontiguousarray(scan.points), **scan.fields(), **_facts(scan)}
-    write_arrays(path, arrays)
+    write_arrays(path, stored({"points": scan.points, **scan.fields()}, path) | _facts(scan))
 
 
 def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | None = None) -> Scan:
@@ -86,7 +109,7 @@ def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -
         FileError: if it cannot be written.
     """
     facts = {"sensor": np.array(json.dumps(image.sensor.to_dict()))} if scan is None else _facts(scan, image.sensor)
-    arrays = {"range": image.range, **image.channels, **facts}
+    arrays = {"range": np.asarray(image.range, np.float32), **stored(image.channels, path), **facts}
     write_arrays(path, arrays, compressed=True)
 
 

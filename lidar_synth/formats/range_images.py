@@ -9,7 +9,7 @@ As a source of scans, a set has one point per return: on the ray through the cel
 holds them. ``image`` returns the range image itself.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -86,16 +86,24 @@ class RangeImages(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
-        if convention is None:
-            of_sensor = {c.sensor: name for name, c in CONVENTIONS.items()}
-            convention = "kitti" if sensor is None else of_sensor.get(load_sensor(sensor).name, "kitti")
-        self._convention = choose("convention", convention, CONVENTIONS)
         self._base, paths = scan_paths(root, SUFFIXES)
         ids = [path.relative_to(self._base).with_suffix("").as_posix() for path in paths]
-        given = None if sensor is None else load_sensor(sensor)
-        grid = stored_sensor(paths[0]) or given or load_sensor(self._convention.sensor)
-        super().__init__(root, ids, None, on_bad, stored=grid)
-        self._suffix, self._given = paths[0].suffix, given
+        stored = stored_sensor(paths[0])
+        super().__init__(root, ids, sensor if stored is None else None, on_bad, stored=stored)
+        self._suffix, self._given = paths[0].suffix, None if sensor is None else load_sensor(sensor)
+        said = None if self.description is None else self.description.sensor
+        named = any(known is not None for known in (self._given, stored, said))
+        if convention is None:
+            of_sensor = {c.sensor: name for name, c in CONVENTIONS.items()}
+            convention = of_sensor.get(self.sensor.name, "kitti") if named else "kitti"
+        self._convention = choose("convention", convention, CONVENTIONS)
+        if not named:
+            self.sensor = load_sensor(self._convention.sensor)
+        self.skip_sensor_check()  # the grid is the sensor's: points on its rays agree with any
+
+    @property
+    def options(self) -> dict[str, Any]:
+        return asdict(self._convention)
 
     def image(self, index: int) -> RangeImage:
         """The range image at ``index``.

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import ClassVar, Literal, TypeVar, get_args
+from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats.calibration import Calibration
@@ -87,6 +87,11 @@ class ScanFiles(ABC):
         self.on_bad = on_bad
         self.skipped: dict[str, str] = {}
         self.dropped: dict[str, int] = {}
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Further options of the reader that determine its scans, as plain values."""
+        return {}
 
     @abstractmethod
     def read(self, index: int) -> Scan:
