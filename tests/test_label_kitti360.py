@@ -111,6 +111,9 @@ def test_a_rerun_repeats_only_what_is_missing_or_changed(copy: Path, tmp_path: P
     poses = copy / "data_poses" / DRIVE / "poses.txt"
     poses.write_text(poses.read_text() + "\n")
     assert label_scans(copy, out, progress=False).kept == 0
+    mounted = next((copy / "calibration").glob("calib_cam_to_velo*.txt"))
+    mounted.write_text(mounted.read_text() + "\n")
+    assert label_scans(copy, out, progress=False).kept == 0
     _beside(copy)
     with pytest.raises(DataError, match="do not lie on"):
         label_scans(copy, out, progress=False)

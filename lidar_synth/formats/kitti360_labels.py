@@ -241,6 +241,7 @@ def _inputs(root: Path, against: Path | None, job: WindowJob) -> dict[str, Any]:
         "frames": [job.frames[0], job.frames[-1], len(job.frames)],
         "sizes": [[f"{p.parent.name}/{p.name}", p.stat().st_size] for p in (*files, *([boxes] if boxes else []))],
         "poses": _hash(root / "data_poses" / job.drive / "poses.txt"),
+        "calibration": {p.name: _hash(p) for p in sorted((root / "calibration").glob("*.txt"))},
         "against": None if against is None else str(against.resolve()),
     }
 
