@@ -1,4 +1,4 @@
-"""Curated banks: they hold the kept scans, and merge, split, head and repair keep the curation."""
+"""Curated banks and parts of banks: they hold the kept scans, and merge, split, head and repair keep the curation."""
 
 import shutil
 from pathlib import Path
@@ -159,3 +159,21 @@ def test_an_index_with_invalid_dropped_positions_is_refused(dropped: tuple[int, 
         Index((some_facts(),), (Entry("a.h5", 0, 0, 3, dropped=dropped),), curation=("by hand",))
     with pytest.raises(DataError, match="and the rule"):
         Index((some_facts(),), (Entry("a.h5", 0, 0, 3, dropped=(1,)),))
+
+
+def test_a_part_without_its_index_does_not_get_the_other_parts(original: Path, model: Path, tmp_path: Path) -> None:
+    """A part has the names, and may have the first shards, of the whole bake."""
+    split(Bank(original), {tmp_path / "train": 3 / 8, tmp_path / "val": 5 / 8}, progress=False)
+    (tmp_path / "train" / INDEX).unlink()
+    with pytest.raises(DataError, match="shard-00001.h5 is not there, nor .bake.json.*a copy of the index"):
+        repair(tmp_path / "train", str(model), progress=False)
+    assert [path.name for path in (tmp_path / "train").glob("*.h5")] == ["shard-00000.h5"]
+
+
+def test_the_same_scans_by_other_settings_are_not_merged(model: Path, tmp_path: Path) -> None:
+    banks = []
+    for name, steps in (("own", None), ("named", 2)):
+        bake(make_plan(tmp_path / name, BakeJob(model=str(model), count=2, steps=steps)), progress=False)
+        banks.append(Bank(tmp_path / name))
+    with pytest.raises(ConfigError, match="both hold scan 0 of seed 0"):
+        merge(banks, tmp_path / "both", progress=False)

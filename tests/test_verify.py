@@ -175,24 +175,6 @@ def test_repair_rebuilds_a_bank_from_its_shards(root: Path, original: Path) -> N
     assert sides(root) == sides(original) and (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
 
 
-def test_a_part_without_its_index_does_not_get_the_other_parts(original: Path, model: Path, tmp_path: Path) -> None:
-    """A part has the names, and may have the first shards, of the whole bake."""
-    split(Bank(original), {tmp_path / "train": 3 / 8, tmp_path / "val": 5 / 8}, progress=False)
-    (tmp_path / "train" / INDEX).unlink()
-    with pytest.raises(DataError, match="shard-00001.h5 is not there, nor .bake.json.*a copy of the index"):
-        repair(tmp_path / "train", str(model), progress=False)
-    assert [path.name for path in (tmp_path / "train").glob("*.h5")] == ["shard-00000.h5"]
-
-
-def test_the_same_scans_by_other_settings_are_not_merged(model: Path, tmp_path: Path) -> None:
-    banks = []
-    for name, steps in (("own", None), ("named", 2)):
-        bake(make_plan(tmp_path / name, BakeJob(model=str(model), count=2, steps=steps)), progress=False)
-        banks.append(Bank(tmp_path / name))
-    with pytest.raises(ConfigError, match="both hold scan 0 of seed 0"):
-        merge(banks, tmp_path / "both", progress=False)
-
-
 def test_an_index_of_an_older_version_lists_no_other_files(root: Path, original: Path, model: Path) -> None:
     """It is the same bank; its settings file with another order of keys is kept."""
     values = json.loads((root / INDEX).read_bytes())

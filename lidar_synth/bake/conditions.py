@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files.disk import read_file
+from lidar_synth.files.disk import hash_of_names, read_file
 from lidar_synth.formats import ScanFiles, open_scans
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.layout import Layout
@@ -136,8 +136,9 @@ def fingerprint(source: ConditionSource | None) -> str | None:
     """
     if source is None:
         return None
-    parts = source.contents() if isinstance(source, LayoutFiles) else [name.encode() for name in source.ids]
-    return hashlib.sha256(b"\n".join(parts)).hexdigest()
+    if isinstance(source, LayoutFiles):
+        return hashlib.sha256(b"\n".join(source.contents())).hexdigest()
+    return hash_of_names(source.ids)
 
 
 def conditions(source: ConditionSource | None, indices: Iterable[int]) -> list[Scan | Layout] | None:

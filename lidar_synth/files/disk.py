@@ -138,6 +138,11 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
     write_file(path, lambda file: save(file, **values))
 
 
+def hash_of_names(names: Iterable[str]) -> str:
+    """SHA-256 of several names, in their order; of any names, such as those of files that are no UTF-8."""
+    return hashlib.sha256("\n".join(names).encode(errors="surrogatepass")).hexdigest()
+
+
 def sha256(path: Path) -> str:
     """The SHA-256 of a file's bytes, as hexadecimal digits.
 

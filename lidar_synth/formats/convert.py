@@ -5,7 +5,6 @@ is skipped and reported. Each worker process has its own copy of source and writ
 of the whole folder at the end.
 """
 
-import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -18,6 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.disk import hash_of_names
 from lidar_synth.formats import OnBad, ScanFiles, Writer
 from lidar_synth.formats.as_sensor import AsSensor
 from lidar_synth.formats.description import NAME, Origin, add_origin
@@ -237,8 +237,8 @@ def _settings(source: Source, writer: Writer, change: AsSensor | None, unfold: b
     """The settings that determine which scans are written, as far as the source has them."""
     settings: dict[str, Any] = {"scans": len(source), "writer": type(writer).__name__, "unfold": unfold}
     if isinstance(source, ScanFiles):
-        names = hashlib.sha256("\n".join(source.ids).encode()).hexdigest()
-        settings |= {"root": str(source.root.resolve()), "sensor": source.sensor.to_dict(), "names": names}
+        settings |= {"root": str(source.root.resolve()), "sensor": source.sensor.to_dict()}
+        settings["names"] = hash_of_names(source.ids)
         settings["options"] = source.options
     return settings | {"as_sensor": None if change is None else change.identity}
 

@@ -1,6 +1,5 @@
 """``Sources``: several sources as one; and the check that sources can be mixed."""
 
-import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.disk import hash_of_names
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -66,8 +66,8 @@ def identity_of(source: Any) -> str:
     """A text that identifies a source: its ``identity``, or its class, its length and a hash of its scans' names."""
     if own := getattr(source, "identity", ""):
         return str(own)
-    names = "\n".join(map(str, getattr(source, "ids", ())))
-    return f"{type(source).__name__}:{len(source)}:{hashlib.sha256(names.encode()).hexdigest()[:16]}"
+    names = hash_of_names(map(str, getattr(source, "ids", ())))
+    return f"{type(source).__name__}:{len(source)}:{names[:16]}"
 
 
 def sensor_of(source: Any) -> Sensor:

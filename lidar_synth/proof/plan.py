@@ -4,11 +4,11 @@ A *pair* is a place that is left out and a seed; it has one training of every ar
 whole pairs are compared.
 """
 
-import hashlib
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from lidar_synth.datasets.recordings import Recordings
+from lidar_synth.files.disk import hash_of_names
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.proof.arms import Row
 from lidar_synth.proof.places import Places, spread
@@ -83,7 +83,7 @@ class ProofPlan:
         """Plain values that determine every training, to tell whether one that exists may be kept."""
         own = asdict(self.settings)
         free = ("arms", "ratios", "seeds", "classes", "only")  # they add trainings, or score the same ones
-        digest = hashlib.sha256("\n".join(self.names).encode()).hexdigest()
+        digest = hash_of_names(self.names)
         return {
             "format": FORMAT, "scans": digest, "sensor": self.sensor.name, "half": self.half,
             **{name: value for name, value in own.items() if name not in free},

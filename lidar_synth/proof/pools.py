@@ -4,7 +4,6 @@ A pool is a folder; ``objects.npz`` in the pool ``skin`` holds the objects that 
 continued where it stopped.
 """
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,7 +16,7 @@ import numpy as np
 from lidar_synth.datasets.recordings import CONTENT, Recordings
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.evaluate.leakage import content_of, contents, overlap, seen_by, town
-from lidar_synth.files.disk import read_text, write_file
+from lidar_synth.files.disk import hash_of_names, read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
 from lidar_synth.formats.writer import claim
@@ -181,7 +180,7 @@ def _settings(task: PoolTask) -> dict[str, Any]:
     plain = {"kind": task.kind, "sensor": task.sensor.to_dict(), "grid": grid, "count": task.count}
     if task.kind == "generator":
         return plain | {"model": task.model, "checkpoint": read_header(find_model(task.model))[1]}
-    learnt = hashlib.sha256("\n".join(task.learnt).encode()).hexdigest()
+    learnt = hash_of_names(task.learnt)
     return plain | {"seed": task.town_seed} | ({"learnt_from": learnt} if task.kind == "skin" else {})
 
 

@@ -1,6 +1,5 @@
 """``Transfer``: what another sensor on another mount would have recorded of the same scene."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.files.disk import hash_of_names
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
@@ -169,10 +169,10 @@ class SeenAs:
     @property
     def identity(self) -> str:
         """A text that tells it from other sources: the source, or the names of its scans, transfer and seed."""
-        names = "\n".join(map(str, getattr(self.source, "ids", ())))
-        source = getattr(self.source, "identity", "") or f"{type(self.source).__name__}:{len(self)}:{names}"
-        text = f"{source} as {self.transfer.identity}, seed {self.seed}"
-        return f"{type(self).__name__}:{len(self)}:{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+        own = getattr(self.source, "identity", "") or type(self.source).__name__
+        names = map(str, getattr(self.source, "ids", ()))
+        digest = hash_of_names([own, *names, self.transfer.identity, str(self.seed)])
+        return f"{type(self).__name__}:{len(self)}:{digest[:16]}"
 
     def __len__(self) -> int:
         return len(self.source)

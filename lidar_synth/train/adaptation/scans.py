@@ -4,7 +4,6 @@ The last fifth of the scans is held out. The scans before it are left out, so th
 sides. Scans of several drives follow each other drive by drive.
 """
 
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.datasets.recordings import PLACES, TOWN, Recordings, frames_of
 from lidar_synth.errors import DataError
 from lidar_synth.evaluate.leakage import content_of, contents, recordings_of
-from lidar_synth.files.disk import read_text, write_file
+from lidar_synth.files.disk import hash_of_names, read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats import RangeImages, ScanFiles
 from lidar_synth.formats.npz import write_range_image
@@ -205,4 +204,4 @@ def _labelled(image: RangeImage, codec: Latent) -> RangeImage:
 
 def digest(ids: Sequence[str]) -> str:
     """sha256 of names, to tell whether the scans are the same when a run is resumed."""
-    return hashlib.sha256("\n".join(ids).encode()).hexdigest()
+    return hash_of_names(ids)
