@@ -49,6 +49,13 @@ def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> 
     assert train.mixture.synthetic[0].identity.startswith(f"generated:{generator.hash}:11:")
 
 
+def test_generators_that_differ_have_different_plans() -> None:
+    same = [load_generator("town-dense", **options) for options in ({}, {"columns": 2048})]
+    others = [load_generator("town-dense", **options) for options in ({"columns": 1024}, {"dtype": torch.bfloat16})]
+    assert len({Generated(generator).identity for generator in same}) == 1
+    assert len({Generated(generator).identity for generator in (*same, *others)}) == 3
+
+
 def test_sources_that_differ_have_different_plans() -> None:
     """A state of one mixture cannot be loaded into the other."""
     towns = [Town(0, scans=50), Town(1, scans=50), Town(0, scans=50, interval=2.0), Town(0, scans=49)]

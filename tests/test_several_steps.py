@@ -13,6 +13,12 @@ from lidar_synth.generate.generator import load_generator
 __all__ = ["one_thread", "scans", "teacher"]  # fixtures
 
 
+def test_other_numbers_of_steps_have_no_times_beside_a_given_grid(scans: Path, teacher: Path, tmp_path: Path) -> None:
+    config = write_config(scans, tmp_path, teacher=str(teacher), grid=[1, 0.5, 0], also=[1], intervals=2)
+    with pytest.raises(ConfigError, match=r"also=\[1\] with grid=\[1.0, 0.5, 0.0\]; expected grid=null"):
+        call("distill", config)
+
+
 def test_a_student_of_several_numbers_of_steps_is_distilled(scans: Path, teacher: Path, tmp_path: Path) -> None:
     config = distilling(scans, tmp_path, teacher)
     call("distill", config, "also=[2, 1]")

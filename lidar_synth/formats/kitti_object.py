@@ -177,7 +177,8 @@ class KITTIObjectWriter(Writer):
         image = folder / "image_2" / f"{frame}.png"
         write_image(image, picture)
         write_calibration(folder / "calib" / f"{frame}.txt", camera)
-        camera = replace(camera, image_size=png_size(image))  # which boxes are in view depends on it
+        if camera.image_size is None:  # on which depends which boxes are in view
+            camera = replace(camera, image_size=png_size(image))
         if folder.name == "training" and scan.boxes is not None:
             write_label_2(folder / "label_2" / f"{frame}.txt", scan.boxes, camera)
         self._write_points(path, scan)

@@ -112,6 +112,13 @@ class Generator:
         return make_codec(self.autoencoder, self.tensors, self.header.sensor.shape)
 
     @property
+    def variant(self) -> str:
+        """A text of what else than the checkpoint determines the scans: columns and precision; "" for its own."""
+        dtype = next(self.network.parameters()).dtype
+        columns = "" if self.sensor == self.header.sensor else f":{self.columns} columns"
+        return columns + ("" if dtype == torch.float32 else f":{dtype}")
+
+    @property
     def condition(self) -> str | None:
         """The name of the model's condition, a key of ``conditions.CONDITIONS``; None for an unconditional model."""
         return next(iter(self.header.conditioning), None)

@@ -102,7 +102,7 @@ class Generated:
         model = self.generator.hash or self.generator.name
         options = {k: v for k, v in sorted(self._sampling.items()) if v is not None}
         conditions = "" if self.condition is None else identity_of(self.condition)
-        return f"generated:{model}:{self.seed}:{options}:{conditions}"
+        return f"generated:{model}:{self.seed}:{options}:{conditions}{self.generator.variant}"
 
     def __getitem__(self, number: int) -> Scan:
         if number in self._cached:

@@ -193,6 +193,7 @@ def _open_folder(folder: Path, facts: dict[str, Any], layout: Layout, sensor: Se
             return ImageCache(maps, sensor), done
         folder.mkdir(parents=True, exist_ok=True)
         new = {n: np.lib.format.open_memmap(folder / f"{n}.npy", "w+", d, s) for n, (s, d) in layout.items()}
+        _note(folder, facts, 0)  # another run that opens the folder now does not empty the files
         return ImageCache(new, sensor), 0
     except (OSError, KeyError, json.JSONDecodeError) as error:
         raise FileError(f"the cache {folder} cannot be opened ({error})", "a folder that can be written") from error

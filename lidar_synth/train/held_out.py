@@ -15,6 +15,7 @@ from lidar_synth.train.config import Run
 from lidar_synth.train.data import Batches
 from lidar_synth.train.loop import weighted
 from lidar_synth.train.plan import TrainingPlan, open_data
+from lidar_synth.train.schedules import ENDLESS, PLATEAU
 from lidar_synth.train.state import Training
 
 if TYPE_CHECKING:
@@ -79,9 +80,12 @@ class Watch:
 
     @property
     def exhausted(self) -> bool:
-        """Whether the loss has not fallen for as many measurements as the run has patience."""
+        """Whether the loss has not fallen for as many measurements as the run has patience. Those before the learning
+        rate begins to fall do not count where a plateau ended, or the rate would never fall."""
         assert self.config.held_out is not None
-        losses = [m.loss for m in self.measured]
+        recipe = self.config.recipe
+        begin = PLATEAU * recipe.iterations if recipe.schedule == "trapezoid" and recipe.iterations < ENDLESS else 0
+        losses = [m.loss for m in self.measured if m.step >= begin]
         return bool(losses) and len(losses) - 1 - losses.index(min(losses)) >= self.config.held_out.patience
 
     def measure(self, training: Training) -> bool:

@@ -22,7 +22,8 @@ from lidar_synth.train.config import (
     published_models,
     read_values,
 )
-from lidar_synth.train.staged import ENDLESS, StagedRuns
+from lidar_synth.train.schedules import ENDLESS
+from lidar_synth.train.staged import StagedRuns
 
 LEAST = 0.01
 """Least minutes of a stage."""

@@ -132,6 +132,11 @@ def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> TrainingPla
 
 def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingPlan:
     """Distillation on the given, the selected or a uniform grid, from the teacher's weights."""
+    if config.also and config.grid is not None:
+        raise ConfigError(
+            f"also={list(config.also)} with grid={list(config.grid)}",
+            "grid=null: the times of all numbers of steps are selected together",
+        )
     teacher = load_checkpoint(config.teacher, accelerator.device)
     if VELOCITY not in teacher.networks:
         raise ConfigError(f"teacher {config.teacher}, an autoencoder", "a model that generates")

@@ -159,15 +159,14 @@ def _train(
 
 
 def _save(config: Run, plan: TrainingPlan, training: Training, data: Batches, watch: Watch | None) -> None:
-    best = watch is None or watch.measure(training)
+    """Write the checkpoint, if it is the best, and then the state: what is lost in between is trained again."""
+    if watch is None or watch.measure(training):
+        if isinstance(training.average, Autoencoding):
+            training.average.finish(data)
+        facts = {"iterations": training.step} | ({} if watch is None else {"held_out_loss": watch.least})
+        header = replace(plan.header, provenance=plan.header.provenance | facts)
+        save_checkpoint(checkpoint_path(config), header, plan.parts(training.average))
     training.save(config.output / STATE)
-    if not best:
-        return
-    if isinstance(training.average, Autoencoding):
-        training.average.finish(data)
-    facts = {"iterations": training.step} | ({} if watch is None else {"held_out_loss": watch.least})
-    header = replace(plan.header, provenance=plan.header.provenance | facts)
-    save_checkpoint(checkpoint_path(config), header, plan.parts(training.average))
 
 
 class _Log:

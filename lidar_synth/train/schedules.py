@@ -6,6 +6,8 @@ To add one: write it, enter it in ``SCHEDULES``.
 import math
 from collections.abc import Callable
 
+ENDLESS = 10**9
+"""Iterations of a run that a limit of time or early stopping ends."""
 PLATEAU = 0.75
 """Share of the iterations before ``trapezoid`` falls."""
 

@@ -15,11 +15,9 @@ from lidar_synth.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.train.config.load import Config
 from lidar_synth.train.resume import began_with
 from lidar_synth.train.runs import checkpoint_path, run
-from lidar_synth.train.schedules import PLATEAU
+from lidar_synth.train.schedules import ENDLESS, PLATEAU
 from lidar_synth.train.state import STATE, read_progress
 
-ENDLESS = 10**9
-"""Iterations of a run that a limit of time or early stopping ends."""
 DONE = "done"
 """An empty file in the folder of a run that later ones have started from, or may start from."""
 

@@ -21,7 +21,7 @@ from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.generator import find_model
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.models import build_network, network_class
-from lidar_synth.train.config import PARENTS, Data, Network, Run, TrainConfig
+from lidar_synth.train.config import PARENTS, Condition, Data, Network, Run, TrainConfig
 
 
 def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
@@ -67,9 +67,34 @@ def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     header = replace(start.header, networks=kept, time_grid=grid, provenance=provenance)
     if not (config.autoencodes or config.decoder):
         networks, header = _without_ends(networks, header)
-    if config.condition is None or ENCODER in networks or config.autoencodes:
+    if config.condition is None or config.autoencodes:
         return networks, header
+    if ENCODER in networks:
+        return networks, _same_condition(config, config.condition, header)
     return _add_condition(config, networks, header)
+
+
+def _same_condition(config: TrainConfig, condition: Condition, header: Header) -> Header:
+    """The header of a conditional model that is trained further, with the shares of ``condition`` that are given.
+
+    Raises:
+        ConfigError: if the model has another condition.
+    """
+    [(kind, held)] = header.conditioning.items()
+    encoder = header.networks[ENCODER]
+    known = {"kind": kind, "encoder": encoder.architecture, "arguments": encoder.arguments} | held
+    given = {name: value for name, value in condition if name in condition.model_fields_set and value is not None}
+    shares = {name: value for name, value in given.items() if name.endswith("dropout")}
+    if isinstance(given.get("arguments"), dict):  # those that a configuration names: sizes follow from the data
+        known["arguments"] = {name: known["arguments"].get(name) for name in given["arguments"]}
+    for name in sorted(given.keys() - shares.keys()):
+        value = list(given[name]) if isinstance(given[name], tuple) else given[name]
+        if value != known.get(name):
+            raise ConfigError(
+                f"condition.{name} {value!r} for init {config.init}", f"that of the model, {known.get(name)!r}"
+            )
+    changed = {name: value for name, value in (held | shares).items() if value}
+    return replace(header, conditioning={kind: changed})
 
 
 def _without_ends(networks: dict[str, nn.Module], header: Header) -> tuple[dict[str, nn.Module], Header]:

@@ -98,10 +98,12 @@ class RollingBank:
         if header.conditioning:
             raise ConfigError(f"a rolling bank of {path}, a conditional model", "an unconditional model")
         channels = set(header.channels) | ({"confidence"} if "label" in header.channels else set())
-        replaced = round((refresh or 0) * slots)
+        replaced = max(1, round(refresh * slots)) if refresh else 0
         self.sensor = header.sensor
         self.fields = frozenset(channels - {"range"} | {"reflectance"})
-        self.identity = f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:{starved}:{replaced}"
+        dtype = str(options.get("dtype", "torch.float32"))
+        precision = "" if dtype.endswith("float32") else f":{dtype}"
+        self.identity = f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:{starved}:{replaced}{precision}"
         self._name = f"{path.stem}/{seed}"
         self._slots = Slots(Encoding(header.sensor, channels), slots + replaced)
         plan = GeneratorJob(path, seed, starved, replaced, threads, options, {"steps": steps, "solver": solver})

@@ -14,7 +14,8 @@ from lidar_synth.train.adaptation.scans import HELD, TRAIN, Prepared
 from lidar_synth.train.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.train.config.recipes import merged
 from lidar_synth.train.runs import run
-from lidar_synth.train.staged import ENDLESS, StagedRuns
+from lidar_synth.train.schedules import ENDLESS
+from lidar_synth.train.staged import StagedRuns
 
 TOWN_SEED, TOWN_HELD, TOWN_HELD_SCANS = 0, 7100, 16
 """Seeds of the towns to train on and to hold out, and the scans that are held out."""
