@@ -10,7 +10,6 @@ many scans one process of one thread for each core generate together, as those o
 
 import argparse
 import os
-import resource
 import time
 from itertools import count
 from multiprocessing import get_context
@@ -67,7 +66,13 @@ def _alone(kind: Kind) -> tuple[float, float]:
     start = time.perf_counter()
     for index in range(1, TOGETHER + 1):
         generator.scans(0, [index], steps=kind.steps)
-    return TOGETHER / (time.perf_counter() - start), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    return TOGETHER / (time.perf_counter() - start), _peak()
+
+
+def _peak() -> float:
+    """Peak memory of this process in megabytes; ``ru_maxrss`` of a spawned process begins with that of its parent."""
+    words = Path("/proc/self/status").read_text().split()
+    return int(words[words.index("VmHWM:") + 1]) / 1e3
 
 
 def together(kind: Kind) -> tuple[float, float]:
