@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files.disk import hash_of_names
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.formats.writer import claim
 from lidar_synth.generate.checkpoint import CODEC, Checkpoint, Header, load_checkpoint, save_checkpoint
@@ -14,7 +15,7 @@ from lidar_synth.generate.generator import find_model
 from lidar_synth.generate.regrid import check_movable, fitting, regrid, with_codec
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.train.adaptation.card import figures, provenance_of, write_card
-from lidar_synth.train.adaptation.scans import Split, digest, label, prepare, split
+from lidar_synth.train.adaptation.scans import Split, label, prepare, split
 from lidar_synth.train.adaptation.stages import Stage, Work, shares, stages_for
 from lidar_synth.train.staged import StagedRuns
 
@@ -218,7 +219,7 @@ def _settings(plan: AdaptPlan) -> dict[str, Any]:
     return {
         "model": plan.model.hash,
         "scans": str(plan.root.resolve()),
-        "ids": digest([plan.source.ids[i] for i in indices]),
+        "ids": hash_of_names([plan.source.ids[i] for i in indices]),
         "sensor": plan.sensor.to_dict(),
         "town": plan.town,
     }

@@ -18,7 +18,7 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.datasets.recordings import PLACES, TOWN, Recordings, frames_of
 from lidar_synth.errors import DataError
 from lidar_synth.evaluate.leakage import content_of, contents, recordings_of
-from lidar_synth.files.disk import hash_of_names, read_text, write_file
+from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats import RangeImages, ScanFiles
 from lidar_synth.formats.npz import write_range_image
@@ -200,8 +200,3 @@ def _labelled(image: RangeImage, codec: Latent) -> RangeImage:
     [made] = tensors.to_images(decoded, image.sensor)
     given = np.where(image.mask & made.mask, made.channels["label"], IGNORE).astype(np.uint8)
     return RangeImage(image.range, image.sensor, {**image.channels, "label": given})
-
-
-def digest(ids: Sequence[str]) -> str:
-    """sha256 of names, to tell whether the scans are the same when a run is resumed."""
-    return hash_of_names(ids)
