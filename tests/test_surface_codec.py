@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from lidar_synth.datasets.classes import TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow.path import METRICS
 from lidar_synth.generate.checkpoint import CODEC, VELOCITY
@@ -41,6 +41,10 @@ K, LABELS, CELLS = 3, 20, PATCH[0] * PATCH[1]
 SCALE = NORMALISATIONS["r2flow"]
 FORMAT = TensorFormat(("range", "reflectance", "label"), SCALE)
 COARSE = Sensor("coarse", 256, 1.45, 80.0, rows=16, fov_up=3.0, fov_down=-25.0)
+
+
+FLAT = Noise(torch.zeros(LABELS), torch.zeros(LABELS, len(SPANS)), torch.zeros(LABELS))
+"""No noise of cells."""
 
 
 def small(**changes: object) -> SurfaceAutoencoder:
@@ -177,7 +181,8 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int
     layout, sensor = layout_with_a_box(), replace(COARSE, columns=width)
 
     def image_of(layout: Tensor | None) -> RangeImage:
-        [image] = FORMAT.to_images(Latent(network, FORMAT).decode(z, noise, layout), sensor)
+        known = None if layout is None else {"layout": layout}
+        [image] = FORMAT.to_images(Latent(network, FORMAT).decode(z, noise, known), sensor)
         assert image.label is not None
         return image
 
@@ -192,6 +197,45 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int
     road = inside & (free.channels["label"] == TRAIN_ID["road"])  # rays through a box may miss the object
     assert np.array_equal(free.range[road], bounded.range[road])
     assert np.array_equal(free.range, image_of(torch.zeros_like(layout)).range)  # nothing is known of a blank layout
+
+
+@pytest.mark.parametrize("width", [256, 128])
+def test_returns_have_the_labels_of_a_map(width: int) -> None:
+    network = small().eval()
+    z, noise = torch.randn(1, *network.latent_shape), uniform(0, [0], (network.draws, 16, width))
+    labels = torch.randint(0, 19, (1, 16, width), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    labels[..., ::3] = IGNORE
+    given_map = labels.repeat_interleave(256 // width, 2)
+    if width == 128:
+        given_map[..., 0::2] = IGNORE  # a column that stands for two has the label of the one that is known
+    states = Latent(network, FORMAT)
+    made, free = (
+        FORMAT.to_images(states.decode(z, noise, known), replace(COARSE, columns=width))[0]
+        for known in ({"semantic": given_map}, None)
+    )
+    known = made.mask & (labels[0].numpy() != IGNORE)
+    assert known.mean() > 0.1
+    assert np.array_equal(made.channels["label"][known], labels[0].numpy()[known])
+    assert np.array_equal(made.range[~known & made.mask], free.range[~known & made.mask])
+
+
+def test_a_cell_of_a_given_class_shows_each_surface_with_its_probability_given_the_class() -> None:
+    count, shown = 40_000, TRAIN_ID["pole"]
+    numbers = torch.zeros(1, K * (NUMBERS + LABELS) + CELLS * (K + PER_CELL))
+    surface = numbers[:, : K * (NUMBERS + LABELS)].view(K, -1)
+    surface[:, 0] = torch.tensor([1.0, 2.0, 3.0])  # far from each other
+    surface[:, 3], surface[:, 4] = -9, 20  # sharp, and always a return
+    surface[:, NUMBERS + shown] = torch.tensor([0.0, 1.0, 4.0])
+    surfaces = surfaces_of(numbers, K, LABELS, PATCH)
+    likely = surfaces.classes[0, :, shown].exp() / K
+    drawn = surfaces_of(numbers.expand(count, -1), K, LABELS, PATCH).sample(
+        torch.rand(count, DRAWS, CELLS, generator=torch.Generator().manual_seed(0)),
+        torch.zeros(count, len(SPANS), CELLS), FLAT, SCALE, codes=torch.full((count, CELLS), shown),
+    )  # fmt: skip
+    ranges = SCALE.decode(drawn[:, 0])
+    found = torch.stack([(ranges.log() - mid).abs().lt(0.3).float().mean() for mid in (1.0, 2.0, 3.0)])
+    assert torch.allclose(found, likely / likely.sum(), atol=0.01)
+    assert (drawn[:, 2] == shown).all()
 
 
 @pytest.mark.slow

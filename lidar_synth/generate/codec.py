@@ -4,7 +4,7 @@ Everything after the codec (path, solver, selection, distillation, sampling) is 
 contains range images encoded by ``TensorFormat``; a state is what the flow generates.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, cast
 
@@ -33,9 +33,11 @@ class Codec(Protocol):
         """Tensors (B, C, H, W) to states (B, *shape)."""
         ...
 
-    def decode(self, y: Tensor, uniform_noise: Tensor | None = None, layout: Tensor | None = None) -> Tensor:
+    def decode(
+        self, y: Tensor, uniform_noise: Tensor | None = None, given: Mapping[str, Tensor] | None = None
+    ) -> Tensor:
         """States (B, *shape) to tensors (B, C, H, W), sampled with (B, draws, H, W) numbers in (0, 1); None = the
-        mode. With images of layouts (B, 5, H, W), autoencoders that can draw objects in their boxes only."""
+        mode. With {name of a condition: values (B, ...)}, autoencoders that can follow them exactly."""
         ...
 
 
@@ -47,14 +49,14 @@ class Autoencoder(Protocol):
         resolution: rows and columns of an image.
         latent_shape: channels, rows and columns of a latent.
         draws: number of random numbers per cell for sampling an image; 0 if decoding is deterministic.
-        takes_layout: whether ``decode`` takes images of layouts, and draws objects in their boxes only.
+        decodes_given: the conditions that ``decode`` takes, see ``models.network.Network``.
     """
 
     channels: int
     resolution: tuple[int, int]
     latent_shape: tuple[int, int, int]
     draws: int
-    takes_layout: ClassVar[bool]
+    decodes_given: ClassVar[frozenset[str]]
 
     def encode(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) to latents of approximate mean 0 and variance 1."""
@@ -80,7 +82,9 @@ class Identity:
         """(B, C, H, W), unchanged."""
         return x
 
-    def decode(self, y: Tensor, uniform_noise: Tensor | None = None, layout: Tensor | None = None) -> Tensor:
+    def decode(
+        self, y: Tensor, uniform_noise: Tensor | None = None, given: Mapping[str, Tensor] | None = None
+    ) -> Tensor:
         """(B, C, H, W), unchanged."""
         return y
 
@@ -113,13 +117,16 @@ class Latent:
         return self.network.encode(x).float()
 
     @torch.no_grad()
-    def decode(self, y: Tensor, uniform_noise: Tensor | None = None, layout: Tensor | None = None) -> Tensor:
+    def decode(
+        self, y: Tensor, uniform_noise: Tensor | None = None, given: Mapping[str, Tensor] | None = None
+    ) -> Tensor:
         """Latents (B, *shape), quantised if there is a codebook, to tensors (B, C, H, W).
 
         Args:
             y: latents.
             uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample with; None = the mode.
-            layout: (B, 5, H, W) uint8, images of layouts. Autoencoders without ``takes_layout`` do not use them.
+            given: {name of a condition: values (B, ...)}; those not among the autoencoder's ``decodes_given`` are not
+                used.
 
         Raises:
             DataError: on latents of another shape.
@@ -127,8 +134,8 @@ class Latent:
         if y.shape[1:] != self.shape:
             raise DataError(f"a latent of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, self.shape))})")
         decode: Callable[..., Tensor] = self.network.decode
-        layouts = () if layout is None or not self.network.takes_layout else (layout,)
-        return expected(decode(y, uniform_noise, *layouts).float(), self.tensors)
+        taken = {name: values for name, values in (given or {}).items() if name in self.network.decodes_given}
+        return expected(decode(y, uniform_noise, *([taken] if taken else [])).float(), self.tensors)
 
 
 def expected(output: Tensor, tensors: TensorFormat) -> Tensor:

@@ -216,8 +216,8 @@ class Generator:
             with torch.inference_mode():
                 own = None if given is None else given[part]
                 velocity, cond = self._flow(own, guidance, grid)
-                layout = own if self.condition == "layout" else None
-                yield codec.decode(solve(velocity, noise, grid, solver, cond), uniform_noise, layout)
+                state = solve(velocity, noise, grid, solver, cond)
+                yield codec.decode(state, uniform_noise, None if own is None else {str(self.condition): own})
 
     def _flow(self, condition: Tensor | None, guidance: float, grid: Sequence[float]) -> tuple[Velocity, Tensor | None]:
         """The velocity to solve on a grid, and its encoded condition: it is encoded once, not at every step."""

@@ -16,13 +16,14 @@ class Network(nn.Module):
         needs_ray_angles: whether a network with fresh weights takes ``angles``, (2, H, W) elevation and azimuth of the
             cells of the state in radians; a checkpoint stores them among the weights.
         is_autoencoder: whether the network maps range images to latents and back.
-        takes_layout: whether its ``decode`` takes images of layouts, and draws objects in their boxes only.
+        decodes_given: the conditions that its ``decode`` takes and follows exactly: "layout" (objects in their boxes
+            only) and "semantic" (the labels of the map).
     """
 
     derived_arguments: ClassVar[tuple[str, ...]] = ("resolution", "channels")
     needs_ray_angles: ClassVar[bool] = False
     is_autoencoder: ClassVar[bool] = False
-    takes_layout: ClassVar[bool] = False
+    decodes_given: ClassVar[frozenset[str]] = frozenset()
 
 
 class Encoder(Network):

@@ -5,7 +5,7 @@ cells and predicts what the cells of a patch can show (``surfaces``); only the l
 which makes it cheap.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -16,7 +16,7 @@ from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.models.bounded_latent import BoundedAutoencoder, row_bias
 from lidar_synth.models.convolution import check_shape, pair, reduced
 from lidar_synth.models.surface_codec.blocks import PATCH, Block, cell_norm, from_patches, split, to_patches
-from lidar_synth.models.surface_codec.bounds import bounds_of
+from lidar_synth.models.surface_codec.bounds import bounds_of, codes_of
 from lidar_synth.models.surface_codec.relief import SPANS, relief_fields
 from lidar_synth.models.surface_codec.surfaces import DRAWS, NUMBERS, PER_CELL, Noise, Surfaces, surfaces_of
 
@@ -44,7 +44,7 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         ConfigError: on values that do not fit together.
     """
 
-    takes_layout: ClassVar[bool] = True
+    decodes_given: ClassVar[frozenset[str]] = frozenset({"layout", "semantic"})
     derived_arguments: ClassVar[tuple[str, ...]] = ("resolution", "channels", "normalisation")
 
     roughness: Tensor
@@ -127,14 +127,17 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         numbers = self.head(cell_norm(h).movedim(1, -1).flatten(0, 2))
         return surfaces_of(numbers, self.surfaces, self.codes, PATCH, merged)
 
-    def decode(self, z: Tensor, uniform_noise: Tensor | None = None, layout: Tensor | None = None) -> Tensor:
+    def decode(
+        self, z: Tensor, uniform_noise: Tensor | None = None, given: Mapping[str, Tensor] | None = None
+    ) -> Tensor:
         """Latents to images.
 
         Args:
             z: (B, *latent_shape).
             uniform_noise: (B, draws, H, W') numbers in (0, 1) to sample an image with; None = the most likely image. W'
                 is one of ``widths``, and becomes the width of the image.
-            layout: (B, 5, H, W) uint8, images of layouts: objects are in their boxes only.
+            given: "layout": (B, 5, H, W) uint8, images of layouts: objects are in their boxes only. "semantic":
+                (B, H, W) uint8, label maps: returns have the labels of the map, where it has any.
 
         Returns:
             (B, C, H, W'): range -1 where there is no return; bits as logits of the most likely code, whose magnitude
@@ -151,8 +154,12 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         surfaces = self.describe(self.bounded(z), merged)
         relief = relief_fields(uniform_noise[:, -1], merged)
         drawn = to_patches(uniform_noise, patch), to_patches(relief, patch)
-        bounds = None if layout is None else bounds_of(layout, columns, patch, self.codes, self.normalisation)
-        cells = surfaces.sample(*drawn, self.noise, self.normalisation, bounds)
+        given, bounds, codes = given or {}, None, None
+        if "layout" in given:
+            bounds = bounds_of(given["layout"], columns, patch, self.codes, self.normalisation)
+        if "semantic" in given:
+            codes = codes_of(given["semantic"], columns, patch)
+        cells = surfaces.sample(*drawn, self.noise, self.normalisation, bounds, codes)
         distance, value, code, likely = torch.split(from_patches(cells, patch, (rows, columns)), 1, 1)
         bits = torch.cat([(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
         return torch.cat([distance, value, bits * (2 * torch.atanh(likely.clamp(max=0.9999)))], 1)

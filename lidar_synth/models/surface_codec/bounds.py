@@ -1,11 +1,11 @@
-"""Where a layout lets objects stand: in its boxes, and nowhere else."""
+"""What a condition says of single cells: where objects may be, and classes that are given."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lidar_synth.datasets.classes import BOXED
+from lidar_synth.datasets.classes import BOXED, IGNORE
 from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES
 from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.geometry.normalize import Normalisation
@@ -48,3 +48,20 @@ def bounds_of(layout: Tensor, columns: int, patch: tuple[int, int], codes: int, 
     kinds = torch.isin(torch.arange(codes, device=layout.device), torch.tensor(BOXED, device=layout.device))
     near, far = to_patches(ranges, patch).unbind(1)
     return Bounds(near, far, kinds)
+
+
+def codes_of(labels: Tensor, columns: int, patch: tuple[int, int]) -> Tensor:
+    """(N, P) int64 classes of the cells of N patches, -1 where they are not known.
+
+    A column that stands for several has the class of the first of them that is known.
+
+    Args:
+        labels: (B, H, W) uint8 train ids, 255 = unknown.
+        columns: of the cells; a divisor of W.
+        patch: rows and columns of a patch.
+    """
+    parts = torch.where(labels == IGNORE, -1, labels.long()).view(*labels.shape[:2], columns, -1).unbind(3)
+    codes = parts[0]
+    for part in parts[1:]:
+        codes = torch.where(codes < 0, part, codes)
+    return to_patches(codes[:, None], patch)[:, 0]

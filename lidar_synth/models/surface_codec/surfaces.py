@@ -93,8 +93,7 @@ class Surfaces(NamedTuple):
         far = normalised(self.inverse, normalisation)
         distance = -(x - far).abs() / self.scale - (2 * self.scale).log()
         shown = -self.reflectance.nll(value)
-        index = code[:, None].expand(-1, self.classes.shape[1], -1)
-        seen = F.logsigmoid(self.returned) + temper[0] * distance + temper[1] * shown + self.classes.gather(2, index)
+        seen = F.logsigmoid(self.returned) + temper[0] * distance + temper[1] * shown + self._of(code)
         return torch.logsumexp(self.weights + torch.where(x > -1, seen, F.logsigmoid(-self.returned)), 1)
 
     def sample(
@@ -104,6 +103,7 @@ class Surfaces(NamedTuple):
         noise: Noise,
         normalisation: Normalisation,
         bounds: Bounds | None = None,
+        codes: Tensor | None = None,
     ) -> Tensor:
         """(N, 4, P) range, -1 without a return, reflectance, class and its probability, of sampled cells.
 
@@ -114,21 +114,28 @@ class Surfaces(NamedTuple):
             normalisation: of the ranges.
             bounds: (N, P) where objects may be. A cell without a box shows another surface of its patch, or nothing;
                 ranges of objects are clipped to the box.
+            codes: (N, P) int64 classes that are given, negative where they are not. A cell shows each surface with its
+                probability given the class.
         """
         which, back, near, dim, shared = uniform_noise.unbind(1)
-        count = self.weights.shape[1]
         likely, code = self.classes.max(2)
-        shares = self.weights.exp() if bounds is None else _allowed(self.weights.exp(), bounds.codes[code], bounds)
+        shares = self.weights.exp() if codes is None else self._given(codes)
+        if bounds is not None:
+            shares = _allowed(shares, bounds.codes[code], bounds)
         chosen = _choose(shares, which)[:, None]
         distance, median, returned = (
             part.gather(1, chosen)[:, 0] for part in (self.inverse, self.reflectance.middles, self.returned)
         )
         # What all cells of a surface have in common.
         parts = [self.scale[..., 0], *(part[..., 0] for part in self.reflectance[1:]), likely.exp(), code.float()]
-        parts += [noise.reflectance[code], to_normal(shared[:, :count]), noise.roughness[code]]
-        common = torch.cat([torch.stack(parts, 2), noise.relief[code]], 2)
+        common = torch.stack([*parts, to_normal(shared[:, : self.weights.shape[1]])], 2)
         common = common.gather(1, chosen.mT.expand(-1, -1, common.shape[2]))
-        scale, dull, blank, likely, kind, alike, patch, rough, *bumps = common.unbind(2)
+        scale, dull, blank, likely, kind, patch = common.unbind(2)
+        if codes is not None:
+            own = self._of(codes).gather(1, chosen)[:, 0].exp().clamp_min(_SURE)  # above 0, for the signs of its bits
+            likely, kind = torch.where(codes < 0, likely, own), torch.where(codes < 0, kind, codes)
+        tables = torch.cat([noise.reflectance[:, None], noise.roughness[:, None], noise.relief], 1)
+        alike, rough, *bumps = F.embedding(kind.long(), tables).unbind(2)
         values = ZeroInflatedLogistic(median, dull, blank).sample(_mixed(dim, alike, patch))
         error = rough * laplace_noise(near) + sum(a * b for a, b in zip(bumps, relief.unbind(1), strict=True))
         distance = normalised(distance, normalisation) + scale * error
@@ -136,6 +143,15 @@ class Surfaces(NamedTuple):
             distance = torch.where(bounds.codes[kind.long()], distance.clamp(bounds.near, bounds.far), distance)
         distance = torch.where(returned + torch.logit(back) > 0, distance, -1.0)
         return torch.stack([distance, values, kind, likely], 1)
+
+    def _of(self, codes: Tensor) -> Tensor:
+        """(N, K, P) log probabilities of the classes (N, P) of cells, for each surface; 0 for negative ones."""
+        index = codes.clamp_min(0)[:, None].expand(-1, self.classes.shape[1], -1)
+        return self.classes.gather(2, index).masked_fill(codes[:, None] < 0, 0)
+
+    def _given(self, codes: Tensor) -> Tensor:
+        """(N, K, P) probabilities of the surfaces of cells whose classes (N, P) are given."""
+        return (self.weights + self._of(codes)).softmax(1)
 
 
 def _allowed(shares: Tensor, object_: Tensor, bounds: Bounds) -> Tensor:
