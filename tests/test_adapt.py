@@ -25,6 +25,7 @@ from lidar_synth.evaluate.leakage import measured, overlap, seen_by, town
 from lidar_synth.formats import WRITERS, layout_of
 from lidar_synth.generate.checkpoint import (
     CODEC,
+    ENCODER,
     VELOCITY,
     Checkpoint,
     Header,
@@ -36,6 +37,7 @@ from lidar_synth.generate.checkpoint import (
 from lidar_synth.generate.generator import find_model
 from lidar_synth.generate.regrid import PLACED, fitting, regrid
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
+from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, sensor_yaml
 from lidar_synth.models import build_network
@@ -63,24 +65,35 @@ def short() -> Iterator[None]:
     card.GENERATED = count
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A latent model of the tiny sensor with random weights: the architectures of ``town-dense``."""
+def tiny_model(path: Path, semantic: bool = False) -> Path:
+    """A latent model of the tiny sensor with random weights: the architectures of ``town-dense``, ``town-semantic``."""
     torch.manual_seed(0)
     size = sum(CHANNELS.values())
     codec = {"resolution": list(TINY.shape), "channels": size, "encoder_widths": [8, 16], "widths": [8, 16],
              "reaches": [1], "depth": 1}  # fmt: skip
     flow = {"resolution": [4, 8], "channels": 8, "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2],
             "patch": [1, 1], "window": [3, 3]}  # fmt: skip
+    parts = {CODEC: NetworkSpec("surfaces", codec), VELOCITY: NetworkSpec("hdit", flow)}
+    if semantic:
+        maps = {"resolution": list(TINY.shape), "target": [4, 8], "channels": 6, "method": "patches"}
+        parts |= {ENCODER: NetworkSpec("semantic_map", maps)}
+        flow["condition_channels"] = 6
     angles = torch.nn.functional.avg_pool2d(torch.from_numpy(TINY.ray_angles())[None], (4, 16))[0]
-    networks = {CODEC: build_network("surfaces", codec), VELOCITY: build_network("hdit", flow | {"angles": angles})}
+    needed = {VELOCITY: {"angles": angles}}
+    networks = {name: build_network(part.architecture, part.arguments | needed.get(name, {}))
+                for name, part in parts.items()}  # fmt: skip
     header = Header(
-        {CODEC: NetworkSpec("surfaces", codec), VELOCITY: NetworkSpec("hdit", flow)}, TINY, NORMALISATIONS["r2flow"],
-        tuple(CHANNELS), (1.0, 0.6, 0.0), {"data": "none", "data_licence": "none", "licence": "MIT"},
+        parts, TINY, NORMALISATIONS["r2flow"], tuple(CHANNELS), (1.0, 0.6, 0.0),
+        {"data": "none", "data_licence": "none", "licence": "MIT"},
+        conditioning={"semantic": {"dropout": 0.1}} if semantic else {},
     )  # fmt: skip
-    path = tmp_path_factory.mktemp("model") / "tiny.safetensors"
     save_checkpoint(path, header, networks)
     return path
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny_model(tmp_path_factory.mktemp("model") / "tiny.safetensors")
 
 
 def write(folder: Path, scans: list[Scan]) -> Path:
@@ -177,6 +190,19 @@ def test_the_card_says_what_was_learnt_and_whether_it_repeats(adapted: Path) -> 
         "nearest training",
     ):
         assert part in text, part
+
+
+def test_a_model_of_label_maps_is_adapted_with_its_encoder(scans: Path, own_scans: list[Scan], tmp_path: Path) -> None:
+    model = tiny_model(tmp_path / "maps.safetensors", semantic=True)
+    out = adapt(model, scans, tmp_path / "mine.safetensors", minutes=0.02, town=2, overrides=QUICK, progress=False)
+    generator = load_generator(out)
+    assert (generator.condition, generator.sensor.shape) == ("semantic", (16, 128))
+    wanted = project(own_scans[0], generator.sensor, ["label"]).channels["label"]
+    [image] = generator.range_images(0, [0], own_scans[0])
+    known = image.mask & (wanted != IGNORE)
+    assert known.any() and np.array_equal(image.channels["label"][known], wanted[known])
+    weights = [load_checkpoint(path).networks[ENCODER].mix.weight for path in (model, out)]
+    assert not torch.equal(*weights), "its encoder was trained"
 
 
 @pytest.mark.slow
@@ -296,7 +322,7 @@ def test_a_folder_without_scans_is_refused(model: Path, tmp_path: Path) -> None:
     ("name", "message"),
     {
         "town": "architecture autoencoder; expected architectures among surfaces, hdit",
-        "town-semantic": "the condition semantic; expected an unconditional model",
+        "town-layout": "the condition layout; expected an unconditional model, or the condition semantic",
         "nothing": "model 'nothing'; expected a shipped one",
     }.items(),
 )

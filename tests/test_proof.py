@@ -145,6 +145,21 @@ def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(tm
     refuse_leaks(str(path), frames_of("semantic_kitti", ["00/000003", "01/000000"]))
 
 
+@pytest.mark.parametrize("condition", ["semantic", "layout"])
+def test_a_generator_with_a_condition_gets_those_of_the_towns_streets(condition: str, tmp_path: Path) -> None:
+    model = write_model(tmp_path / "model.safetensors", dropout=0.1, condition=condition)
+
+    def scans_of(seed: int) -> list[Scan]:
+        task = PoolTask("generator", tmp_path / str(seed), SENSOR, None, 2, town_seed=seed, model=str(model))
+        return pools.read_pool(make_pool(task))
+
+    one, other = scans_of(1), scans_of(2)
+    assert len(one) == 2 and all(len(scan) for scan in one + other)
+    assert not np.array_equal(one[0].points, other[0].points), "another street gives another scan"
+    with pytest.raises(ConfigError, match="needs camera images"):
+        refuse_leaks("town-camera", frames_of("semantic_kitti", ["01/000000"]))
+
+
 def test_a_generator_that_saw_the_tested_scans_in_another_folder_is_refused(tmp_path: Path) -> None:
     scans = drives(3, 2)
     saved = load_checkpoint(write_model(tmp_path / "mine.safetensors"))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.checkpoint import CODEC, VELOCITY, Checkpoint, Header, NetworkSpec
+from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Checkpoint, Header, NetworkSpec
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models import build_network
@@ -36,8 +36,11 @@ PLACED: dict[str, dict[str, Axes]] = {
     "surfaces": {name: Axes(2) for name in ("place_stem", "place_latent", "place_outer")},
     "hdit": {"position.table": Axes(0, 1)},
     "denoiser": {"position.table": Axes(0, 1)},
+    "semantic_map": {},
 }
 """{architecture: its weights that belong to places}. A model of other architectures is not moved."""
+CONDITIONS = ("semantic",)
+"""Conditions of the models that are moved."""
 
 
 def fitting(sensor: Sensor, header: Header) -> Sensor:
@@ -74,23 +77,26 @@ def regrid(model: Checkpoint, sensor: Sensor) -> tuple[Header, dict[str, nn.Modu
     """The networks of a model on the grid of another sensor, and the header that describes them.
 
     Args:
-        model: an unconditional model.
+        model: an unconditional model, or one with a condition among ``CONDITIONS``.
         sensor: as ``fitting`` gives it.
 
     Raises:
-        ConfigError: on an autoencoder alone, a model with a condition, or one of an architecture that is not in
+        ConfigError: on an autoencoder alone, a model with another condition, or one of an architecture that is not in
             ``PLACED``.
     """
     check_movable(model.header)
     networks: dict[str, nn.Module] = {}
     parts: dict[str, NetworkSpec] = {}
+    state = sensor.shape
     for name in sorted(model.networks):  # the autoencoder first: it gives the shape of the states
         part = model.header.networks[name]
-        shape = sensor.shape
-        if name == VELOCITY and CODEC in networks:
-            shape = make_codec(networks[CODEC], model.header.tensors, sensor.shape).shape[1:]
-        parts[name] = NetworkSpec(part.architecture, part.arguments | {"resolution": list(shape)})
+        sizes = {"resolution": list(state if name == VELOCITY else sensor.shape)}
+        if name == ENCODER:
+            sizes["target"] = list(state)
+        parts[name] = NetworkSpec(part.architecture, part.arguments | sizes)
         networks[name] = _moved(model.networks[name], parts[name], model.header.sensor, sensor)
+        if name == CODEC:
+            state = make_codec(networks[CODEC], model.header.tensors, sensor.shape).shape[1:]
     return replace(model.header, networks=parts, sensor=sensor), networks
 
 
@@ -98,13 +104,14 @@ def check_movable(header: Header) -> None:
     """Refuse a model that ``regrid`` cannot move; raises as it does."""
     if VELOCITY not in header.networks:
         raise ConfigError("an autoencoder", "a model that generates")
-    if header.conditioning:
-        raise ConfigError(f"a model with the condition {', '.join(header.conditioning)}", "an unconditional model")
+    if not set(header.conditioning) <= set(CONDITIONS):
+        wanted = f"an unconditional model, or the condition {', '.join(CONDITIONS)}"
+        raise ConfigError(f"a model with the condition {', '.join(header.conditioning)}", wanted)
     if unknown := [part.architecture for part in header.networks.values() if part.architecture not in PLACED]:
         raise ConfigError(
             f"a model with the architecture {', '.join(unknown)}",
             f"architectures among {', '.join(PLACED)}: those that can be moved to another sensor",
-            "The shipped model 'town-dense' can.",
+            "The shipped models 'town-dense' and 'town-semantic' can.",
         )
 
 
@@ -150,5 +157,5 @@ def _along(weight: Tensor, axis: int, places: NDArray[np.float64], wraps: bool) 
 
 
 def with_codec(flow: Mapping[str, nn.Module], codec: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
-    """The flow of one model with the autoencoder of another one."""
-    return {VELOCITY: flow[VELOCITY], CODEC: codec[CODEC]}
+    """The flow of one model, with what encodes its condition, and the autoencoder of another one."""
+    return {**flow, CODEC: codec[CODEC]}

@@ -7,7 +7,8 @@ continued where it stopped.
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +91,13 @@ def skinned_town(task: PoolTask) -> Iterator[Scan]:
 
 
 def generated(task: PoolTask) -> Iterator[Scan]:
-    """Scans of a generator, turned into scans of the user's sensor where theirs is another one."""
+    """Scans of a generator, turned into scans of the user's sensor where theirs is another one. What a model with a
+    condition needs, the town gives: label maps or layouts of its streets."""
     generator = load_generator(task.model)
     change = None if _alike(generator.sensor, task.sensor) else Transfer(task.sensor)
-    for index in range(task.count):
-        [scan] = generator.scans(0, [index])
+    streets = repeat(None) if generator.condition is None else _streets(replace(task, sensor=generator.sensor), None)
+    for index, street in zip(range(task.count), streets, strict=False):
+        [scan] = generator.scans(0, [index], street)
         yield scan if change is None else change(scan, keyed_rng(0, index))
 
 
@@ -121,7 +124,7 @@ def make_pool(task: PoolTask) -> Path:
         kept = scan if task.grid is None else thinned(scan, task.grid)
         writer.write(kept, made, name=f"00/{made:06d}")
         made += 1
-        boxed += [kept] if kept.boxes is not None else []
+        boxed += [kept] if task.kind == "skin" and kept.boxes is not None else []
     if boxed:
         _save_objects(boxed, task.folder / OBJECTS)
     write_file(task.folder / DONE, json.dumps({"scans": made, "seconds": time.monotonic() - start}).encode())
@@ -152,9 +155,11 @@ def refuse_leaks(model: str, tested: Recordings, scans: Iterable[Scan] = ()) -> 
         scans: those of them that are known by their content only; read if the generator has learnt from such scans.
 
     Raises:
-        ConfigError: if it was; the message names drives and frames.
+        ConfigError: if it was; the message names drives and frames. On a model that needs camera images.
     """
     generator = load_generator(model)
+    if generator.condition == "camera":
+        raise ConfigError(f"generator {model!r}, which needs camera images", "one that needs none, such as town-dense")
     seen = seen_by(generator.header.provenance)
     if any(dataset == CONTENT for dataset, _ in seen.drives):
         tested = tested | contents(map(content_of, scans))
@@ -178,10 +183,12 @@ def town_seed(recordings: Recordings) -> int:
 def _settings(task: PoolTask) -> dict[str, Any]:
     grid = None if task.grid is None else task.grid.to_dict()
     plain = {"kind": task.kind, "sensor": task.sensor.to_dict(), "grid": grid, "count": task.count}
+    streets = {"seed": task.town_seed}
     if task.kind == "generator":
-        return plain | {"model": task.model, "checkpoint": read_header(find_model(task.model))[1]}
+        header, checkpoint = read_header(find_model(task.model))
+        return plain | {"model": task.model, "checkpoint": checkpoint} | (streets if header.conditioning else {})
     learnt = hash_of_names(task.learnt)
-    return plain | {"seed": task.town_seed} | ({"learnt_from": learnt} if task.kind == "skin" else {})
+    return plain | streets | ({"learnt_from": learnt} if task.kind == "skin" else {})
 
 
 def _streets(task: PoolTask, skin: Skin | None) -> Iterator[Scan]:

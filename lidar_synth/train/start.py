@@ -64,7 +64,8 @@ def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     grid = start.header.time_grid if config.autoencodes or config.decoder else uniform_grid(config.steps)
     networks = {CODEC: start.networks[CODEC]} if config.autoencodes else start.networks
     kept = {name: start.header.networks[name] for name in networks}
-    header = replace(start.header, networks=kept, time_grid=grid, provenance=provenance)
+    conditioning = {} if config.autoencodes else start.header.conditioning
+    header = replace(start.header, networks=kept, time_grid=grid, provenance=provenance, conditioning=conditioning)
     if not (config.autoencodes or config.decoder):
         networks, header = _without_ends(networks, header)
     if config.condition is None or config.autoencodes:

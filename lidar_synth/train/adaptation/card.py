@@ -64,8 +64,11 @@ def _reconstruction(made: Checkpoint, images: Sequence[RangeImage]) -> dict[str,
 
 def _nearest(made: Checkpoint, train: Sequence[RangeImage], held: Sequence[RangeImage]) -> dict[str, float]:
     generator = Generator("adapted", join(made.networks), made.header, made.hash, autoencoder=made.networks.get(CODEC))
+    conditions = None
+    if generator.condition is not None:  # label maps of scans that it has not seen
+        conditions = np.stack([held[i % len(held)].channels["label"] for i in range(GENERATED)])
     with torch.inference_mode():
-        generated = generator.scans(0, range(GENERATED))
+        generated = generator.scans(0, range(GENERATED), conditions)
     known, fake, others = (features(scans) for scans in (_scans(train), generated, _scans(held)))
     novelty = nearest_training(known, fake, others)
     apart = np.linalg.norm(known[:, None] - known[None], axis=2)

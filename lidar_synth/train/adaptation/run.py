@@ -131,7 +131,8 @@ def adapt(
     the scans. A card is written beside the checkpoint. The same call resumes an interrupted adaptation.
 
     Args:
-        model: an unconditional model, such as ``"town-dense"``, or the path of a checkpoint.
+        model: ``"town-dense"``, or ``"town-semantic"``, which then takes anyone's label maps; or the path of a
+            checkpoint.
         scans: scans of one sensor, in any layout that is read. Labelled scans teach the model their labels. Without
             labels it keeps guesses, which it learns on the town.
         out: the checkpoint to write, a ``.safetensors`` file.
