@@ -7,6 +7,7 @@ KITTI's trainers use the points and boxes in the view of camera 2, and shift pas
 import pickle
 import re
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -136,7 +137,8 @@ def write_gt_database(
     """Write a bank of objects as the database of a trainer's GT sampling.
 
     Points are relative to the trainer's reference point of the box. Both trainers read the list of objects as a pickle,
-    so that the package writes one; it never reads one.
+    so that the package writes one; it never reads one. They leave out objects of difficulty -1, so an unknown occlusion
+    counts as none, and nuScenes' objects have difficulty 0, as MMDetection3D gives them.
 
     Args:
         objects: of any source with boxes, ``ObjectBank.from_scans(source)``.
@@ -154,8 +156,10 @@ def write_gt_database(
         DataError: for nuScenes, on a name that ``nuscenes.NAMES`` does not have.
         FileError: if it cannot be written.
     """
-    root, found, level = Path(root), dict[str, list[dict[str, Any]]](), difficulty(objects.boxes)
+    root, found = Path(root), dict[str, list[dict[str, Any]]]()
     nuscenes = layout == "nuscenes"
+    shown = replace(objects.boxes, occlusion=objects.boxes.occlusion.clip(min=0))
+    level = np.zeros(len(shown), np.int32) if nuscenes else difficulty(shown)
     names = nuscenes_names(objects.boxes.names, "the bank of objects") if nuscenes else objects.boxes.names
     boxes = (turned_boxes(objects.boxes) if nuscenes else objects.boxes).values
     for i, name in enumerate(names):

@@ -7,11 +7,13 @@ label_2, calib, image_2, planes and ImageSets, so that a trainer's stock loader 
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from lidar_synth.integrations.detection import ground_plane, plane_in_camera
 from lidar_synth.integrations.mmdet3d_lists import write_plane
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.evaluate.cache import scan_hash
 from lidar_synth.files.disk import write_file
 from lidar_synth.formats import KITTIObject
 from lidar_synth.formats.calibration import Calibration
@@ -21,6 +23,8 @@ from lidar_synth.formats.writer import Writer, claim
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
 
+COMPARED = 3
+"""Synthetic samples by which an export that is resumed is compared with the one that began."""
 MANIFEST, SETTINGS = "mixture.csv", ".mixture.json"
 
 
@@ -59,14 +63,15 @@ def export_mixture(
         raise ConfigError(f"layout {layout!r}", "'semantic_kitti' or 'kitti'")
     root = Path(out)
     camera = calibration or OBJECT_CAMERA
-    claim(root / SETTINGS, {"plan": mixed.plan(epoch).hash, "layout": layout, "projection": camera.projection.tolist(),
-                            "camera_from_sensor": camera.camera_from_sensor.tolist()})  # fmt: skip
+    claim(root / SETTINGS, {
+        "plan": mixed.plan(epoch).hash, "samples": _first_synthetic(mixed, epoch), "layout": layout,
+        "projection": camera.projection.tolist(), "camera_from_sensor": camera.camera_from_sensor.tolist(),
+        "image": camera.image_size,
+    })  # fmt: skip
     writer: Writer = SemanticKITTIWriter(root) if layout == "semantic_kitti" else KITTIObjectWriter(root)
     rows, written = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"], 0
     for position in tqdm(range(mixed.length(epoch)), unit="scan", disable=not progress):
-        scan = mixed.sample(epoch, position)
-        if not isinstance(scan, Scan):
-            raise ConfigError(f"samples of the type {type(scan).__name__}", "scans: to_sample=lambda scan, rng: scan")
+        scan = _sample(mixed, epoch, position)
         rows.append(f"{position:06d},{scan.domain},{scan.id}")
         if writer.complete(position):
             continue
@@ -80,6 +85,19 @@ def export_mixture(
     writer.finish()
     write_file(root / MANIFEST, "".join(f"{row}\n" for row in rows).encode())
     return written
+
+
+def _sample(mixed: MixedScans, epoch: int, position: int) -> Scan:
+    scan = mixed.sample(epoch, position)
+    if not isinstance(scan, Scan):
+        raise ConfigError(f"samples of the type {type(scan).__name__}", "scans: to_sample=lambda scan, rng: scan")
+    return scan
+
+
+def _first_synthetic(mixed: MixedScans, epoch: int) -> list[str]:
+    """Hashes of the first synthetic samples: they tell label policies and augmentations, which the plan leaves out."""
+    first = np.flatnonzero(mixed.plan(epoch).domain)[:COMPARED].tolist()
+    return [scan_hash(_sample(mixed, epoch, position)) for position in first]
 
 
 def write_planes(root: str | Path, split: str = "trainval") -> int:

@@ -122,7 +122,7 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             self._batches.load_state_dict(self._resume)
             self._resume = None
         dataset: Any = OnDevice(self.train) if self.on_device else self.train
-        collate = list if self.on_device else self.train.collate
+        collate = Unfinished if self.on_device else self.train.collate
         return _Loader(dataset, batch_sampler=self._batches, collate_fn=collate, **self._workers())
 
     def val_dataloader(self) -> Any:
@@ -134,12 +134,14 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         return self._plain(self.test)
 
     def transfer_batch_to_device(self, batch: Any, device: Any, dataloader_idx: int) -> Any:
-        """Transfer a batch; a list of samples is transferred later, when its synthetic samples are made."""
-        return batch if isinstance(batch, list) else super().transfer_batch_to_device(batch, device, dataloader_idx)
+        """Transfer a batch; an unfinished one is transferred later, when its synthetic samples are made."""
+        if isinstance(batch, Unfinished):
+            return batch
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
         """Make the synthetic samples of a batch, all of one generator at once, and collate it."""
-        if not isinstance(batch, list):
+        if not isinstance(batch, Unfinished):
             return batch
         for number, source in enumerate(self.train.synthetic):
             wanted = [i for i, item in enumerate(batch) if isinstance(item, Pending) and item.source == number]
@@ -175,6 +177,10 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             return []
         collate = self.train.collate if isinstance(self.train.collate, Collate) else Collate()
         return DataLoader(Items(scans), self.batch_size, collate_fn=collate, **self._workers())
+
+
+class Unfinished(list[Any]):
+    """The samples of a batch whose synthetic ones are not made yet; no collate function returns this type."""
 
 
 class _Epochs:
@@ -233,7 +239,8 @@ class _Epochs:
     def _check_limit(self) -> None:
         """Refuse an epoch with more batches than the first one, because Lightning would skip the additional ones."""
         trainer = self._data.trainer
-        if trainer is None or trainer.limit_train_batches != 1.0:
+        limit = None if trainer is None else trainer.limit_train_batches
+        if trainer is None or isinstance(limit, int) or limit != 1.0:  # 1 is one batch, as of fast_dev_run; 1.0 is all
             return
         limits = getattr(trainer.fit_loop._combined_loader, "limits", None)
         if limits and limits[0] < len(self):

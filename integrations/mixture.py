@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
 from lidar_synth.bank import Bank, is_bank
+from lidar_synth.bank.storage import is_url
 from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_text
@@ -43,7 +44,7 @@ def open_synthetic(where: Any) -> Any:
     """
     if not isinstance(where, str | Path):
         return where
-    if is_bank(where):
+    if is_url(where) or is_bank(where):
         return Bank(where)
     if not Path(where).is_dir():
         return load_generator(where)

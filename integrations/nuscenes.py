@@ -23,10 +23,10 @@ CLASSES = (
 
 NAMES = {
     "Car": "car", "Van": "car", "Truck": "truck", "Pedestrian": "pedestrian", "Person_sitting": "pedestrian",
-    "Cyclist": "bicycle", "Tram": None, "Misc": None, **{name: name for name in CLASSES},
+    "Cyclist": "bicycle", "Motorcyclist": "motorcycle", "Tram": None, "Misc": None, **{name: name for name in CLASSES},
 }  # fmt: skip
 """nuScenes' class by KITTI's; None: nuScenes has no such class, and the box is dropped. A van is a car in nuScenes, and
-a cyclist a bicycle with its rider."""
+a cyclist a bicycle with its rider; a motorcyclist likewise."""
 
 
 def as_nuscenes(scan: Scan) -> Scan:

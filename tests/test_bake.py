@@ -223,6 +223,14 @@ def test_a_different_checkpoint_is_refused(plan: BakePlan, tmp_path: Path) -> No
         bake(changed, progress=False)
 
 
+def test_a_checkpoint_that_was_replaced_is_loaded_again(tmp_path: Path) -> None:
+    model = write(tmp_path / "mine.safetensors")
+    bake(plan_in(tmp_path / "first", model), progress=False)
+    write(model, ("range", "reflectance", "label")[:2])
+    bake(plan_in(tmp_path / "second", model), progress=False)
+    assert Bank(tmp_path / "second").fields == {"reflectance"}
+
+
 def test_a_bank_without_bake_settings_is_refused(plan: BakePlan) -> None:
     bake(plan, progress=False)
     (plan.out / SETTINGS).unlink()

@@ -113,6 +113,9 @@ def test_a_bank_returns_the_scans_that_were_written(root: Path) -> None:
     for wrong in (5, -6):
         with pytest.raises(IndexError):
             bank[wrong]
+        with pytest.raises(IndexError):
+            bank.image(wrong)
+    assert np.array_equal(bank.image(-1).range, bank.image(4).range) and bank.ids[-1] == bank.ids[4]
 
 
 def test_few_shards_are_open_at_a_time(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -223,7 +223,17 @@ def test_the_command_prints_json_and_takes_a_reference(bank: Path, tmp_path: Pat
     write_all("npz", tmp_path / "real", [unproject(images_with("range")[13])])
     call("curate", bank, "--reference", tmp_path / "real", "--json")
     scores = read_scores(bank / FILE)
-    assert scores.reference == f"1 scans of {tmp_path / 'real'}" and not np.allclose(scores.values["range"], before)
+    assert scores.reference.startswith(f"1 scans of {tmp_path / 'real'} (")
+    assert not np.allclose(scores.values["range"], before)
+
+
+def test_scores_of_a_reference_with_other_scans_of_the_same_names_are_not_reused(bank: Path, tmp_path: Path) -> None:
+    found = []
+    for seed in (1, 2):
+        write_all("npz", tmp_path / "real", [unproject(some_image(seed))])
+        call("curate", bank, "--reference", tmp_path / "real", "--json")
+        found.append(read_scores(bank / FILE).values["range"])
+    assert not np.allclose(*found)
 
 
 def test_scores_of_another_bank_are_not_reused(bank: Path) -> None:

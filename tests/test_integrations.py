@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from banks import some_image, write_bank
 from lidar_synth.integrations.detection import (
     check_names,
     in_view,
@@ -53,6 +54,8 @@ def test_synthetic_scans_by_name(tmp_path: Path) -> None:
     assert open_synthetic(given) is given
     with pytest.raises(ConfigError, match="no such model"):
         open_synthetic("no such model")
+    write_bank(tmp_path / "bank", [some_image(i) for i in range(3)])
+    assert len(open_synthetic(str(tmp_path / "bank"))) == len(open_synthetic((tmp_path / "bank").as_uri())) == 3
 
 
 def test_real_samples_of_a_mixture_are_numbers(tmp_path: Path) -> None:
@@ -203,6 +206,9 @@ def test_a_mixture_as_semantic_kitti(mixed: MixedScans, tmp_path: Path) -> None:
     assert export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 0
     with pytest.raises(ConfigError, match="was filled with .*plan.* or choose another folder"):
         export_mixture(mixed, tmp_path / "out", "semantic_kitti", epoch=1, progress=False)
+    other = MixedScans(mixed.real[0], mixed.synthetic[0], ratio=0.4, seed=2, to_sample=as_is, labels="none")
+    with pytest.raises(ConfigError, match="was filled with"):
+        export_mixture(other, tmp_path / "out", "semantic_kitti", progress=False)
 
 
 def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:

@@ -68,6 +68,21 @@ def test_the_object_database(tmp_path: Path, origin: Any) -> None:
         assert np.isclose(info["box3d_lidar"][2] + lift, objects.boxes.values[i, 2], atol=1e-5)
 
 
+@pytest.mark.parametrize("layout", ["kitti", "nuscenes"])
+def test_objects_of_unknown_occlusion_are_pasted_too(tmp_path: Path, layout: Any) -> None:
+    """Stock configurations leave out objects of difficulty -1."""
+    import pickle
+
+    scan = street(0)
+    assert scan.boxes is not None
+    bare = replace(scan, boxes=replace(scan.boxes, occlusion=None, truncation=None, image_box=None))
+    objects = ObjectBank.from_scans([bare])
+    assert (objects.boxes.occlusion == -1).all()
+    path = write_gt_database(objects, tmp_path, origin="bottom", infos="infos.pkl", layout=layout)
+    found = [info["difficulty"] for infos in pickle.loads(path.read_bytes()).values() for info in infos]
+    assert len(found) == len(objects) and set(found) == {0}
+
+
 def test_a_detectors_mixture_has_boxes_by_the_mix_policy(tmp_path: Path) -> None:
     """As a configuration says it: a bank of objects by its file, scans without a box."""
     ObjectBank.from_scans([street(i) for i in range(6)]).save(tmp_path / "objects.npz")

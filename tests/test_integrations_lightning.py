@@ -95,6 +95,34 @@ def test_synthesis_after_the_transfer_gives_the_same_batches(workers: int) -> No
     assert max(map(len, made.asked)) > 1  # several at once
 
 
+class Pairs(Model):
+    """Is given (input, target) as PyTorch's own collate function makes them, a list."""
+
+    def training_step(self, batch: Any, index: int) -> Any:
+        x, y = batch
+        assert x.dtype == torch.float32 and y.dtype == torch.int64 and x.shape == y.shape == (4, 8, 8)
+        self.validated += 1
+        return self.weight.sum()
+
+
+def test_batches_of_pairs_are_passed_on(tmp_path: Path) -> None:
+    def pair(scan: Any, rng: Any) -> Any:
+        return torch.zeros(8, 8), torch.ones(8, 8, dtype=torch.int64)
+
+    mixed = MixedScans.wrap([pair(None, None)] * REAL, Endless(), ratio=0.25, to_sample=pair)
+    model = Pairs()
+    trainer(tmp_path, 1).fit(model, module.MixedData(mixed, batch_size=4))
+    assert model.validated == 3
+
+
+@pytest.mark.parametrize("options", [{"fast_dev_run": True}, {"limit_train_batches": 1}, {"overfit_batches": 1}])
+def test_one_batch_is_no_epoch_that_grows(options: dict[str, Any], tmp_path: Path) -> None:
+    model = Model()
+    data = module.MixedData(MixedScans(Scans("r", REAL), Endless(), ratio=0.25, seed=1), batch_size=4)
+    trainer(tmp_path, 1, **options).fit(model, data)
+    assert len(model.seen) == 4
+
+
 def test_on_device_refuses_sources_that_are_not_generators() -> None:
     mixed = MixedScans(Scans("r", REAL), Endless())
     with pytest.raises(ConfigError, match="on_device with .'Endless'."):

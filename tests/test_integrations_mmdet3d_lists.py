@@ -93,6 +93,8 @@ def test_names_of_boxes_become_nuscenes_classes() -> None:
     named = replace(scan, boxes=replace(scan.boxes, names=("Cyclist", "Tram", "traffic_cone")))
     boxes = as_nuscenes(named).boxes
     assert boxes is not None and boxes.names == ("bicycle", "traffic_cone") and set(boxes.names) <= set(CLASSES)
+    rider = replace(scan, boxes=replace(scan.boxes, names=("Motorcyclist", "Car", "Van")))
+    assert (as_nuscenes(rider).boxes or named.boxes).names == ("motorcycle", "car", "car")
     with pytest.raises(DataError, match="boxes of .'car_x'. in scan.*Rename"):
         as_nuscenes(replace(scan, boxes=replace(scan.boxes, names=("Car", "car_x", "Car"))))
     far = Scan(scan.points[:1] + 500, scan.reflectance[:1], scan.sensor, boxes=scan.boxes)

@@ -200,6 +200,15 @@ def test_wrap_returns_samples_of_the_wrapped_dataset_unchanged() -> None:
     assert [name for batch in batches for name in batch["name"]] == [s["name"] for s in samples]
 
 
+def test_seeds_and_weights_may_be_numpys() -> None:
+    sources = Endless(), Endless(name="t")
+    given, plain = (
+        MixedScans(Scans("r", 6), Sources(*sources, weights=weights), ratio=0.5, seed=seed)
+        for weights, seed in ((np.array([3, 1]), np.int64(1)), ([3, 1], 1))
+    )
+    assert ids(given) == ids(plain) and given.plan(0).hash == plain.plan(0).hash
+
+
 def test_several_sources() -> None:
     real = Sources(Scans("a", 4), Scans("b", 8))
     assert [len(real), real[0].id, real[4].id, real[11].id] == [12, "a0", "b0", "b7"]

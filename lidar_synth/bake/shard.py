@@ -119,7 +119,11 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
         ConfigError: if it is another checkpoint, or the device is not available.
         FileError, DataError: if it cannot be read.
     """
-    generator = _load(job.model, job.device, job.dtype, job.batch or BATCH[job.device], job.columns)
+    settings = job.model, job.device, job.dtype, job.batch or BATCH[job.device], job.columns
+    generator = _load(*settings)
+    if generator.hash != facts.checkpoint:  # maybe the file was replaced since it was loaded
+        _load.cache_clear()
+        generator = _load(*settings)
     if generator.hash != facts.checkpoint:
         raise ConfigError(
             f"model {job.model!r}, checkpoint {generator.hash[:12]}",

@@ -92,15 +92,13 @@ class Bank:
         Raises:
             DataError, FileError: if it cannot be read; the message names shard and scan.
         """
-        if not -len(self) <= number < len(self):
-            raise IndexError(f"scan {number} of {len(self)}")
-        shard, position = _place(self.index, number % len(self))
+        shard, position = _place(self.index, number)
         image = self.facts.encoding.decode(self.shard(shard).read(position))
         name, made = _name(self.index, shard, position), _provenance(self.index, shard)
         return replace(unproject(image), id=name, domain=SYNTHETIC, provenance=made)
 
     def image(self, number: int) -> RangeImage:
-        """The range image of a scan, 0 <= number < len; raises as ``__getitem__``."""
+        """The range image of a scan; raises as ``__getitem__``."""
         shard, position = _place(self.index, number)
         return self.facts.encoding.decode(self.shard(shard).read(position))
 
@@ -169,11 +167,18 @@ class _Names(Sequence[str]):
     def __getitem__(self, number: int | slice) -> str | Sequence[str]:
         if isinstance(number, slice):
             return [self[i] for i in range(len(self))[number]]
-        return _name(self._index, *_place(self._index, range(len(self))[number]))
+        return _name(self._index, *_place(self._index, number))
 
 
 def _place(index: Index, number: int) -> tuple[int, int]:
-    """The shard of a scan, and its position in that shard."""
+    """The shard of a scan, and its position in that shard.
+
+    Raises:
+        IndexError: unless -len <= number < len.
+    """
+    if not -index.scans <= number < index.scans:
+        raise IndexError(f"scan {number} of {index.scans}")
+    number %= index.scans
     shard = bisect_right(index.ends, number)
     entry = index.shards[shard]
     return shard, entry.position(number - (index.ends[shard] - entry.kept))

@@ -102,12 +102,17 @@ def _scores(
     """Read the saved scores of this bank and reference, or compute and save them."""
     from lidar_synth.bake.curate import FILE, kept_in, read_scores, score, write_scores
     from lidar_synth.errors import ConfigError
+    from lidar_synth.evaluate.cache import scan_hash
+    from lidar_synth.files.disk import hash_of_names
     from lidar_synth.formats import open_scans
 
     if split is not None and reference is None:
         raise ConfigError(f"--split {split} without a reference", "--reference as well")
     source = None if reference is None else open_scans(reference, split=split)
-    name = "" if source is None else f"{len(source)} scans of {' '.join(filter(None, (reference, split)))}"
+    name = ""
+    if source is not None:
+        which = hash_of_names([*source.ids, *(scan_hash(source[i]) for i in (0, len(source) // 2, -1))])
+        name = f"{len(source)} scans of {' '.join(filter(None, (reference, split)))} ({which[:8]})"
     path = bank / FILE
     if path.is_file():
         saved = read_scores(path)

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +120,7 @@ class MixedScans(Dataset[Any]):
         real_as_is: bool = False,
         compare: bool = True,
     ) -> None:
-        reals = each(real)
+        reals, seed = each(real), index(seed)
         synthetics = [(make_synthetic(source, seed), weight) for source, weight in each(synth)]
         self.real = tuple(source for source, _ in reals)
         self.synthetic = tuple(source for source, _ in synthetics)

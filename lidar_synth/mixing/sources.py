@@ -37,7 +37,8 @@ class Sources:
                 f"{len(sources)} sources with weights {weights}", "sources, and a weight for each or none"
             )
         self.sources = sources
-        self.weights: tuple[float | None, ...] = (None,) * len(sources) if weights is None else tuple(weights)
+        plain = None if weights is None else [w.item() if isinstance(w, np.generic) else w for w in weights]
+        self.weights: tuple[float | None, ...] = (None,) * len(sources) if plain is None else tuple(plain)
 
     def __len__(self) -> int:
         return sum(map(len, self.sources))
