@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,12 @@ from lidar_synth.cli import app
 from lidar_synth.datasets.classes import GROUND
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS
-from lidar_synth.geometry.projection import locate, project
+from lidar_synth.geometry.projection import locate, project, unproject
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import edit, objects_of
 from lidar_synth.labels.edit.insertion import cut_out
 from lidar_synth.labels.edit.rays import rays_of_scan
-from lidar_synth.labels.edit.removal import returns_of
+from lidar_synth.labels.edit.removal import returns_of, without
 from lidar_synth.labels.ground import FLOOR
 
 BEHIND = wall(24, 0, np.pi / 2, length=80)
@@ -226,6 +227,19 @@ def test_the_flow_draws_the_hole_and_nothing_else() -> None:
     assert len(new - before) > 0.5 * len(filled - before) and not filled - before <= new
     for result in (by_geometry, drawn):
         assert edit.measure([result]).objects == 0
+
+
+def test_a_drawn_road_is_level_where_rays_start_above_the_origin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that draws exactly what was there gives back the scan."""
+    sensor = load_sensor("hdl64e_lasers")
+    image = project(Town(seed=0, scans=1, sensor=sensor, motion=False)[0])
+    scan = unproject(image)
+    monkeypatch.setattr("lidar_synth.generate.inpaint.inpaint", lambda *_: [image])
+    x, y, _ = scan.points.T
+    removed = GROUND[scan.label] & (x > 6) & (x < 20) & (np.abs(y) < 0.15 * x)
+    box = np.array([13, 0, -1, 10, 3, 2, 0], np.float32)
+    result = without(scan, [(removed, box)], SimpleNamespace(sensor=sensor), 0)
+    assert removed.sum() > 500 and np.allclose(result.points, scan.points, atol=1e-3)
 
 
 def test_the_command_line_keeps_the_calibration(tmp_path: Path) -> None:
