@@ -97,6 +97,14 @@ def test_the_rays_of_a_scan_lead_to_its_points() -> None:
         assert np.allclose(rays.points(there, rays.rho[there]), scan.points[rays.point[there]], atol=1e-5)
 
 
+def test_rays_of_a_grid_start_where_its_rows_do() -> None:
+    sensor = load_sensor("hdl64e_lasers")
+    scan = unproject(project(Town(seed=0, scans=1, sensor=sensor, motion=False)[0]))
+    rays = rays_of_scan(replace(scan, ring=None))
+    assert np.array_equal(rays.height.astype(np.float32), sensor.starts[rays.ring])
+    assert np.allclose(rays.slope, np.tan(sensor.row_elevations())[rays.ring], atol=1e-4)
+
+
 @pytest.mark.parametrize(
     "old, new",
     [((10, 0, 0.3), (14, 6, None)), ((12, -4, 1.2), (8, 3, None)), ((-9, 2, 0.0), (11, -3, 3.0)),
