@@ -153,6 +153,14 @@ def test_every_point_gets_its_ring_and_firing() -> None:
     assert (np.abs(shift - np.median(shift)) <= 1).all()
 
 
+@pytest.mark.parametrize("name", ["town", "hdl64e_kitti", "hdl64e_lasers", "os1_128"])
+def test_every_point_gets_its_ring_with_the_scans_own_sensor(name: str) -> None:
+    """Also where the preset has the elevations that lasers above the origin seem to have from there."""
+    scan = Town(seed=0, scans=1, sensor=name, motion=False)[0]
+    found = assign_beams(scan)
+    assert (found.ring == scan.ring).mean() > 0.999 and np.percentile(np.abs(found.off), 99) < 0.01
+
+
 def test_motion_compensation_is_undone_by_poses() -> None:
     scan, path = turned().scan, driving(15.0, 0.5)
     published = deskew(scan, path)
