@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.geometry.fitting import assign_beams
 from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import joined
 
 
@@ -17,8 +19,8 @@ def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
 
     The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of the first scan.
     Labels, confidence (1 for labels of scans without confidence) and instances are always set; instances of the other
-    scans are renumbered. Rings are set if the first scan has them, boxes if any scan has them; times are dropped, as
-    each scan has its own moment.
+    scans are renumbered. Rings are set if the first scan has them, as lasers of its sensor; boxes if any scan has them;
+    times are dropped, as each scan has its own moment.
     """
     parts = [_complete(scan)]
     used = _last_instance(parts[0])
@@ -27,13 +29,25 @@ def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
         used = max(used, _last_instance(parts[-1]))
     names = ["reflectance", "label", "confidence", "instance"]
     if scan.ring is not None:
-        parts = [replace(p, ring=_rings(p, scan) if p.ring is None else p.ring) for p in parts]
+        parts = [_with_rings(p, scan.sensor) for p in parts]
         names.append("ring")
     together: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in ("points", *names)}
     boxes = [p.boxes for p in parts if p.boxes is not None]
     return replace(
         scan, **together, raw_label=None, time=None, boxes=joined(boxes) if boxes else None, domain=SYNTHETIC
     )
+
+
+def same_lasers(one: Sensor, other: Sensor) -> bool:
+    """Whether ring numbers of one sensor are those of another."""
+    return np.array_equal(one.optics(), other.optics())
+
+
+def _with_rings(part: Scan, sensor: Sensor) -> Scan:
+    """The scan with the rings of a sensor: its own if they are of the same lasers, else the nearest."""
+    if part.ring is not None and same_lasers(part.sensor, sensor):
+        return part
+    return replace(part, ring=assign_beams(part, sensor).ring)
 
 
 def _complete(scan: Scan) -> Scan:
@@ -66,11 +80,3 @@ def _renumbered(scan: Scan, used: int) -> Scan:
     if boxes is not None:
         boxes = replace(boxes, instance=new(boxes.instance))
     return replace(scan, instance=new(scan.instance), boxes=boxes)
-
-
-def _rings(part: Scan, scan: Scan) -> NDArray[np.int16]:
-    """(N,) the rings of points whose ring is unknown: the lasers of the scan's sensor with the nearest elevation."""
-    tilt = np.arcsin(part.points[:, 2] / np.linalg.norm(part.points, axis=1))
-    lasers = scan.sensor.laser_elevations[::-1]
-    above = np.searchsorted((lasers[1:] + lasers[:-1]) / 2, tilt)
-    return np.asarray(len(lasers) - 1 - above, np.int16)
