@@ -177,12 +177,29 @@ def test_objects_of_a_bank_are_inserted() -> None:
     assert result.boxes.contain(result.points[result.label == CAR]).all() and (result.label == CAR).sum() > 100
 
 
+def test_boxes_given_by_their_values_leave_the_scan() -> None:
+    scan = cast([car(12, 0), car(10, 6), car(10, -6)], [BEHIND])
+    for box in (1, [1], scan.boxes[[1]], scan.boxes.values[1], scan.boxes.values[[1, 1]]):
+        left = edit.remove(scan, box).boxes
+        assert left is not None and np.array_equal(left.values, scan.boxes.values[[0, 2]])
+    beside = edit.remove(scan, scan.boxes.values[1] + np.float32([0.1, 0, 0, 0, 0, 0, 0]))
+    assert len(beside.boxes) == 3, "a box of one's own is none of the scan's"
+
+
+@pytest.mark.parametrize("none", [[], np.zeros((0, 7), np.float32), Boxes(np.zeros((0, 7), np.float32), ())])
+def test_without_boxes_to_remove_the_scan_stays(none: Any) -> None:
+    assert edit.remove(SCAN, none) is SCAN
+
+
 SCAN = cast([car(12, 0, 0.3), car(8, 8)], [BEHIND])
 ITEM = cut_out(SCAN, 0)
 BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "number": (lambda: edit.remove(SCAN, 2), DataError, r"box 2 of scan 'world' with 2 boxes; expected numbers"),
     "no boxes": (lambda: edit.remove(replace(SCAN, boxes=None), 0), DataError, "with 0 boxes.*takes a box"),
     "shape": (lambda: edit.remove(SCAN, [1.0, 2.0]), DataError, r"a box of shape \(2,\)"),
+    "whole numbers": (
+        lambda: edit.remove(SCAN, [1, 1, 0, 0, 1, 1, 0]), DataError, "each number once, or a box .* as floats",
+    ),
     "far": (lambda: edit.remove(SCAN, car(90, 0)), DataError, "90.0 m away; expected at most 80 m"),
     "empty": (lambda: edit.remove(SCAN, car(-9, 0) + np.float32([0, 0, 6, 0, 0, 0, 0])), DataError, "without a return"),
     "model": (lambda: edit.remove(SCAN, 0, model="nothing"), ConfigError, "model 'nothing'; expected a shipped one"),
