@@ -236,6 +236,16 @@ def test_objects_of_another_sensor_get_rings_of_the_scans_lasers() -> None:
     assert len(new) > 100 and np.array_equal(new.ring, assign_beams(new).ring)
 
 
+def test_objects_with_tracks_are_still_there_where_points_have_no_instance() -> None:
+    """As in PandaSet and KITTI raw, whose boxes have the numbers of their tracks."""
+    town = replace(Town(0, scans=1)[0], instance=None, raw_label=None)
+    before, after = objects_of(town), objects_of(merged(town, []))
+    assert len(before) >= 8 and before.keys() == after.keys()
+    for number, item in before.items():
+        assert np.array_equal(after[number].scan.points, item.scan.points)
+        assert after[number].scan.boxes.instance == item.scan.boxes.instance
+
+
 @pytest.mark.slow
 def test_nothing_that_is_given_is_changed() -> None:
     host, candidate = cast([car(20, 0)]), seen(car(8, 5))

@@ -12,15 +12,16 @@ from lidar_synth.geometry.fitting import assign_beams
 from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import joined
+from lidar_synth.labels.objects import belonging
 
 
 def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
     """Append the points, labels and boxes of other scans to a scan.
 
     The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of the first scan.
-    Labels, confidence (1 for labels of scans without confidence) and instances are always set; instances of the other
-    scans are renumbered. Rings are set if the first scan has them, as lasers of its sensor; boxes if any scan has them;
-    times are dropped, as each scan has its own moment.
+    Labels, confidence (1 for labels of scans without confidence) and instances (those of their boxes, if points have
+    none) are always set; instances of the other scans are renumbered. Rings are set if the first scan has them, as
+    lasers of its sensor; boxes if any scan has them; times are dropped, as each scan has its own moment.
     """
     parts = [_complete(scan)]
     used = _last_instance(parts[0])
@@ -53,8 +54,18 @@ def _with_rings(part: Scan, sensor: Sensor) -> Scan:
 def _complete(scan: Scan) -> Scan:
     label = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
     confidence = (label != IGNORE).astype(np.float32) if scan.confidence is None else scan.confidence
-    instance = np.zeros(len(scan), np.int32) if scan.instance is None else scan.instance
+    instance = _of_tracks(scan) if scan.instance is None else scan.instance
     return replace(scan, label=label, confidence=confidence, instance=instance)
+
+
+def _of_tracks(scan: Scan) -> NDArray[np.int32]:
+    """(N,) the instances of points that have none, by the boxes of tracks; without it these would lose their points."""
+    instance = np.zeros(len(scan), np.int32)
+    if scan.boxes is not None:
+        for number in np.flatnonzero(scan.boxes.instance > 0):
+            mine = belonging(scan, scan.boxes[[number]])
+            instance[mine & (instance == 0)] = scan.boxes.instance[number]
+    return instance
 
 
 def _numbers(scan: Scan) -> list[NDArray[np.int32]]:
