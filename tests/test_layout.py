@@ -138,6 +138,16 @@ def test_the_cells_of_a_box_look_at_points_of_its_surface(seed: int) -> None:
     assert np.abs(image[4][seen] / 255 - along)[single].max() < 0.02
 
 
+def test_nothing_is_known_beyond_the_depths_of_an_image() -> None:
+    """Two bytes end at 131 m; the front of the farther truck would be there instead of at 154 m."""
+    trucks = Boxes(np.array([(160, 0, 0, 12, 6, 6, 0), (0, 126, 0, 12, 6, 6, 0)], np.float32), ("Truck", "Truck"))
+    sensor = load_sensor("vls128")
+    image = layout_image(Layout(trucks), sensor)
+    seen = image[0] == CODES["Truck"]
+    assert sensor.range_max > 160 and seen.any() and 122 < depth_of(image)[seen].max() < 131.07
+    assert not seen[:, sensor.columns // 2 - 50 : sensor.columns // 2 + 50].any()
+
+
 def test_turning_rolls_and_mirroring_flips() -> None:
     sensor = load_sensor("hdl64e_lasers")
     layout = replace(some_layout(5, walls=False), ground=(-1.7, 0.0, 0.0))
