@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,12 @@ from lidar_synth.cli import app
 from lidar_synth.datasets.classes import GROUND
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS
-from lidar_synth.geometry.projection import locate, project
+from lidar_synth.geometry.projection import locate, project, unproject
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import edit, objects_of
 from lidar_synth.labels.edit.insertion import cut_out
 from lidar_synth.labels.edit.rays import rays_of_scan
-from lidar_synth.labels.edit.removal import returns_of
+from lidar_synth.labels.edit.removal import returns_of, without
 from lidar_synth.labels.ground import FLOOR
 
 BEHIND = wall(24, 0, np.pi / 2, length=80)
@@ -94,6 +95,14 @@ def test_the_rays_of_a_scan_lead_to_its_points() -> None:
         there = np.flatnonzero(rays.point >= 0)
         assert np.array_equal(np.sort(rays.point[there]), np.arange(len(scan)))
         assert np.allclose(rays.points(there, rays.rho[there]), scan.points[rays.point[there]], atol=1e-5)
+
+
+def test_rays_of_a_grid_start_where_its_rows_do() -> None:
+    sensor = load_sensor("hdl64e_lasers")
+    scan = unproject(project(Town(seed=0, scans=1, sensor=sensor, motion=False)[0]))
+    rays = rays_of_scan(replace(scan, ring=None))
+    assert np.array_equal(rays.height.astype(np.float32), sensor.starts[rays.ring])
+    assert np.allclose(rays.slope, np.tan(sensor.row_elevations())[rays.ring], atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -168,12 +177,29 @@ def test_objects_of_a_bank_are_inserted() -> None:
     assert result.boxes.contain(result.points[result.label == CAR]).all() and (result.label == CAR).sum() > 100
 
 
+def test_boxes_given_by_their_values_leave_the_scan() -> None:
+    scan = cast([car(12, 0), car(10, 6), car(10, -6)], [BEHIND])
+    for box in (1, [1], scan.boxes[[1]], scan.boxes.values[1], scan.boxes.values[[1, 1]]):
+        left = edit.remove(scan, box).boxes
+        assert left is not None and np.array_equal(left.values, scan.boxes.values[[0, 2]])
+    beside = edit.remove(scan, scan.boxes.values[1] + np.float32([0.1, 0, 0, 0, 0, 0, 0]))
+    assert len(beside.boxes) == 3, "a box of one's own is none of the scan's"
+
+
+@pytest.mark.parametrize("none", [[], np.zeros((0, 7), np.float32), Boxes(np.zeros((0, 7), np.float32), ())])
+def test_without_boxes_to_remove_the_scan_stays(none: Any) -> None:
+    assert edit.remove(SCAN, none) is SCAN
+
+
 SCAN = cast([car(12, 0, 0.3), car(8, 8)], [BEHIND])
 ITEM = cut_out(SCAN, 0)
 BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "number": (lambda: edit.remove(SCAN, 2), DataError, r"box 2 of scan 'world' with 2 boxes; expected numbers"),
     "no boxes": (lambda: edit.remove(replace(SCAN, boxes=None), 0), DataError, "with 0 boxes.*takes a box"),
     "shape": (lambda: edit.remove(SCAN, [1.0, 2.0]), DataError, r"a box of shape \(2,\)"),
+    "whole numbers": (
+        lambda: edit.remove(SCAN, [1, 1, 0, 0, 1, 1, 0]), DataError, "each number once, or a box .* as floats",
+    ),
     "far": (lambda: edit.remove(SCAN, car(90, 0)), DataError, "90.0 m away; expected at most 80 m"),
     "empty": (lambda: edit.remove(SCAN, car(-9, 0) + np.float32([0, 0, 6, 0, 0, 0, 0])), DataError, "without a return"),
     "model": (lambda: edit.remove(SCAN, 0, model="nothing"), ConfigError, "model 'nothing'; expected a shipped one"),
@@ -226,6 +252,19 @@ def test_the_flow_draws_the_hole_and_nothing_else() -> None:
     assert len(new - before) > 0.5 * len(filled - before) and not filled - before <= new
     for result in (by_geometry, drawn):
         assert edit.measure([result]).objects == 0
+
+
+def test_a_drawn_road_is_level_where_rays_start_above_the_origin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that draws exactly what was there gives back the scan."""
+    sensor = load_sensor("hdl64e_lasers")
+    image = project(Town(seed=0, scans=1, sensor=sensor, motion=False)[0])
+    scan = unproject(image)
+    monkeypatch.setattr("lidar_synth.generate.inpaint.inpaint", lambda *_: [image])
+    x, y, _ = scan.points.T
+    removed = GROUND[scan.label] & (x > 6) & (x < 20) & (np.abs(y) < 0.15 * x)
+    box = np.array([13, 0, -1, 10, 3, 2, 0], np.float32)
+    result = without(scan, [(removed, box)], SimpleNamespace(sensor=sensor), 0)
+    assert removed.sum() > 500 and np.allclose(result.points, scan.points, atol=1e-3)
 
 
 def test_the_command_line_keeps_the_calibration(tmp_path: Path) -> None:

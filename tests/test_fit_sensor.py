@@ -64,6 +64,25 @@ def test_the_beams_are_found(name: str) -> None:
     assert fit.share > 0.98 and fit.points.sum() == sum(map(len, fit.rings))
 
 
+@pytest.mark.parametrize("change", ["from 1", "even", "one lost", "one almost lost"])
+def test_ring_numbers_may_have_gaps(change: str) -> None:
+    made = [turned(seed=seed) for seed in range(2)]
+    scans = [replace(m.scan, ring=m.ring.astype(np.int16)) for m in made]
+    if change in ("from 1", "even"):
+        scans = [replace(s, ring=s.ring + np.int16(1) if change == "from 1" else 2 * s.ring) for s in scans]
+    else:
+        scans = [s[s.ring != 5] for s in scans]
+    if change == "one almost lost":  # its only returns are those of the sensor's own housing
+        near = np.array([[0.1, 0.0, 0.01]], np.float32)
+        last = replace(scans[0][-1:], points=near, ring=np.array([5], np.int16))
+        fields = {n: np.concatenate([v, last.fields()[n]]) for n, v in scans[0].fields().items()}
+        scans[0] = replace(scans[0], points=np.concatenate([scans[0].points, near]), **fields)
+    fit = fit_sensor(scans)
+    there = BEAMS if change in ("from 1", "even") else (*BEAMS[:5], *BEAMS[6:])
+    assert fit.source == "ring field" and fit.sensor.shape[0] == len(there)
+    assert np.abs(np.array(fit.sensor.elevations) - there).max() < 0.02 and fit.share > 0.99
+
+
 def test_heights_and_speeds_are_found() -> None:
     fit = fit_sensor(shuffled(some(heights=HEIGHTS)))
     assert np.allclose(fit.sensor.heights, HEIGHTS, atol=0.005)
@@ -151,6 +170,14 @@ def test_every_point_gets_its_ring_and_firing() -> None:
     # Firings are counted from behind; the fit does not know where the first one is.
     shift = (found.firing - made.firing) % sensor.firings
     assert (np.abs(shift - np.median(shift)) <= 1).all()
+
+
+@pytest.mark.parametrize("name", ["town", "hdl64e_kitti", "hdl64e_lasers", "os1_128"])
+def test_every_point_gets_its_ring_with_the_scans_own_sensor(name: str) -> None:
+    """Also where the preset has the elevations that lasers above the origin seem to have from there."""
+    scan = Town(seed=0, scans=1, sensor=name, motion=False)[0]
+    found = assign_beams(scan)
+    assert (found.ring == scan.ring).mean() > 0.999 and np.percentile(np.abs(found.off), 99) < 0.01
 
 
 def test_motion_compensation_is_undone_by_poses() -> None:

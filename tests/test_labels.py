@@ -247,6 +247,14 @@ def test_a_partner_is_thinned_to_the_grid() -> None:
         thinned(scan, presets()["os1_128"])
 
 
+def test_a_partner_of_other_lasers_lends_no_rings() -> None:
+    host, other = Town(1, scans=1)[0], Town(1, "os1_128", scans=1)[0]
+    assert thinned(other, host.sensor).ring is None
+    assert thinned(host, replace(host.sensor, name="fewer", columns=512)).ring is not None
+    mixed = swap_sector(host, thinned(other, host.sensor), 0, 512)
+    assert mixed.ring.max() < 64
+
+
 def test_mixed_in_labels_are_certain_and_the_rest_keeps_its_own(synthetic: Scan, real: list[Scan]) -> None:
     policy = make_policy("mix", real=real, fields=FIELDS, kind="laser", bands=[4], threshold=0.5)
     mixed = policy(synthetic, keyed_rng(3))

@@ -13,7 +13,7 @@ from lidar_synth import Layout, Town, layout_of, load_layout, load_sensor
 from lidar_synth.datasets.classes import BOXED
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.evaluate.layouts import layout_agreement, rays_of_boxes
-from lidar_synth.geometry.layout import CODES, Outline, layout_image
+from lidar_synth.geometry.layout import CODES, Outline, known_boxes, layout_image
 from lidar_synth.geometry.layout.layout import overlaps
 from lidar_synth.geometry.layout.raster import depth_of
 from lidar_synth.geometry.scan import Boxes
@@ -138,6 +138,16 @@ def test_the_cells_of_a_box_look_at_points_of_its_surface(seed: int) -> None:
     assert np.abs(image[4][seen] / 255 - along)[single].max() < 0.02
 
 
+def test_nothing_is_known_beyond_the_depths_of_an_image() -> None:
+    """Two bytes end at 131 m; the front of the farther truck would be there instead of at 154 m."""
+    trucks = Boxes(np.array([(160, 0, 0, 12, 6, 6, 0), (0, 126, 0, 12, 6, 6, 0)], np.float32), ("Truck", "Truck"))
+    sensor = load_sensor("vls128")
+    image = layout_image(Layout(trucks), sensor)
+    seen = image[0] == CODES["Truck"]
+    assert sensor.range_max > 160 and seen.any() and 122 < depth_of(image)[seen].max() < 131.07
+    assert not seen[:, sensor.columns // 2 - 50 : sensor.columns // 2 + 50].any()
+
+
 def test_turning_rolls_and_mirroring_flips() -> None:
     sensor = load_sensor("hdl64e_lasers")
     layout = replace(some_layout(5, walls=False), ground=(-1.7, 0.0, 0.0))
@@ -181,6 +191,12 @@ def test_the_layout_of_a_scan_has_the_boxes_within_the_range(town: Any) -> None:
     values = inside.values.copy()
     values[0, :2] = 80.5, 0  # its nearer half is within 80 m
     assert layout_of(replace(town, boxes=replace(inside, values=values))).boxes.names == inside.names[1:]
+
+
+def test_only_boxes_that_overlap_a_kept_one_are_dropped(town: Any) -> None:
+    """The second of three in a row overlaps both others, which stand apart."""
+    row = Boxes(np.array([(x, 0, -1, 4, 2, 1.5, 0) for x in (10, 13, 16)], np.float32), ("Car",) * 3)
+    assert known_boxes(replace(town, boxes=row)).values[:, 0].tolist() == [10, 16]
 
 
 def test_a_scan_without_labels_has_ground_and_outlines(town: Any) -> None:

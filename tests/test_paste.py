@@ -10,11 +10,14 @@ from pasting import assert_nothing_shares_a_ray
 from worlds import CAR, HEIGHT, SENSOR, WALL, car, cast, wall
 
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.fitting import assign_beams
 from lidar_synth.geometry.projection import locate, project
 from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.labels import Object, objects_of, paste
+from lidar_synth.labels.merge import merged
 from lidar_synth.labels.pasting import LIFT
+from lidar_synth.town import Town
 
 places = st.tuples(st.floats(5, 30), st.floats(-180, 180), st.floats(-3.1, 3.1))
 
@@ -208,15 +211,39 @@ def test_fields_of_a_scan_with_pasted_objects() -> None:
     assert (pasted.confidence[new] == 1).all() and (pasted.instance[new] == 1).all()
     assert np.array_equal(pasted.reflectance[new], candidate.scan.reflectance)
     assert (pasted.domain, pasted.id, pasted.raw_label) == (SYNTHETIC, host.id, None)
-    lasers = np.degrees(SENSOR.laser_elevations[pasted.ring[new]])
-    tilt = np.degrees(np.arcsin(pasted.points[new, 2] / np.linalg.norm(pasted.points[new], axis=1)))
-    assert np.abs(lasers - tilt).max() < 0.45
+    elevation, height = (values[pasted.ring[new]] for values in SENSOR.optics())
+    x, y, z = pasted.points[new].T
+    assert np.abs(np.degrees(np.arctan2(z - height, np.hypot(x, y)) - elevation)).max() < 0.45
     boxes = pasted.boxes
     assert (boxes.occlusion.tolist(), boxes.image_box.tolist()) == ([1], [[-1] * 4])
     assert (boxes.truncation[0], boxes.alpha[0]) == (np.float32(0.2), 1)
     about = paste(host, [candidate.turned(0.2)]).boxes
     assert about is not None
     assert (about.truncation[0], about.alpha[0]) == (-1, -10)  # in another direction the camera saw nothing of it
+
+
+@pytest.mark.parametrize("name", ["town", "hdl64e_lasers"])
+def test_points_without_rings_get_those_of_their_lasers(name: str) -> None:
+    host, other = (Town(seed, name, scans=1, motion=False)[0] for seed in (0, 3))
+    both = merged(host, [replace(other, ring=None)])
+    assert (both.ring[len(host) :] == other.ring).mean() > 0.999
+
+
+def test_objects_of_another_sensor_get_rings_of_the_scans_lasers() -> None:
+    host, finer = Town(0, scans=1, motion=False)[0], Town(3, "os1_128", scans=1, motion=False)[0]
+    pasted = paste(host, objects_of(finer, 50).values())
+    new = pasted[pasted.instance > host.instance.max()]
+    assert len(new) > 100 and np.array_equal(new.ring, assign_beams(new).ring)
+
+
+def test_objects_with_tracks_are_still_there_where_points_have_no_instance() -> None:
+    """As in PandaSet and KITTI raw, whose boxes have the numbers of their tracks."""
+    town = replace(Town(0, scans=1)[0], instance=None, raw_label=None)
+    before, after = objects_of(town), objects_of(merged(town, []))
+    assert len(before) >= 8 and before.keys() == after.keys()
+    for number, item in before.items():
+        assert np.array_equal(after[number].scan.points, item.scan.points)
+        assert after[number].scan.boxes.instance == item.scan.boxes.instance
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Sensors: presets, files, angles and validation."""
 
 import copy
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import yaml
 
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
+from lidar_synth.geometry.sensor import Sensor, load_sensor, presets, sensor_yaml
 from lidar_synth.geometry.transfer.rays import rays_of
 
 DESIGN = {"hdl64e_kitti360", "hdl64e_kitti", "hdl32e_nuscenes", "os1_128", "town"}
@@ -112,6 +113,13 @@ GOOD = {"name": "x", "columns": 8, "range_min": 1.0, "range_max": 9.0, "rows": 4
 def test_invalid_sensors_are_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Sensor.from_dict({**GOOD, **change})
+
+
+def test_numbers_of_numpy_become_those_of_python() -> None:
+    numbers = {"columns": np.int64(8), "rows": np.int32(4), "range_min": np.float32(1), "range_max": np.float64(9)}
+    sensor = Sensor.from_dict({**GOOD, **numbers})
+    assert sensor == Sensor.from_dict(GOOD) and sensor.to_dict() == GOOD
+    assert json.loads(json.dumps(sensor.to_dict())) == GOOD and "range_max: 9.0" in sensor_yaml(sensor)
 
 
 def test_unknown_names_and_invalid_files_are_explained(tmp_path: Path) -> None:

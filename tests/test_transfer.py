@@ -14,6 +14,7 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
 from lidar_synth.geometry.transfer import Measurement, Mount, Response, SeenAs, Transfer
 from lidar_synth.geometry.transfer.rays import rays_of
+from lidar_synth.geometry.transfer.surfaces import rings_of
 from lidar_synth.noise import keyed_rng
 
 HDL64E = replace(load_sensor("hdl64e_kitti360"), firings=2000, heights=None)
@@ -290,6 +291,16 @@ def test_a_shuffled_scan_finds_its_rings_by_elevation(scan: Scan) -> None:
     sensor = replace(HDL64E, name="beams", elevations=HDL64E.beams, beams=None, rows=None, fov_up=None, fov_down=None)
     given, shuffled = replace(scan, sensor=sensor), replace(_shuffled(scan), sensor=sensor)
     assert abs(len(Transfer(UNEVEN)(given)) - len(Transfer(UNEVEN)(shuffled))) < 50
+
+
+def test_rows_whose_rays_start_above_the_origin_are_found_without_rings() -> None:
+    sensor = load_sensor("hdl64e_lasers")
+    drawn = project(Town(seed=0, scans=1, sensor=sensor, motion=False)[0])
+    on_rows = unproject(drawn)
+    rows, on_grid = rings_of(replace(on_rows, ring=None))
+    assert on_grid and np.array_equal(rows, np.nonzero(drawn.mask)[0])
+    given, without = (Transfer(load_sensor("hdl32e"))(s) for s in (on_rows, replace(on_rows, ring=None)))
+    assert len(without) > 0.95 * len(given)
 
 
 @pytest.mark.parametrize("wrong", [{"z": 9.0}, {"pitch": 60.0}, {"z": float("nan")}])

@@ -128,23 +128,25 @@ class Sensor:
             raise self._error(f"reflectance_levels = {self.reflectance_levels}", "2 to 65536")
 
     def _check_types(self) -> None:
-        """Check that values are texts, integers or finite numbers; convert lists to tuples of float."""
+        """Check that values are texts, integers or finite numbers; convert lists to tuples of float, and numbers of
+        numpy, which JSON and YAML cannot hold, to Python's."""
         for key in ("name", "description"):
             if not isinstance(getattr(self, key), str):
                 raise self._error(f"{key} = {getattr(self, key)!r}", "text")
         if not self.name:
             raise self._error("an empty name", "text, which files of its scans tell")
         for key in (*_INTEGERS, *_NUMBERS):
-            value, integer = getattr(self, key), key in _INTEGERS
+            value, integer = _plain(getattr(self, key)), key in _INTEGERS
             valid = _is_integer(value) if integer else _is_finite(value)
             if not valid and not (value is None and key in _OPTIONAL):
                 raise self._error(f"{key} = {value!r}", "a whole number" if integer else "a finite number")
+            object.__setattr__(self, key, value)
         for key in ("elevations", "beams", "heights", "azimuths"):
             table = getattr(self, key)
             if table is None:
                 continue
             is_list = isinstance(table, list | tuple) or (isinstance(table, np.ndarray) and table.ndim == 1)
-            if not is_list or not len(table) or not all(map(_is_finite, table)):
+            if not is_list or not len(table) or not all(_is_finite(_plain(value)) for value in table):
                 raise self._error(f"{key} = {table!r}", "a list of finite numbers")
             object.__setattr__(self, key, tuple(float(value) for value in table))
 
@@ -282,13 +284,18 @@ def _ray_directions(sensor: Sensor, rays: Rays) -> NDArray[np.float32]:
     return directions
 
 
+def _plain(value: Any) -> Any:
+    """A number of numpy as Python's; other values as they are."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def _is_finite(value: object) -> bool:
-    is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return bool(is_number and -1e300 < value < 1e300)  # type: ignore[operator]  # isfinite fails on very large integers
 
 
 def _is_integer(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _entries(values: Any, where: str) -> dict[Any, dict[str, Any]]:

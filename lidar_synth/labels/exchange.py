@@ -15,7 +15,7 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import overlapping
 from lidar_synth.labels.ground import standing
-from lidar_synth.labels.merge import merged
+from lidar_synth.labels.merge import merged, same_lasers
 from lidar_synth.labels.objects import holding
 from lidar_synth.labels.view import refuse_coarser
 
@@ -23,12 +23,15 @@ from lidar_synth.labels.view import refuse_coarser
 def thinned(scan: Scan, sensor: Sensor) -> Scan:
     """Thin a scan to the grid of another sensor: the nearest return in each of its cells.
 
+    Ring numbers are kept only if both sensors have the same lasers.
+
     Raises:
         DataError: if the scan's own sensor is coarser.
     """
     refuse_coarser(scan.sensor, sensor)
     point = locate(scan.points, sensor).point
-    return replace(scan[np.sort(point[point >= 0])], sensor=sensor)
+    ring = scan.ring if same_lasers(scan.sensor, sensor) else None
+    return replace(replace(scan, ring=ring)[np.sort(point[point >= 0])], sensor=sensor)
 
 
 def swap_sector(scan: Scan, other: Scan, start: int, width: int) -> Scan:

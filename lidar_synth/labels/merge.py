@@ -8,17 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.geometry.fitting import assign_beams
 from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import joined
+from lidar_synth.labels.objects import belonging
 
 
 def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
     """Append the points, labels and boxes of other scans to a scan.
 
     The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of the first scan.
-    Labels, confidence (1 for labels of scans without confidence) and instances are always set; instances of the other
-    scans are renumbered. Rings are set if the first scan has them, boxes if any scan has them; times are dropped, as
-    each scan has its own moment.
+    Labels, confidence (1 for labels of scans without confidence) and instances (those of their boxes, if points have
+    none) are always set; instances of the other scans are renumbered. Rings are set if the first scan has them, as
+    lasers of its sensor; boxes if any scan has them; times are dropped, as each scan has its own moment.
     """
     parts = [_complete(scan)]
     used = _last_instance(parts[0])
@@ -27,7 +30,7 @@ def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
         used = max(used, _last_instance(parts[-1]))
     names = ["reflectance", "label", "confidence", "instance"]
     if scan.ring is not None:
-        parts = [replace(p, ring=_rings(p, scan) if p.ring is None else p.ring) for p in parts]
+        parts = [_with_rings(p, scan.sensor) for p in parts]
         names.append("ring")
     together: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in ("points", *names)}
     boxes = [p.boxes for p in parts if p.boxes is not None]
@@ -36,11 +39,33 @@ def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
     )
 
 
+def same_lasers(one: Sensor, other: Sensor) -> bool:
+    """Whether ring numbers of one sensor are those of another."""
+    return np.array_equal(one.optics(), other.optics())
+
+
+def _with_rings(part: Scan, sensor: Sensor) -> Scan:
+    """The scan with the rings of a sensor: its own if they are of the same lasers, else the nearest."""
+    if part.ring is not None and same_lasers(part.sensor, sensor):
+        return part
+    return replace(part, ring=assign_beams(part, sensor).ring)
+
+
 def _complete(scan: Scan) -> Scan:
     label = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
     confidence = (label != IGNORE).astype(np.float32) if scan.confidence is None else scan.confidence
-    instance = np.zeros(len(scan), np.int32) if scan.instance is None else scan.instance
+    instance = _of_tracks(scan) if scan.instance is None else scan.instance
     return replace(scan, label=label, confidence=confidence, instance=instance)
+
+
+def _of_tracks(scan: Scan) -> NDArray[np.int32]:
+    """(N,) the instances of points that have none, by the boxes of tracks; without it these would lose their points."""
+    instance = np.zeros(len(scan), np.int32)
+    if scan.boxes is not None:
+        for number in np.flatnonzero(scan.boxes.instance > 0):
+            mine = belonging(scan, scan.boxes[[number]])
+            instance[mine & (instance == 0)] = scan.boxes.instance[number]
+    return instance
 
 
 def _numbers(scan: Scan) -> list[NDArray[np.int32]]:
@@ -66,11 +91,3 @@ def _renumbered(scan: Scan, used: int) -> Scan:
     if boxes is not None:
         boxes = replace(boxes, instance=new(boxes.instance))
     return replace(scan, instance=new(scan.instance), boxes=boxes)
-
-
-def _rings(part: Scan, scan: Scan) -> NDArray[np.int16]:
-    """(N,) the rings of points whose ring is unknown: the lasers of the scan's sensor with the nearest elevation."""
-    tilt = np.arcsin(part.points[:, 2] / np.linalg.norm(part.points, axis=1))
-    lasers = scan.sensor.laser_elevations[::-1]
-    above = np.searchsorted((lasers[1:] + lasers[:-1]) / 2, tilt)
-    return np.asarray(len(lasers) - 1 - above, np.int16)

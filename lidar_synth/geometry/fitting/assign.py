@@ -29,8 +29,7 @@ def assign_beams(scan: Scan, sensor: Sensor | None = None) -> Assigned:
 
     Args:
         scan: N points in the sensor's frame, without motion compensation (see ``reskew``).
-        sensor: by default the scan's own; with ``heights``, its elevations are those of the lasers, as in a fitted
-            sensor.
+        sensor: by default the scan's own. Its lasers point and start as ``Sensor.optics`` says.
 
     Returns:
         The ring and firing of each point, and its distance from the beam: points that lie far off are not from this
@@ -45,8 +44,8 @@ def assign_beams(scan: Scan, sensor: Sensor | None = None) -> Assigned:
     """
     sensor = sensor or scan.sensor
     points = scan.points.astype(np.float64)
-    tangents = np.tan(sensor.laser_elevations.astype(np.float64))
-    heights = np.zeros(len(tangents)) if sensor.heights is None else np.asarray(sensor.heights)
+    elevations, heights = sensor.optics()
+    tangents = np.tan(elevations)
     ring = nearest_beams(points, tangents, heights)
     off = np.degrees(residuals(points, ring, tangents, heights))
     count = sensor.firings or sensor.columns

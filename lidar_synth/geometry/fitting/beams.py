@@ -159,7 +159,7 @@ def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud
     cloud = gather(scans)
     source, ring = rings_of_file(scans)
     cloud = replace(cloud, ring=cloud.ring if ring is None else ring, kept=ring is not None)
-    part = _some_points(cloud, POINTS, seed)
+    part = _without_gaps(_some_points(cloud, POINTS, seed))
     still = Model(np.zeros(1), np.zeros(1), np.zeros(3), np.eye(3), np.zeros((len(scans), 6)))
     best, quality = _attempt(part, still, seed)
     if quality < GOOD:
@@ -192,6 +192,11 @@ def _some_points(cloud: Cloud, count: int, seed: int) -> Cloud:
     if len(use) > count:
         use = np.sort(np.random.default_rng(seed).choice(use, count, replace=False))
     return Cloud(cloud.points[use], cloud.scan[use], cloud.time[use], cloud.ring[use], cloud.kept)
+
+
+def _without_gaps(cloud: Cloud) -> Cloud:
+    """The cloud with rings of the file numbered 0, 1, ...: files may count from 1, and lasers may be dead."""
+    return replace(cloud, ring=np.unique(cloud.ring, return_inverse=True)[1]) if cloud.kept else cloud
 
 
 def _attempt(

@@ -57,7 +57,10 @@ def known_boxes(scan: Scan) -> Boxes:
     assert scan.boxes is not None
     boxes = scan.boxes[np.hypot(*scan.boxes.values[:, :2].T) <= scan.sensor.range_max]
     boxes = boxes[np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)]
-    later = {j for _, j in overlaps(boxes)}
+    later: set[int] = set()
+    for first, second in overlaps(boxes):  # in order, so that the first of a pair is kept or dropped already
+        if first not in later:
+            later.add(second)
     return boxes[[i for i in range(len(boxes)) if i not in later]] if later else boxes
 
 

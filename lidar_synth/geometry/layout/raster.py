@@ -8,6 +8,9 @@ from torch import Tensor
 from lidar_synth.geometry.layout.layout import CHANNELS, CHORD_STEP, CODES, DEPTH_STEP, Layout
 from lidar_synth.geometry.sensor import Sensor
 
+FARTHEST = 65535 * DEPTH_STEP
+"""The largest depth that two bytes hold, metres."""
+
 
 def layout_image(layout: Layout, sensor: Sensor) -> NDArray[np.uint8]:
     """Cast the rays through the centres of a sensor's cells, from where they start.
@@ -22,7 +25,7 @@ def layout_image(layout: Layout, sensor: Sensor) -> NDArray[np.uint8]:
         (5, H, W) uint8, the ``CHANNELS``: ``class`` from ``CODES``; ``depth_high`` and ``depth_low``, the two bytes of
         the distance from the start of the ray in steps of 2 mm, 0 where nothing is known; inside a box ``chord``, the
         way of the ray through it in steps of 0.1 m, and ``along``, where the ray enters it, from 0 at the box's rear
-        to 255 at its front. Nothing beyond the sensor's range is known.
+        to 255 at its front. Nothing is known beyond the sensor's range, nor beyond 131.07 m, the largest depth.
     """
     rows, columns = sensor.shape
     slope = np.tan(sensor.row_elevations().astype(np.float64))
@@ -31,10 +34,10 @@ def layout_image(layout: Layout, sensor: Sensor) -> NDArray[np.uint8]:
     code, depth, chord, along = _cast(
         sensor.column_azimuths().astype(np.float64), slope, starts.astype(np.float64),
         layout.boxes.values.astype(np.float64), layout.codes(), walls, kinds, np.array(layout.ground, np.float64),
-        layout.reach, sensor.range_min, sensor.range_max,
+        layout.reach, sensor.range_min, min(sensor.range_max, FARTHEST),
     )  # fmt: skip
     image = np.zeros((len(CHANNELS), rows, columns), np.uint8)
-    steps = np.minimum(np.rint(depth / DEPTH_STEP), 65535).astype(np.uint16)
+    steps = np.rint(depth / DEPTH_STEP).astype(np.uint16)
     image[0], image[1], image[2] = code, steps >> 8, steps & 255
     image[3], image[4] = np.clip(np.rint(chord / CHORD_STEP), 0, 255), np.clip(np.rint(along * 255), 0, 255)
     return image

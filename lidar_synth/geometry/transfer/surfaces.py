@@ -1,6 +1,6 @@
 """Surfaces of one scan: its returns by ring and azimuth, and the triangles between neighbours of one surface."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.projection import ring_numbers
+from lidar_synth.geometry.projection import locate, ring_numbers
 from lidar_synth.geometry.projection.rings import fault_of
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer.kernels import find_level, neighbours_below, triangulate
@@ -94,6 +94,8 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
         ring = ring_numbers(scan.points)
         if ring[-1] > 0 and not fault_of(scan.points, ring, lasers):
             return ring.astype(np.int64), False
+    if len(scan.sensor.starts):
+        return _rows_of(scan), True
     sine = scan.points[:, 2] / np.maximum(np.linalg.norm(scan.points, axis=1), 1e-6)
     elevation = np.arcsin(np.clip(sine, -1, 1))
     rows = [np.searchsorted(-s.edges[1:-1], -elevation) for s in (scan.sensor, lasers)]
@@ -101,6 +103,13 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
     off = [np.median(np.abs(elevation - c[r])) for r, c in zip(rows, centres, strict=True)]
     best = int(off[1] < off[0])
     return rows[best], best == 0
+
+
+def _rows_of(scan: Scan) -> NDArray[np.int64]:
+    """(N,) row of each return; of those outside the sensor's range limits too."""
+    endless = replace(scan.sensor, range_min=0.0, range_max=1e6)
+    cell = locate(scan.points.astype(np.float32), endless).cell
+    return np.asarray(np.maximum(cell, 0) // scan.sensor.columns, np.int64)
 
 
 def _check(scan: Scan) -> None:

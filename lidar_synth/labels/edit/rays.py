@@ -59,11 +59,12 @@ class ScanRays(NamedTuple):
 def rays_of_scan(scan: Scan) -> ScanRays:
     """The rays of a scan of N returns; gaps between the returns of a ring are rays without a return.
 
-    The rings are ``scan.ring``, or follow from the order of the points, or are the rows of the sensor's grid. Only in
-    the last case rays start at the origin.
+    The rings are ``scan.ring``, or follow from the order of the points, or are the rows of the sensor's grid. In the
+    last case rays start at the origin, unless those of the grid start above it (``Sensor.starts``).
     """
     ring, on_grid = rings_of(scan)
-    optics = np.zeros(1) if on_grid else scan.sensor.optics()[1]
+    starts = scan.sensor.starts.astype(np.float64) if len(scan.sensor.starts) else np.zeros(1)
+    optics = starts if on_grid else scan.sensor.optics()[1]
     x, y, z = scan.points.astype(np.float64).T
     azimuth, rho = -np.arctan2(y, x), np.maximum(np.hypot(x, y), 1e-3)
     height = optics[np.minimum(ring, len(optics) - 1)]

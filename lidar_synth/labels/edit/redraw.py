@@ -104,6 +104,8 @@ def _on_rays(
     elevation = drawn.sensor.row_elevations()[row].astype(np.float64)
     distance = drawn.range.reshape(-1)[cell].astype(np.float64)
     rho, z = distance * np.cos(elevation), distance * np.sin(elevation)
+    if len(starts := drawn.sensor.starts):
+        z += starts[row]  # ranges of such rows are measured from where their rays start
     label = drawn.channels.get("label")
     if label is not None:
         slope = rays.slope[which]

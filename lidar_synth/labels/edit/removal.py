@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from lidar_synth.generate.generator import Generator
 
 Which = int | Sequence[int] | Boxes | NDArray[np.float32]
-"""Boxes: by their numbers in the scan, or by their values."""
+"""Boxes: by their numbers in the scan, or by their values; seven whole numbers, each once, are seven boxes."""
 
 MARGIN = 0.05
 """Metres around an object within which a ray without a return is taken for one that the object absorbed."""
@@ -44,11 +44,12 @@ def remove(scan: Scan, box: Which, *, model: "Generator | str | Path | None" = N
         seed: of the model's noise.
 
     Returns:
-        A new scan. All other points, labels, boxes and instances are unchanged.
+        A new scan. All other points, labels, boxes and instances are unchanged; without boxes to remove, it is the
+        scan as it was given.
 
     Raises:
-        DataError: on a box that the scan does not have, that is out of the sensor's range or that holds no return;
-            with a model, on a scan of another sensor.
+        DataError: on a box that the scan does not have, that is out of the sensor's range or that holds no return; on
+            seven whole numbers with repeats, which may be a box or boxes; with a model, on a scan of another sensor.
         ConfigError: on an unknown or a conditional model.
 
     Example:
@@ -61,26 +62,33 @@ def remove(scan: Scan, box: Which, *, model: "Generator | str | Path | None" = N
         1
     """
     boxes, numbers = selected(scan, box)
+    if not len(boxes):
+        return scan
     parts = [(returns_of(scan, boxes[[i]]), boxes.values[i]) for i in range(len(boxes))]
     if numbers is None and not any(mine.any() for mine, _ in parts):
         raise DataError(f"box {_text(boxes.values[0])} of scan {scan.id!r} without a return", "a box with an object")
     result = without(scan, parts, open_model(model), seed)
-    if scan.boxes is None or numbers is None:
+    if scan.boxes is None:
         return result
-    return replace(result, boxes=scan.boxes[~np.isin(np.arange(len(scan.boxes)), numbers)])
+    gone = (scan.boxes.values[:, None] == boxes.values).all(2).any(1)
+    return replace(result, boxes=scan.boxes[~gone])
 
 
 def selected(scan: Scan, box: Which) -> tuple[Boxes, list[int] | None]:
     """The boxes that an argument names, and their numbers in the scan, None for boxes of its own.
 
     Raises:
-        DataError: on a number or a place that the scan does not have.
+        DataError: on a number or a place that the scan does not have, or seven whole numbers with repeats.
     """
     given = np.asarray(box.values if isinstance(box, Boxes) else box)
+    if not given.size:
+        return Boxes(np.zeros((0, 7), np.float32), ()), None
+    if given.dtype.kind in "iu" and given.shape == (7,) and len(np.unique(given)) < 7:
+        raise DataError(f"seven whole numbers {given.tolist()}", "each number once, or a box (7,) as floats")
     if given.dtype.kind in "iu" and given.ndim < 2:
         numbers = np.atleast_1d(given).tolist()
         count = 0 if scan.boxes is None else len(scan.boxes)
-        if scan.boxes is None or not numbers or min(numbers) < 0 or max(numbers) >= count:
+        if scan.boxes is None or min(numbers) < 0 or max(numbers) >= count:
             given_text = f"box {given.tolist()} of scan {scan.id!r} with {count} boxes"
             raise DataError(given_text, "numbers of its boxes, from 0",
                             "A scan without boxes takes a box (7,): x, y, z, length, width, height, yaw.")  # fmt: skip
