@@ -35,18 +35,17 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     full, codec = network("unet", resolution=(16, 128)), network("vqvae", resolution=(64, 1024))
-    shipped = load_generator("town-semantic")
-    town, town_flow = shipped.autoencoder, shipped.network.velocity
+    shipped = load_generator("town")
+    town, town_flow = shipped.autoencoder, shipped.network
     a = torch.randn(4096, 4096)
     image, latent = torch.randn(1, 1, 64, 1024), torch.randn(1, 8, 16, 128)
     town_image, town_latent = torch.randn(1, 7, 64, 1024), torch.randn(1, *town.latent_shape)
-    maps = torch.randn(1, 16, *town.latent_shape[1:])
     calls = {
         "product of 4096 x 4096 (137 GFLOP)": lambda: a @ a,
         "LiDM's U-Net, one evaluation": lambda: full(latent, 0.5),
         "LiDM's autoencoder, encode": lambda: codec.encode(image),
         "LiDM's autoencoder, decode": lambda: codec.decode(latent),
-        "town's HDiT, one evaluation": lambda: town_flow(town_latent, 0.5, maps),
+        "town's HDiT, one evaluation": lambda: town_flow(town_latent, 0.5),
         "town's autoencoder, encode": lambda: town.encode(town_image),
         "town's autoencoder, decode": lambda: town.decode(town_latent),
     }
