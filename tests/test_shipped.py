@@ -36,6 +36,21 @@ def generator() -> Generator:
     return load_generator("town")
 
 
+@pytest.mark.parametrize("columns", [2048, 1024])
+def test_returns_of_a_label_map_have_its_labels(columns: int) -> None:
+    street = Town(3, "hdl64e_lasers", 1, motion=False)[0]
+    generator = load_generator("town-semantic", columns=columns)
+    wanted = project(street, generator.sensor, ["label"])
+    for steps in (4, 1):
+        [image] = generator.range_images(0, [0], street, steps=steps)
+        known = image.mask & wanted.mask & (wanted.label != IGNORE)
+        assert known.sum() > 0.8 * wanted.mask.sum()
+        same = (image.label == wanted.label)[known].mean()
+        assert same == 1 or (columns == 1024 and same > 0.9)  # a column that stands for two has the label of one
+        near = np.abs(image.range - wanted.range)[known] < 0.05 * wanted.range[known]
+        assert near.mean() > 0.6  # it stands where the map's scan stood, roughly
+
+
 @pytest.fixture(scope="module")
 def sources(generator: Generator, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     """The same scans from every kind of source."""

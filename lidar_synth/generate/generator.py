@@ -37,7 +37,6 @@ BATCH = {"cpu": 1, "cuda": 16}
 SHIPPED = {
     "town": "2d8d08119dc4a1c0002040ff47e66dea71bf87c7ae82d667c0ccfff15778202b",
     "town-camera": "5d96b6af7d5479f45e8ece7120bc5cf0493e639d783c0725f5f87581a6a1dc78",
-    "town-semantic": "36d110505d2108346c82a70092b1f112474d105c34e577e546d9ad36cd11e993",
 }
 """Hashes of the shipped checkpoints, whose older format has no checksum of the header."""
 
@@ -154,7 +153,8 @@ class Generator:
             B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its ``confidence`` in
             [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0) where there is no return. If a
             model conditioned on semantic maps does not generate labels, ``label`` is the map's where there is a
-            return, with confidence 1 where the map's label is known. A model conditioned on a ``Layout`` or on the
+            return, with confidence 1 where the map's label is known. With an autoencoder of surfaces ("town-semantic")
+            it is the map's where that is known, with the probability of this class there as confidence. A model conditioned on a ``Layout`` or on the
             layout of a scan gives the image the boxes that hold a return, and their numbers in ``instance``.
 
         Raises:
