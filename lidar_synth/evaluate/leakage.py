@@ -102,10 +102,11 @@ def measured(
 ) -> Recordings:
     """The recordings of a reference, and its path: data on which an evaluated model must not have been trained.
 
-    The scans are read and hashed if the model has ``seen`` scans that only their hashes identify.
+    The scans are read and hashed if the model has ``seen`` scans that only their hashes identify: these may lie in the
+    layout of any dataset now.
     """
     found = recordings_of(source, layout, path) | whole(FILES, [str(path)] + ([f"{path}#{split}"] if split else []))
-    hashed = seen is not None and layout not in PLACES and any(dataset == CONTENT for dataset, _ in seen.drives)
+    hashed = seen is not None and any(dataset == CONTENT for dataset, _ in seen.drives)
     return found | contents(map(content_of, source)) if hashed else found
 
 
