@@ -6,7 +6,6 @@ or a path; a split with known drives is replaced by these drives, a path is kept
 """
 
 import hashlib
-import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -29,7 +28,9 @@ from lidar_synth.datasets.recordings import (
     frames_of,
     whole,
 )
+from lidar_synth.errors import DataError
 from lidar_synth.files.disk import read_text
+from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats import BankScans
 from lidar_synth.formats.semantic_kitti import SPLITS as SEMANTIC_KITTI_SPLITS
 from lidar_synth.formats.source import ScanFiles
@@ -67,7 +68,7 @@ def seen_by_model_of(path: Path) -> Recordings | None:
         FileError, DataError: if what stands beside them is damaged.
     """
     if (path / NOTE).is_file():
-        note = json.loads(read_text(path / NOTE))
+        note = _facts(path / NOTE, "the settings that lidar-synth sample wrote")
         known = {"data": note.get("trained_on")} | ({"seen": note["seen"]} if "seen" in note else {})
         return seen_by(known)
     if is_bank(path):
@@ -88,7 +89,7 @@ def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recording
     """
     settings = Path(os.path.expandvars(path)) / SETTINGS
     if settings.is_file():  # a town has the layout and the names of a dataset
-        return town(json.loads(read_text(settings)).get("seed", 0))
+        return town(_facts(settings, "the settings of a town").get("seed", 0))
     made = next(iter(source)).provenance  # of all scans, or of the first one
     if made.get("made_by") == "town":  # converted to another format
         return town(made.get("seed", 0))
@@ -136,6 +137,14 @@ def undecided(seen: Recordings, reference: Recordings) -> bool:
 def town(seed: int) -> Recordings:
     """The town of a seed; the streets of its scans are the same in every layout."""
     return whole(TOWN, [f"seed {seed}"])
+
+
+def _facts(path: Path, expected: str) -> dict[str, Any]:
+    """The mapping in a JSON file."""
+    facts = parse_json(read_text(path, expected), str(path), expected)
+    if not isinstance(facts, dict):
+        raise DataError(f"{path} is damaged (it holds {type(facts).__name__})", expected)
+    return facts
 
 
 def _of_bank(bank: Bank) -> Recordings:
