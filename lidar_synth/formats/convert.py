@@ -21,6 +21,7 @@ from lidar_synth.files.disk import hash_of_names
 from lidar_synth.formats import OnBad, ScanFiles, Writer
 from lidar_synth.formats.as_sensor import AsSensor
 from lidar_synth.formats.description import NAME, Origin, add_origin
+from lidar_synth.formats.models import models_of, write_models
 from lidar_synth.formats.writer import claim
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.projection import unfold as unfold_rings
@@ -105,7 +106,7 @@ def convert(
         ConfigError: on fewer than one job, an output folder with the scans of another conversion or sensor, or a source
             whose points are not those of its sensor.
         FileError: if the output cannot be written, for any ``on_bad``.
-        DataError: on a bad scan, unless ``on_bad="skip"``.
+        DataError: on a bad scan, unless ``on_bad="skip"``; if what lies beside the scans is damaged.
     """
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
@@ -114,6 +115,7 @@ def convert(
         source.check_sensor()  # both first, so that a wrong sensor leaves no settings behind
         target = source.sensor if change is None else change.transfer.target
         writer.require_grid(target.by_beams() if unfold else target)
+    models = models_of(source.root) if isinstance(source, ScanFiles) else []
     claim(writer.root / SETTINGS, _settings(source, writer, change, unfold))
     missing, report = _compare(source, writer, on_bad)
     if change is not None and change.moves:
@@ -128,6 +130,7 @@ def convert(
             if done.origin is not None and jobs > 1 and (writer.root / NAME).is_file():
                 add_origin(writer.root, done.origin)  # again: two workers may have added theirs at the same moment
     writer.finish()
+    write_models(writer.root, models)
     return report
 
 
