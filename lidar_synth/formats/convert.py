@@ -22,7 +22,7 @@ from lidar_synth.formats import OnBad, ScanFiles, Writer
 from lidar_synth.formats.as_sensor import AsSensor
 from lidar_synth.formats.description import NAME, Origin, add_origin
 from lidar_synth.formats.models import models_of, write_models
-from lidar_synth.formats.writer import claim
+from lidar_synth.formats.writer import claimed
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.projection import unfold as unfold_rings
 from lidar_synth.geometry.scan import Scan, Source
@@ -116,7 +116,16 @@ def convert(
         target = source.sensor if change is None else change.transfer.target
         writer.require_grid(target.by_beams() if unfold else target)
     models = models_of(source.root) if isinstance(source, ScanFiles) else []
-    claim(writer.root / SETTINGS, _settings(source, writer, change, unfold))
+    with claimed(writer.root / SETTINGS, _settings(source, writer, change, unfold)):
+        report = _write_missing(source, writer, change, unfold, on_bad, jobs, progress)
+        write_models(writer.root, models if report.written or report.kept else [])
+    return report
+
+
+def _write_missing(
+    source: Source, writer: Writer, change: AsSensor | None, unfold: bool, on_bad: OnBad, jobs: int, progress: bool
+) -> Report:
+    """The part of ``convert`` that writes."""
     missing, report = _compare(source, writer, on_bad)
     if change is not None and change.moves:
         if type(writer).carry is not Writer.carry:
@@ -130,7 +139,6 @@ def convert(
             if done.origin is not None and jobs > 1 and (writer.root / NAME).is_file():
                 add_origin(writer.root, done.origin)  # again: two workers may have added theirs at the same moment
     writer.finish()
-    write_models(writer.root, models)
     return report
 
 
