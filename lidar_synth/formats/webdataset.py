@@ -75,8 +75,8 @@ class WebDataset(ScanFiles):
 class WebDatasetWriter(Writer):
     """Writes WebDataset's .tar files. Each scan is written to a file of its own; ``finish`` merges them in order.
 
-    Scans that a later run adds, because they could not be read before, are appended to their file, as are scans that are
-    written again, which replace the old ones.
+    Scans that a later run adds, because they could not be read before, are appended to their file, and so are
+    those that are written again, in place of the old ones.
 
     Args:
         root: output folder.
