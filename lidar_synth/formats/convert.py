@@ -6,6 +6,7 @@ of the whole folder at the end.
 """
 
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -258,17 +259,51 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _work: Callable[[Any], Any] | None = None
+_busy = _stopped = False
 
 
 def _start(work: Callable[[Any], Any]) -> None:
-    """Pass the function to a worker once, instead of with every item."""
+    """Pass the function to a worker once, instead of with every item, and let Ctrl-C reach it from now on."""
     global _work
     _work = work
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupted)
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _interrupted(number: int, frame: Any) -> None:
+    """End a worker's items at Ctrl-C, which a terminal sends to every process. While it waits for items, an exception
+    would end it with a traceback; the main process ends it."""
+    global _stopped
+    _stopped = True
+    if _busy:
+        raise KeyboardInterrupt
 
 
 def _next(item: Any) -> Any:
+    global _busy
     assert _work is not None, "a worker that was not started by in_processes"
-    return _work(item)
+    _busy = True
+    try:
+        if _stopped:
+            raise KeyboardInterrupt
+        return _work(item)
+    finally:
+        _busy = False
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Defer Ctrl-C to the end of the block; processes that it starts do not get it before they ask for it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
@@ -291,7 +326,9 @@ def in_processes(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
         try:
-            yield pool.map(_next, items, chunksize=chunk)
+            with _without_interrupts():  # map starts the workers
+                results = pool.map(_next, items, chunksize=chunk)
+            yield results
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
