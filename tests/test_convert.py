@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -297,10 +298,41 @@ def test_other_options_of_the_reader_do_not_keep_the_old_scans(tmp_path: Path) -
         convert(open_scans(tmp_path / "in", reflectance_max=255), out, progress=False)
     target = load_sensor("vlp16")
     mistaken = open_scans(tmp_path / "in", reflectance_max=255, sensor="vlp16")
-    with suppress(DataError):  # these points are no streets
-        convert(mistaken, changed, as_sensor=target, progress=False)
+    changed.root.mkdir()
+    changed.path(0, "a").touch()  # as if it could be written: these points are no streets
+    convert(mistaken, changed, as_sensor=target, progress=False)
     with pytest.raises(ConfigError, match="was filled with"):
         convert(open_scans(tmp_path / "in", reflectance_max=255), changed, as_sensor=target, progress=False)
+
+
+def five_fields(folder: Path, *counts: int) -> Path:
+    """Files of five numbers per point, whose sizes show it with an odd number of points."""
+    folder.mkdir()
+    for index, count in enumerate(counts):
+        np.tile(np.float32([9, 9, 0, 0.5, 0.1]), (count, 1)).tofile(folder / f"{index}.bin")
+    return folder
+
+
+@pytest.mark.parametrize("policy", ["error", "skip"])
+def test_a_run_that_wrote_nothing_can_be_corrected(tmp_path: Path, policy: Any) -> None:
+    root, out = five_fields(tmp_path / "in", 21, 23), WRITERS["npz"](tmp_path / "out")
+    with suppress(DataError):
+        convert(open_scans(root), out, on_bad=policy, progress=False)
+    assert files(out.root) == {} and not (out.root / SETTINGS).exists()
+    assert convert(open_scans(root, fields=5), out, progress=False) == Report(written=2)
+
+
+def test_a_run_that_wrote_a_scan_or_was_not_the_first_keeps_its_settings(tmp_path: Path) -> None:
+    scans, out = [some_scan(0), some_scan(1)], WRITERS["kitti_object"](tmp_path)
+    scans[1].boxes = None
+    with pytest.raises(DataError, match="has no boxes"):
+        convert(scans, out, progress=False)
+    with pytest.raises(ConfigError, match="was filled with .*KITTIObjectWriter"):
+        convert(scans, WRITERS["semantic_kitti"](tmp_path), progress=False)
+    [path.unlink() for path in tmp_path.rglob("*") if path.is_file() and path.name != SETTINGS]
+    with pytest.raises(DataError, match="has no boxes"):  # beside another run, which has not written a scan yet
+        convert(scans[::-1], out, progress=False)
+    assert (tmp_path / SETTINGS).is_file()
 
 
 @pytest.mark.parametrize("options", [{}, {"tr": False}, {"calib": False}, {"times": False}])

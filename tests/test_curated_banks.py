@@ -88,6 +88,12 @@ def test_a_curated_bank_can_be_curated_again(good: Path, original: Path, tmp_pat
         drop(Bank(original), [0], "elsewhere", good, progress=False)
 
 
+@pytest.mark.parametrize("shares", [(float("nan"), 1.0), (float("inf"), 1.0), (0.0, 1.0), (-1.0, 2.0), (0.5, 0.4)])
+def test_shares_that_are_none_are_refused(good: Path, tmp_path: Path, shares: tuple[float, ...]) -> None:
+    with pytest.raises(ConfigError, match="expected positive numbers that sum to 1"):
+        split(Bank(good), {tmp_path / str(i): share for i, share in enumerate(shares)}, progress=False)
+
+
 @pytest.mark.parametrize("shares", [(0.2, 0.2, 0.6), (0.4, 0.6), (0.8, 0.2)])
 def test_parts_of_a_curated_bank_are_curated(good: Path, tmp_path: Path, shares: tuple[float, ...]) -> None:
     parts = split(Bank(good), {tmp_path / str(i): share for i, share in enumerate(shares)}, progress=False)

@@ -322,3 +322,58 @@ def test_files_that_describe_themselves_may_differ(tmp_path: Path, to: str) -> N
 def test_a_folder_may_hold_files_of_several_sensors(tmp_path: Path, to: str) -> None:
     write_all(to, tmp_path, [a_scan(sensor) for sensor in SENSORS.values()])
     assert [scan.sensor for scan in open_scans(tmp_path)] == list(SENSORS.values())
+
+
+# --- folders below a description ----------------------------------------------------------------------------------
+
+
+NESTED = ("town/1/0", "town/1/1", "002/00", "a/b/c/d/0")
+"""Ids of banks, of PandaSet and of folders, which become names of files."""
+
+
+def nested(root: Path) -> Path:
+    writer = WRITERS["kitti"](root)
+    for index, name in enumerate(NESTED):
+        writer.write(a_scan(seed=index), index, name=name)
+    return root
+
+
+@pytest.mark.parametrize("part", ["town", "town/1", "town/1/0.bin", "002", "002/00.bin", "a/b/c/d/0.bin"])
+def test_a_part_of_a_converted_folder_is_what_the_folder_is(tmp_path: Path, part: str) -> None:
+    source = open_scans(nested(tmp_path / "out") / part)
+    assert source.sensor == SENSORS["preset"] and Origin.of(source[0]) == ORIGINS["town"]
+
+
+def test_the_nearest_description_counts(tmp_path: Path) -> None:
+    (tmp_path / NAME).write_text(json.dumps({"format": FORMAT, "sensor": "vlp16"}))
+    assert open_scans(nested(tmp_path / "out") / "town" / "1").sensor == SENSORS["preset"]
+
+
+@pytest.mark.parametrize("layout", ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw"])
+def test_a_description_above_a_dataset_says_nothing_about_it(tmp_path: Path, layout: str) -> None:
+    nested(tmp_path)
+    MAKERS[layout](tmp_path / "real")
+    (tmp_path / "real" / NAME).unlink(missing_ok=True)
+    for path in (tmp_path / "real", next((tmp_path / "real").rglob("*.bin"))):
+        source = open_scans(path)
+        assert source.description is None and source[0].domain == REAL
+
+
+@pytest.mark.parametrize("above", ["kitti", "semantic_kitti", "kitti_object", "kitti360"])
+def test_a_description_above_a_folder_of_other_scans_says_nothing_about_them(tmp_path: Path, above: str) -> None:
+    """Of a dataset's layout, which has no other folders, or of scans that lie in the folder itself."""
+    write_all(above, tmp_path, [a_scan()])
+    write_all("kitti", tmp_path / "own", [some_scan()])
+    (tmp_path / "own" / NAME).unlink()
+    assert open_scans(tmp_path / "own").description is None
+
+
+@pytest.mark.parametrize("content", ["[1, 2]", "{", '{"scans": 5}'])
+def test_a_file_of_another_program_above_is_no_description(tmp_path: Path, content: str) -> None:
+    write_all("kitti", tmp_path / "own", [some_scan()])
+    (tmp_path / "own" / NAME).unlink()
+    (tmp_path / NAME).write_text(content)
+    assert open_scans(tmp_path / "own").description is None
+    (tmp_path / NAME).write_text(json.dumps(GOOD)[:-1])
+    with pytest.raises(DataError, match=f"{NAME} is damaged"):
+        open_scans(tmp_path / "own")

@@ -51,6 +51,14 @@ def test_every_figure_names_its_protocol_and_its_sets(folders: tuple[Path, Path]
     assert f"({protocol} protocol, 3 real, 3 generated)" in text
 
 
+def test_the_intervals_of_few_scans_are_json(folders: tuple[Path, Path]) -> None:
+    """A resample may hold copies of one scan only, of which some figures have no value."""
+    call = ["evaluate", *map(str, folders), "--protocol", "town", "--segmenter", "--extended", "--intervals", "50"]
+    result = CliRunner().invoke(app, [*call, "--json"])
+    assert result.exception is None, result.output
+    assert "NaN" not in result.stdout and any(s["low"] is not None for s in json.loads(result.stdout))
+
+
 @pytest.mark.parametrize("protocol", [name for name, p in PROTOCOLS.items() if p.needs.generated])
 def test_fewer_scans_than_the_papers_are_refused(folders: tuple[Path, Path], protocol: str) -> None:
     result = CliRunner().invoke(app, ["evaluate", *map(str, folders), "--protocol", protocol])

@@ -9,6 +9,7 @@ from layouts import write_all
 from small_models import SENSOR, write
 from typer.testing import CliRunner
 
+from lidar_synth.datasets.recordings import NOTE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.generator import load_generator
@@ -54,6 +55,17 @@ def test_sample_refuses_a_folder_that_holds_samples_of_another_seed(path: Path, 
     with pytest.raises(ConfigError, match=r"'seed': 4.*'seed': 5"):
         CliRunner().invoke(app, [*call, "--seed", "5"], catch_exceptions=False)
     assert (tmp_path / "out" / "000000.npz").read_bytes() == before
+
+
+def test_sample_takes_another_format_after_one_that_cannot_hold_the_scans(path: Path, tmp_path: Path) -> None:
+    from lidar_synth.cli import app
+
+    call = ["sample", str(tmp_path / "out"), "--model", str(path), "--count", "1", "--to"]
+    with pytest.raises(DataError, match="Write it as semantic_kitti"):
+        CliRunner().invoke(app, [*call, "kitti_object"], catch_exceptions=False)
+    result = CliRunner().invoke(app, [*call, "semantic_kitti"])
+    assert result.exception is None, result.exception
+    assert (tmp_path / "out" / NOTE).is_file()
 
 
 @pytest.mark.slow

@@ -158,6 +158,15 @@ def test_intervals_refuse_what_cannot_give_one() -> None:
             bootstrap(smallest_of_pairs(np.ones((5, 5))), **options)
 
 
+def test_a_resample_without_a_value_gives_no_interval() -> None:
+    """Of one sample that is drawn every time, the unbiased kernel distance has no pair."""
+    rng = np.random.default_rng(0)
+    few, many = (polynomial_mmd(*rng.normal(size=(2, n, 3))) for n in (3, 30))
+    assert np.isfinite(few.value) and bootstrap(few) is None
+    interval = bootstrap(many, 50)
+    assert interval is not None and np.isfinite(interval).all()
+
+
 # --- neighbours ---------------------------------------------------------------------------------------------------
 
 

@@ -163,6 +163,14 @@ def test_an_interrupted_export_resumes(tmp_path: Path, town: Town) -> None:
     assert export_town(longer, tmp_path, "semantic_kitti", camera=False, progress=False) == (1, COUNT)
 
 
+def test_fewer_scans_than_there_are_keep_all_times(tmp_path: Path) -> None:
+    times = tmp_path / "sequences" / "00" / "times.txt"
+    export_town(Town(seed=5, scans=2), tmp_path, "semantic_kitti", camera=False, progress=False)
+    before = times.read_text()
+    assert export_town(Town(seed=5, scans=1), tmp_path, "semantic_kitti", camera=False, progress=False) == (0, 1)
+    assert times.read_text() == before and len(before.splitlines()) == 2
+
+
 def test_a_folder_that_holds_another_town_is_refused(tmp_path: Path, town: Town) -> None:
     export_town(Town(seed=5, scans=0), tmp_path, "kitti", camera=False, progress=False)
     with pytest.raises(ConfigError, match=r"was filled with .*'seed': 5"):

@@ -149,6 +149,24 @@ def test_skipped_scans_are_added_by_a_later_run(tmp_path: Path) -> None:
         WebDatasetWriter(tmp_path, shard_size=0)
 
 
+def test_a_scan_that_is_written_again_replaces_the_old_one(tmp_path: Path) -> None:
+    """All of it: the new one may have fewer members."""
+    old, new = [some_scan(i) for i in range(3)], some_scan(7)
+    new.label = new.raw_label = new.instance = new.boxes = None
+    names = ["a.b/0", "a.b/00", "c"]
+    writer = WebDatasetWriter(tmp_path)
+    for index, name in enumerate(names):
+        writer.write(old[index], index, name=name)
+    writer.finish()
+    writer.write(new, 0, name=names[0])
+    writer.finish()
+    read = {scan.id: scan for scan in open_scans(tmp_path)}
+    assert set(read) == set(names) and read[names[0]].boxes is None
+    for name, expected in zip(names, [new, *old[1:]], strict=True):
+        assert np.array_equal(read[name].points, expected.points)
+    samples(tmp_path / "scans-000000.tar")
+
+
 def damaged(path: Path, **members: bytes | None) -> None:
     """Write the file again with other members; None leaves one out."""
     [(key, there)] = samples(path).items()

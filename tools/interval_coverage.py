@@ -84,7 +84,8 @@ def coverage(simulation: Simulation, trials: int, replicates: int) -> tuple[floa
     found = []
     for k in range(trials):
         statistic = simulation.draw(np.random.default_rng([1, k]), simulation.samples)
-        found.append(bootstrap(statistic, replicates, seed=k))
+        if (interval := bootstrap(statistic, replicates, seed=k)) is not None:
+            found.append(interval)
     return float(np.mean([i.low <= truth <= i.high for i in found])), float(np.mean([i.high - i.low for i in found]))
 
 

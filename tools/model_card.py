@@ -177,7 +177,8 @@ def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
         return np.array([100 * mean_iou(np.tensordot(counts, tables, 1)) for counts in b])
 
     statistic = Statistic(at, (real, len(tables)))
-    low, high = bootstrap(statistic, replicates, smallest=0, largest=100) if replicates else (None, None)
+    interval = bootstrap(statistic, replicates, smallest=0, largest=100) if replicates else None
+    low, high = interval or (None, None)
     return Score("mIoU with the town segmenter, %", statistic.value, "town", real, len(tables), low=low, high=high)
 
 

@@ -55,7 +55,7 @@ def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dic
         ConfigError: on shares that do not sum to 1 or leave a part empty, or a folder that is not empty.
         FileError: if it cannot be written.
     """
-    if any(share <= 0 for share in parts.values()) or abs(sum(parts.values()) - 1) > 1e-9:
+    if any(not share > 0 for share in parts.values()) or abs(sum(parts.values()) - 1) > 1e-9:
         raise ConfigError(f"shares {list(parts.values())}", "positive numbers that sum to 1")
     ends, total = [0], 0.0
     for share in parts.values():

@@ -1,6 +1,7 @@
 """The command line ``lidar-synth``: one file per command; this module converts errors to exit statuses.
 
-Exit status 0 = success, 1 = the run failed, 2 = wrong options or arguments; a failure prints one message.
+Exit status 0 = success, 1 = the run failed, 2 = wrong options or arguments, 130 = interrupted by Ctrl-C (1 from
+``bake``, which says that it may be resumed); a failure prints one message.
 """
 
 import sys
@@ -30,6 +31,9 @@ from lidar_synth.cli.town import town
 from lidar_synth.cli.train import distill, train
 from lidar_synth.cli.view import view
 from lidar_synth.errors import ConfigError, LidarSynthError
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as of a program that a shell saw end by SIGINT; typer exits with it, without a message."""
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "town": town,
@@ -89,6 +93,8 @@ def main() -> None:
     except LidarSynthError as error:
         print(f"lidar-synth: {error}", file=sys.stderr)
         sys.exit(2 if isinstance(error, ConfigError) else 1)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as stop:
+        if isinstance(stop, SystemExit) and stop.code != INTERRUPTED:
+            raise
         print("lidar-synth: interrupted", file=sys.stderr)
-        sys.exit(1)
+        sys.exit(INTERRUPTED)

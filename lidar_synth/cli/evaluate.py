@@ -72,7 +72,7 @@ def evaluate(
     if judge is None and protocol not in PROTOCOLS:
         raise typer.BadParameter(f"{protocol!r} is none of {', '.join(PROTOCOLS)}", param_hint="--protocol")
     sources = open_scans(real, sensor=sensor, split=split), open_scans(fake, sensor=sensor)
-    if not training_data and (seen := seen_by_model_of(fake)) is not None:
+    if not training_data and (seen := seen_by_model_of(fake, sources[1])) is not None:
         _refuse_training_data(seen, measured(sources[0], layout_of(real), real, split, seen), real, fake)
     if judge is not None:
         _recognition(judge, columns, sources, as_json)

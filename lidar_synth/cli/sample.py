@@ -53,7 +53,7 @@ def sample(
     from lidar_synth.evaluate.leakage import seen_by
     from lidar_synth.formats import WRITERS
     from lidar_synth.formats.source import choose
-    from lidar_synth.formats.writer import claim
+    from lidar_synth.formats.writer import claimed
     from lidar_synth.generate.generator import load_generator
 
     writer = choose("format", to, WRITERS)(out)
@@ -67,16 +67,16 @@ def sample(
     }  # fmt: skip
     provenance = generator.header.provenance
     trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}
-    claim(writer.root / NOTE, settings | trained)
-    missing = [i for i in range(count) if not writer.complete(i)]
-    with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
-        for first in range(0, len(missing), generator.batch):
-            indices = missing[first : first + generator.batch]
-            scans = generator.scans(
-                seed, indices, conditions(given, indices), steps=steps, solver=solver, guidance=guidance
-            )
-            for index, scan in zip(indices, scans, strict=True):
-                writer.write(scan, index)
-            bar.update(len(indices))
-    writer.finish()
+    with claimed(writer.root / NOTE, settings | trained):
+        missing = [i for i in range(count) if not writer.complete(i)]
+        with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
+            for first in range(0, len(missing), generator.batch):
+                indices = missing[first : first + generator.batch]
+                scans = generator.scans(
+                    seed, indices, conditions(given, indices), steps=steps, solver=solver, guidance=guidance
+                )
+                for index, scan in zip(indices, scans, strict=True):
+                    writer.write(scan, index)
+                bar.update(len(indices))
+        writer.finish()
     typer.echo(f"{out}: {len(missing)} scans written, {count - len(missing)} were there already")

@@ -58,6 +58,9 @@ ODOMETRY = {
 NOTE = ".sample.json"
 """The file beside generated scans with the settings of generation and the training data of the model."""
 
+MODELS = ".models.json"
+"""The file beside converted scans with the provenances of the models that generated them."""
+
 _MOST_RUNS = 200  # maximum number of intervals of a drive; more become one from the first frame to the last
 _SHOWN = 6  # number of drives in a message
 

@@ -30,7 +30,7 @@ def bootstrap(
     seed: int = 0,
     smallest: float = -np.inf,
     largest: float = np.inf,
-) -> Interval:
+) -> Interval | None:
     """The basic bootstrap interval (Davison and Hinkley, 1997, section 5.2.1): twice the value less the quantiles of
     its resamples. Both sets are resampled with replacement.
 
@@ -43,6 +43,10 @@ def bootstrap(
         level: of confidence, in (0, 1).
         seed: of the resamples.
         smallest, largest: the values between which the interval is cut, for instance 0 and 1 of a share.
+
+    Returns:
+        The interval; None where the statistic of a resample is not a number, as those of few samples may be which
+        compare different ones: a resample may hold copies of one only.
 
     Raises:
         ConfigError: on a level outside (0, 1) or fewer than 20 resamples.
@@ -60,7 +64,9 @@ def bootstrap(
     for first in range(0, replicates, _BATCH):
         count = min(_BATCH, replicates - first)
         values.append(statistic.at(*(rng.multinomial(n, np.full(n, 1 / n), count) for n in statistic.sizes)))
-    tails = np.quantile(np.concatenate(values), [(1 - level) / 2, (1 + level) / 2])
+    if not np.isfinite(together := np.concatenate(values)).all():
+        return None
+    tails = np.quantile(together, [(1 - level) / 2, (1 + level) / 2])
     low, high = np.clip(2 * statistic.value - tails[::-1], smallest, largest)
     return Interval(float(low), float(high))
 

@@ -6,7 +6,6 @@ or a path; a split with known drives is replaced by these drives, a path is kept
 """
 
 import hashlib
-import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.bank import Bank, is_bank
+from lidar_synth.bank import Bank
 from lidar_synth.datasets.recordings import (
     CONTENT,
     FILES,
@@ -22,15 +21,15 @@ from lidar_synth.datasets.recordings import (
     KITTI360,
     KITTI360_SPLITS,
     KITTI_OBJECT,
-    NOTE,
     PLACES,
     TOWN,
     Recordings,
     frames_of,
     whole,
 )
-from lidar_synth.files.disk import read_text
+from lidar_synth.files.parsing import read_facts
 from lidar_synth.formats import BankScans
+from lidar_synth.formats.models import models_of
 from lidar_synth.formats.semantic_kitti import SPLITS as SEMANTIC_KITTI_SPLITS
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.generate.importers import lidm
@@ -57,22 +56,20 @@ def inherited(provenance: Mapping[str, Any]) -> Recordings:
     return seen
 
 
-def seen_by_model_of(path: Path) -> Recordings | None:
-    """The training data of the model that generated scans; None if nothing beside the scans records it.
+def seen_by_model_of(path: Path, source: ScanFiles | None = None) -> Recordings | None:
+    """The training data of the model that generated scans; empty if it is not known, None if no model did.
 
     Args:
-        path: a folder of ``lidar-synth sample``, or a bank.
+        path: a folder of ``lidar-synth sample``, a bank, or a folder into which such scans were converted.
+        source: its scans; the first one may say that a model made it, where nothing beside the scans does.
 
     Raises:
         FileError, DataError: if what stands beside them is damaged.
     """
-    if (path / NOTE).is_file():
-        note = json.loads(read_text(path / NOTE))
-        known = {"data": note.get("trained_on")} | ({"seen": note["seen"]} if "seen" in note else {})
-        return seen_by(known)
-    if is_bank(path):
-        return _of_bank(Bank(path))
-    return None
+    if models := models_of(path):
+        return _of_models(models)
+    by_model = source is not None and next(iter(source)).provenance.get("made_by") == "model"
+    return Recordings() if by_model else None
 
 
 def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recordings:
@@ -88,7 +85,7 @@ def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recording
     """
     settings = Path(os.path.expandvars(path)) / SETTINGS
     if settings.is_file():  # a town has the layout and the names of a dataset
-        return town(json.loads(read_text(settings)).get("seed", 0))
+        return town(read_facts(settings, "the settings of a town").get("seed", 0))
     made = next(iter(source)).provenance  # of all scans, or of the first one
     if made.get("made_by") == "town":  # converted to another format
         return town(made.get("seed", 0))
@@ -102,10 +99,11 @@ def measured(
 ) -> Recordings:
     """The recordings of a reference, and its path: data on which an evaluated model must not have been trained.
 
-    The scans are read and hashed if the model has ``seen`` scans that only their hashes identify.
+    The scans are read and hashed if the model has ``seen`` scans that only their hashes identify: these may lie in the
+    layout of any dataset now.
     """
     found = recordings_of(source, layout, path) | whole(FILES, [str(path)] + ([f"{path}#{split}"] if split else []))
-    hashed = seen is not None and layout not in PLACES and any(dataset == CONTENT for dataset, _ in seen.drives)
+    hashed = seen is not None and any(dataset == CONTENT for dataset, _ in seen.drives)
     return found | contents(map(content_of, source)) if hashed else found
 
 
@@ -138,9 +136,13 @@ def town(seed: int) -> Recordings:
 
 
 def _of_bank(bank: Bank) -> Recordings:
+    return _of_models(facts.provenance for facts in bank.index.sources)
+
+
+def _of_models(provenances: Iterable[Mapping[str, Any]]) -> Recordings:
     seen = Recordings()
-    for facts in bank.index.sources:
-        seen |= seen_by(facts.provenance)
+    for provenance in provenances:
+        seen |= seen_by(provenance)
     return seen
 
 

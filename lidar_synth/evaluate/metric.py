@@ -273,8 +273,7 @@ class Metric:
     def _interval(self, statistic: Any, limits: tuple[float, float]) -> tuple[float | None, float | None]:
         if statistic is None or not self._replicates:
             return None, None
-        interval = bootstrap(statistic, self._replicates, LEVEL, smallest=limits[0], largest=limits[1])
-        return interval.low, interval.high
+        return bootstrap(statistic, self._replicates, LEVEL, smallest=limits[0], largest=limits[1]) or (None, None)
 
     def _gathered(self) -> dict[str, _Kept]:
         """Both sets of all processes, in the order of their ranks."""

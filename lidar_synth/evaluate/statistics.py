@@ -176,7 +176,8 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
     def within(k: int, counts: Counts) -> NDArray[np.float64]:
         pairs, own = counts.sum(1).astype(np.float64) ** 2, (counts.astype(np.float64) ** 2)
         total = _mean_kernel(kernel, rows[k], counts, rows[k], counts, _BLOCK) * pairs - own @ diagonals[k]
-        return np.asarray(total / (pairs - own.sum(1)))
+        with np.errstate(divide="ignore", invalid="ignore"):  # copies of one sample only: there is no pair
+            return np.asarray(total / (pairs - own.sum(1)))
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
         return within(0, a) + within(1, b) - 2 * _mean_kernel(kernel, rows[0], a, rows[1], b, _BLOCK)

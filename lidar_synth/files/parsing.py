@@ -56,6 +56,23 @@ def parse_json(text: str | bytes, where: str, expected: str = "JSON") -> Any:
         raise DataError(f"{where} is not JSON ({type(error).__name__}: {error})", expected, SKIP_HINT) from error
 
 
+def read_facts(path: Path, expected: str) -> dict[str, Any]:
+    """Read a JSON file with values by name.
+
+    Args:
+        path: the file.
+        expected: description of the expected file, for the error.
+
+    Raises:
+        FileError: if it cannot be read.
+        DataError: if it is not JSON, or no mapping.
+    """
+    facts = parse_json(read_text(path, expected), str(path), expected)
+    if not isinstance(facts, dict):
+        raise DataError(f"{path} is damaged (it holds {type(facts).__name__})", expected)
+    return facts
+
+
 def read_yaml(path: Path, expected: str) -> Any:
     """Read a YAML file.
 

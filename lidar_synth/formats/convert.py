@@ -6,6 +6,7 @@ of the whole folder at the end.
 """
 
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -21,7 +22,8 @@ from lidar_synth.files.disk import hash_of_names
 from lidar_synth.formats import OnBad, ScanFiles, Writer
 from lidar_synth.formats.as_sensor import AsSensor
 from lidar_synth.formats.description import NAME, Origin, add_origin
-from lidar_synth.formats.writer import claim
+from lidar_synth.formats.models import models_of, write_models
+from lidar_synth.formats.writer import claimed
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.projection import unfold as unfold_rings
 from lidar_synth.geometry.scan import Scan, Source
@@ -105,7 +107,7 @@ def convert(
         ConfigError: on fewer than one job, an output folder with the scans of another conversion or sensor, or a source
             whose points are not those of its sensor.
         FileError: if the output cannot be written, for any ``on_bad``.
-        DataError: on a bad scan, unless ``on_bad="skip"``.
+        DataError: on a bad scan, unless ``on_bad="skip"``; if what lies beside the scans is damaged.
     """
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
@@ -114,7 +116,17 @@ def convert(
         source.check_sensor()  # both first, so that a wrong sensor leaves no settings behind
         target = source.sensor if change is None else change.transfer.target
         writer.require_grid(target.by_beams() if unfold else target)
-    claim(writer.root / SETTINGS, _settings(source, writer, change, unfold))
+    models = models_of(source.root) if isinstance(source, ScanFiles) else []
+    with claimed(writer.root / SETTINGS, _settings(source, writer, change, unfold)):
+        report = _write_missing(source, writer, change, unfold, on_bad, jobs, progress)
+        write_models(writer.root, models if report.written or report.kept else [])
+    return report
+
+
+def _write_missing(
+    source: Source, writer: Writer, change: AsSensor | None, unfold: bool, on_bad: OnBad, jobs: int, progress: bool
+) -> Report:
+    """The part of ``convert`` that writes."""
     missing, report = _compare(source, writer, on_bad)
     if change is not None and change.moves:
         if type(writer).carry is not Writer.carry:
@@ -247,17 +259,51 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _work: Callable[[Any], Any] | None = None
+_busy = _stopped = False
 
 
 def _start(work: Callable[[Any], Any]) -> None:
-    """Pass the function to a worker once, instead of with every item."""
+    """Pass the function to a worker once, instead of with every item, and let Ctrl-C reach it from now on."""
     global _work
     _work = work
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupted)
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _interrupted(number: int, frame: Any) -> None:
+    """End a worker's items at Ctrl-C, which a terminal sends to every process. While it waits for items, an exception
+    would end it with a traceback; the main process ends it."""
+    global _stopped
+    _stopped = True
+    if _busy:
+        raise KeyboardInterrupt
 
 
 def _next(item: Any) -> Any:
+    global _busy
     assert _work is not None, "a worker that was not started by in_processes"
-    return _work(item)
+    _busy = True
+    try:
+        if _stopped:
+            raise KeyboardInterrupt
+        return _work(item)
+    finally:
+        _busy = False
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Defer Ctrl-C to the end of the block; processes that it starts do not get it before they ask for it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
@@ -280,7 +326,9 @@ def in_processes(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
         try:
-            yield pool.map(_next, items, chunksize=chunk)
+            with _without_interrupts():  # map starts the workers
+                results = pool.map(_next, items, chunksize=chunk)
+            yield results
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

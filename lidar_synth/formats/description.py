@@ -19,15 +19,16 @@ Folders of earlier versions have ``synthetic.json`` or ``town.json`` instead, wh
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidar_synth.errors import ConfigError, DataError, shorten
-from lidar_synth.files.disk import read_text, write_file
+from lidar_synth.files.disk import read_start, read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, presets
@@ -36,6 +37,7 @@ NAME = "scans.json"
 """File in the root of a folder that describes its scans."""
 
 FORMAT = "lidar-synth-scans/1"
+_FORMATS = "lidar-synth-scans/"  # of any version
 
 MARK = "synthetic.json"
 """File by which earlier versions marked all scans of a folder as synthetic."""
@@ -59,6 +61,9 @@ _MOST_FACTS, _LONGEST_TEXT = 32, 1000
 _OF_A_LAYOUT = re.compile(
     r"velodyne(_points|_reduced)?|data|data_3d_raw|2013_05_28_drive_\d{4}_sync|sequences|\d\d|training|testing"
 )
+
+_OF_A_DATASET = ("data_3d_raw", "sequences", "training", "testing", "velodyne", "velodyne_points")
+# folders in the root of a dataset, whose other folders are not its own
 
 
 @dataclass(frozen=True)
@@ -161,25 +166,44 @@ def same_grid(a: Sensor, b: Sensor) -> bool:
     return a is b or (a.shape == b.shape and bool(np.allclose(a.edges, b.edges, rtol=0, atol=1e-5)))
 
 
-def read_description(root: Path) -> Description | None:
+def read_description(root: Path, plain: bool = False) -> Description | None:
     """The description beside scans, or above the folders of their layout; None if there is none.
 
     Args:
         root: a dataset's root, one of its folders, or one scan.
+        plain: whether the scans are plain files, which lie in folders of any name below that of their ``scans.json``.
 
     Raises:
         FileError, DataError: if there is one that cannot be read, or is damaged.
     """
     root = root.resolve()
     folder = root.parent if root.is_file() else root
-    for _ in range(LEVELS):
+    folders = [folder, *folder.parents][:LEVELS]
+    first = sum(1 for _ in takewhile(lambda each: _OF_A_LAYOUT.fullmatch(each.name), folders[:-1]))
+    for each in folders[: first + 1]:
         for name, read in ((NAME, _current), (TOWN, _of_town), (MARK, _of_mark)):
-            if (folder / name).is_file():
-                return read(folder / name)
-        if not _OF_A_LAYOUT.fullmatch(folder.name):
-            break
-        folder = folder.parent
+            if (each / name).is_file():
+                return read(each / name)
+    return _above(folders[first:]) if plain else None
+
+
+def _above(folders: Sequence[Path]) -> Description | None:
+    """The description of a plain folder, from the folders above the first one.
+
+    A folder has nothing to say about those below it if it is a dataset, or holds scans itself: the ids of a source,
+    from which the names come, are of one form.
+    """
+    for below, folder in pairwise(folders):
+        if _is_dataset(below):
+            return None
+        path = folder / NAME
+        if path.is_file() and _FORMATS in read_start(path, LONGEST):  # other programs have files of this name
+            return None if _is_dataset(folder) or any(folder.glob("*.bin")) else _current(path)
     return None
+
+
+def _is_dataset(folder: Path) -> bool:
+    return any((folder / name).is_dir() for name in _OF_A_DATASET)
 
 
 def _current(path: Path) -> Description:

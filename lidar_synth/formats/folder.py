@@ -50,6 +50,8 @@ class Folder(ScanFiles):
         DataError: if there is no file.
     """
 
+    plain = True
+
     def __init__(
         self,
         root: str | Path,

@@ -47,6 +47,7 @@ class ScanFiles(ABC):
 
     Attributes:
         default_sensor: of the layout.
+        plain: whether scans lie in folders of any name, all of which ``scans.json`` above them describes.
         description: what stands beside the files about all of their scans; None if there is nothing.
         skipped: {id: reason} of the scans that this process could not read.
         dropped: {id: number of points} that this process has dropped.
@@ -57,6 +58,7 @@ class ScanFiles(ABC):
     """
 
     default_sensor: ClassVar[str] = "hdl64e_kitti"
+    plain: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -73,7 +75,7 @@ class ScanFiles(ABC):
             raise DataError(f"{root} holds no scan", (self.__doc__ or "").splitlines()[0].rstrip("."))
         self.root = root
         self.ids = tuple(ids)
-        self.description = read_description(root) if stored is None else None
+        self.description = read_description(root, self.plain) if stored is None else None
         named = stored if self.description is None else self.description.sensor
         self._given = None if sensor is None else load_sensor(sensor)
         self.sensor = self._given or named or load_sensor(self.default_sensor)

@@ -18,9 +18,10 @@ import json
 import os
 import tarfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import unquote
@@ -74,7 +75,8 @@ class WebDataset(ScanFiles):
 class WebDatasetWriter(Writer):
     """Writes WebDataset's .tar files. Each scan is written to a file of its own; ``finish`` merges them in order.
 
-    Scans that a later run adds, because they could not be read before, are appended to their file.
+    Scans that a later run adds, because they could not be read before, are appended to their file, and so are
+    those that are written again, in place of the old ones.
 
     Args:
         root: output folder.
@@ -105,8 +107,11 @@ class WebDatasetWriter(Writer):
         return _key(index, name) in self._there or super().complete(index, name)
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
-        key = Path(*path.relative_to(self.root / NOTES).parts[1:]).with_suffix("").as_posix()
-        write_file(path, lambda file: _write_tar(file, _encode(key, scan)))
+        write_file(path, lambda file: _write_tar(file, _encode(self._key_of(path), scan)))
+
+    def _key_of(self, path: Path) -> str:
+        """The key of the scan in a file that is still to be merged."""
+        return Path(*path.relative_to(self.root / NOTES).parts[1:]).with_suffix("").as_posix()
 
     def finish(self) -> None:
         parts: dict[int, list[Path]] = defaultdict(list)
@@ -114,8 +119,9 @@ class WebDatasetWriter(Writer):
             parts[int(path.relative_to(self.root / NOTES).parts[0]) // self.shard_size].append(path)
         for number, paths in parts.items():
             shard = self.root / f"scans-{number:06d}{SUFFIX}"
-            sources = [shard, *paths] if shard.is_file() else paths
-            write_file(shard, lambda file, sources=sources: _write_tar(file, _members(sources)))  # type: ignore[misc]
+            again = {self._key_of(path) for path in paths}
+            members = chain(_members([shard] if shard.is_file() else [], without=again), _members(paths))
+            write_file(shard, lambda file, members=members: _write_tar(file, members))  # type: ignore[misc]
         clear_notes(self.root)
         self._there = None
 
@@ -190,27 +196,33 @@ def _scans(path: Path) -> Iterator[tuple[str, Members]]:
     scans: dict[str, Members] = {}
     with _open(path) as tar:
         for member in tar:
-            folder, slash, name = member.name.removeprefix("./").rpartition("/")
-            stem, _, kind = name.partition(".")
+            key, kind = _key_in(member.name)
             if member.isdir():
                 continue
             if not member.isreg() or member.issparse():
                 raise DataError(f"{path}: {shorten(member.name, 100)!r} is not a plain file", "a file of a WebDataset")
-            members = scans.setdefault(f"{folder}{slash}{stem}", {})
+            members = scans.setdefault(key, {})
             if kind in members:
                 raise DataError(f"{path} holds {shorten(member.name, 100)!r} twice", "each member once", SKIP_HINT)
             members[kind] = (member.offset_data, member.size)
     yield from scans.items()
 
 
-def _members(paths: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
-    """The members of several tar files, each name once: an interrupted run may leave a scan in two files."""
+def _key_in(name: str) -> tuple[str, str]:
+    """The key of a scan in the name of a member, and what follows it."""
+    folder, slash, last = name.removeprefix("./").rpartition("/")
+    stem, _, kind = last.partition(".")
+    return f"{folder}{slash}{stem}", kind
+
+
+def _members(paths: Iterable[Path], without: Collection[str] = ()) -> Iterator[tuple[str, bytes]]:
+    """The members of several tar files, each name once, without those of some scans, by their keys."""
     done = set()
     for path in paths:
         with _open(path) as tar:
             for member in tar:
                 content = tar.extractfile(member)
-                if member.name not in done and content is not None:
+                if member.name not in done and content is not None and _key_in(member.name)[0] not in without:
                     done.add(member.name)
                     yield member.name, content.read()
 

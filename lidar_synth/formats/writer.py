@@ -8,6 +8,8 @@ boxes, lists of frames) are noted beside each scan and gathered by ``finish``, w
 import json
 import shutil
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -193,6 +195,32 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
             f"{ {name: wanted[name] for name in other} }",
             "Use the same options to resume, or choose another folder.",
         )
+
+
+@contextmanager
+def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
+    """``claim`` a folder for the block, and take the claim back if the block has written nothing, so that the corrected
+    call may use the folder.
+
+    A claim that was there before is left alone: it may be that of a process that has not written its first file yet.
+
+    Raises:
+        ConfigError, DataError, FileError: as ``claim``.
+    """
+    first = not path.is_file()
+    claim(path, settings)
+    try:
+        yield
+        if not _alone(path):
+            claim(path, settings)  # again: the process that came first may have written nothing and taken it back
+    finally:
+        if first and _alone(path):
+            path.unlink(missing_ok=True)
+
+
+def _alone(path: Path) -> bool:
+    """Whether there is no other file in the folder of a file, and below."""
+    return not any(other.is_file() and other != path for other in path.parent.rglob("*"))
 
 
 def write_note(folder: Path, frame: int, facts: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.files.disk import write_file
+from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.convert import in_processes
 from lidar_synth.formats.description import TOWN
 from lidar_synth.formats.kitti360 import KITTI360Writer
@@ -95,11 +95,17 @@ def export_town(
             bar.update(count)
     writer.finish()
     if layout == "semantic_kitti" and len(town):
-        times = "".join(f"{town.interval * i:e}\n" for i in range(len(town)))
-        write_file(Path(out) / "sequences" / f"{number:02d}" / "times.txt", times.encode())
+        _write_times(Path(out) / "sequences" / f"{number:02d}" / "times.txt", town)
     if accumulate:
         _write_windows(town, Path(out), f"2013_05_28_drive_{number:04d}_sync", jobs, progress)
     return len(missing), len(town) - len(missing)
+
+
+def _write_times(path: Path, town: Town) -> None:
+    """Write the times of the scans; an earlier call may have written more of them, which stay."""
+    there = len(read_text(path).splitlines()) if path.is_file() else 0
+    if there < len(town):
+        write_file(path, "".join(f"{town.interval * i:e}\n" for i in range(len(town))).encode())
 
 
 def _claim_folder(out: Path, town: Town, layout: str, sequence: int, camera: bool) -> None:

@@ -1,0 +1,65 @@
+"""Ctrl-C on the command line: one message, the exit status of an interrupted program, and no word from workers."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import typer
+from layouts import some_scan, write_all
+
+from lidar_synth import cli
+
+
+def test_control_c_gives_one_message(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    app = typer.Typer()
+
+    @app.command()
+    def work() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "app", app)
+    monkeypatch.setattr(sys, "argv", ["lidar-synth"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "lidar-synth: interrupted\n"
+
+
+def children(process: int) -> list[str]:
+    return Path(f"/proc/{process}/task/{process}/children").read_text().split()
+
+
+WHEN: dict[str, Callable[[int, Path], bool]] = {
+    "workers start": lambda process, out: len(children(process)) > 2,  # two, and Python's own for what they share
+    "workers work": lambda process, out: any(out.rglob("*.bin")),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="children are counted in /proc")
+@pytest.mark.parametrize("when", WHEN)
+@pytest.mark.parametrize("command", ["town", "convert"])
+def test_control_c_with_workers(tmp_path: Path, command: str, when: str) -> None:
+    """A terminal sends the signal to every process of the group; only the first one reports it."""
+    out, options = tmp_path / "out", ["--scans", "60", "--no-camera"]
+    if command == "convert":
+        write_all("kitti", tmp_path / "in", [some_scan()] * 800)
+        options = ["--to", "kitti"]
+    call = [command, *([str(tmp_path / "in")] if command == "convert" else []), str(out), *options, "--jobs", "2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lidar_synth", *call], stderr=subprocess.PIPE, text=True, process_group=0
+    )
+    while not WHEN[when](process.pid, out):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    started = time.monotonic()
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, errors
+    assert errors.rstrip().endswith("lidar-synth: interrupted") and "Traceback" not in errors, errors
+    assert not list(out.rglob("*.part")) and time.monotonic() - started < 60
