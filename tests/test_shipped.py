@@ -48,7 +48,7 @@ def test_returns_of_a_label_map_have_its_labels(columns: int) -> None:
         same = (image.label == wanted.label)[known].mean()
         assert same == 1 or (columns == 1024 and same > 0.9)  # a column that stands for two has the label of one
         near = np.abs(image.range - wanted.range)[known] < 0.05 * wanted.range[known]
-        assert near.mean() > 0.6  # it stands where the map's scan stood, roughly
+        assert near.mean() > 0.5  # it stands where the map's scan stood, roughly
 
 
 @pytest.fixture(scope="module")

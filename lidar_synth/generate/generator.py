@@ -153,9 +153,9 @@ class Generator:
             B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its ``confidence`` in
             [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0) where there is no return. If a
             model conditioned on semantic maps does not generate labels, ``label`` is the map's where there is a
-            return, with confidence 1 where the map's label is known. With an autoencoder of surfaces ("town-semantic")
-            it is the map's where that is known, with the probability of this class there as confidence. A model conditioned on a ``Layout`` or on the
-            layout of a scan gives the image the boxes that hold a return, and their numbers in ``instance``.
+            return, with confidence 1 where the map's label is known. The autoencoder of "town-semantic" gives returns
+            the map's labels too, with their probabilities as confidence. A model conditioned on a ``Layout`` or on
+            the layout of a scan gives the image the boxes that hold a return, and their numbers in ``instance``.
 
         Raises:
             ConfigError: on an invalid seed, index, number of steps or solver, a condition for an unconditional model,
