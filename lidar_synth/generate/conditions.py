@@ -35,6 +35,10 @@ HEIGHT_TOLERANCE = 0.35
 """Metres between the heights of two sensors above the ground, up to which the layout of one suits the other."""
 
 
+GAP = 2
+"""Cells of a gap in the labels of a scan that is closed."""
+
+
 class Condition(Protocol):
     """One kind of condition.
 
@@ -67,6 +71,25 @@ class Condition(Protocol):
         ...
 
 
+def bridged(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A label map without narrow gaps: up to ``GAP`` unknown cells between two known ones of a row take the nearer label.
+
+    Lasers of a sensor that moves, or of another one, leave such gaps on a model's grid. To a model, they would be rays
+    without a return, as through a hedge. Columns wrap around.
+
+    Args:
+        labels: (H, W) uint8 train ids, 255 = unknown.
+    """
+    out = labels.copy()
+    for width in range(1, GAP + 1):
+        for left in range(1, width + 1):
+            right = width + 1 - left
+            before, after = np.roll(labels, left, 1), np.roll(labels, -right, 1)
+            gap = (out == IGNORE) & (before != IGNORE) & (after != IGNORE)
+            out[gap] = (before if left <= right else after)[gap]
+    return out
+
+
 class SemanticMap:
     """The classes of a scan on the model's grid."""
 
@@ -80,15 +103,14 @@ class SemanticMap:
         return tuple(encoder.resolution)  # type: ignore[arg-type]  # every encoder has a resolution
 
     def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
-        """The scan's labels, projected onto ``sensor``, which need not be the scan's own.
+        """The scan's labels, projected onto ``sensor``, which need not be the scan's own; see ``bridged``.
 
         Raises:
             DataError: on a scan without labels.
         """
         if scan.label is None:
             raise DataError(f"scan {scan.id!r} has no labels", "a labelled scan, to condition on")
-        labels: NDArray[np.uint8] = project(scan, sensor, ["label"]).channels["label"]
-        return labels
+        return bridged(project(scan, sensor, ["label"]).channels["label"])
 
     def check(self, values: Tensor) -> None:
         """Check that all values are train ids or 255.
