@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.flow.path import guided
-from lidar_synth.generate.conditions import CONDITIONS, GAP, batch_of, blank, bridged, one_view
+from lidar_synth.generate.conditions import CONDITIONS, batch_of, blank, bridged, one_view
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
@@ -76,7 +76,7 @@ def test_labels_of_another_sensor_are_projected_onto_the_grid_of_the_model() -> 
     other = replace(SENSOR, name="other", columns=64, rows=16)
     scan = random_scan(other, 3000)
     labels = CONDITIONS["semantic"].read(scan, SENSOR, SENSOR.shape, {})
-    assert np.array_equal(labels, project(scan, SENSOR, ["label"]).label)
+    assert np.array_equal(labels, bridged(project(scan, SENSOR, ["label"]).channels["label"]))
 
 
 @pytest.mark.parametrize("method", ["rescale", "patches"])
@@ -398,21 +398,3 @@ def test_missing_clip_weights_or_libraries_are_reported_with_a_hint(
         monkeypatch.setitem(sys.modules, library, None)
         with pytest.raises(LibraryError, match=rf"{library}\w* is not installed.*pip install {library}"):
             net(image)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_narrow_gaps_of_a_label_map_are_closed(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    labels = np.where(rng.random((8, 64)) < 0.5, IGNORE, rng.integers(0, 19, (8, 64))).astype(np.uint8)
-    given = labels.copy()
-    made = bridged(labels)
-    assert np.array_equal(labels, given)
-    for row, out in zip(labels, made, strict=True):
-        known = np.flatnonzero(row != IGNORE)
-        for i in np.flatnonzero(row == IGNORE):
-            left, right = ((i - known) % 64).min(), ((known - i) % 64).min()
-            wanted = IGNORE
-            if left + right - 1 <= GAP:
-                wanted = row[(i - left) % 64] if left <= right else row[(i + right) % 64]
-            assert out[i] == wanted
-        assert np.array_equal(out[known], row[known])

@@ -29,6 +29,7 @@ from lidar_synth.generate.checkpoint import (
     read_header,
     save_checkpoint,
 )
+from lidar_synth.generate.conditions import GAP, bridged
 from lidar_synth.generate.generator import Generator, load_generator, shipped_models
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
@@ -165,11 +166,29 @@ def test_a_label_map_also_labels_the_generated_scan(tmp_path: Path, generator: G
 def test_real_scans_provide_their_labels_as_conditions(tmp_path: Path) -> None:
     conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
     scans = [random_scan(SENSOR, 400, seed) for seed in range(2)]
-    maps = np.stack([project(scan, SENSOR, ["label"]).label for scan in scans])
+    maps = np.stack([bridged(project(scan, SENSOR, ["label"]).channels["label"]) for scan in scans])
     for a, b in zip(conditioned.scans(0, [1, 2], scans), conditioned.scans(0, [1, 2], maps), strict=True):
         assert np.array_equal(a.points, b.points)
     [a], [b] = conditioned.scans(0, [1], scans[1]), conditioned.scans(0, [1], maps[1])
     assert np.array_equal(a.points, b.points)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_narrow_gaps_of_a_label_map_are_closed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    labels = np.where(rng.random((8, 64)) < 0.5, IGNORE, rng.integers(0, 19, (8, 64))).astype(np.uint8)
+    given = labels.copy()
+    made = bridged(labels)
+    assert np.array_equal(labels, given)
+    for row, out in zip(labels, made, strict=True):
+        known = np.flatnonzero(row != IGNORE)
+        for i in np.flatnonzero(row == IGNORE):
+            left, right = ((i - known) % 64).min(), ((known - i) % 64).min()
+            wanted = IGNORE
+            if left + right - 1 <= GAP:
+                wanted = row[(i - left) % 64] if left <= right else row[(i + right) % 64]
+            assert out[i] == wanted
+        assert np.array_equal(out[known], row[known])
 
 
 def test_guidance_interpolates_between_blank_and_given_condition(tmp_path: Path) -> None:

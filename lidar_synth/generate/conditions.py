@@ -72,7 +72,7 @@ class Condition(Protocol):
 
 
 def bridged(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A label map without narrow gaps: up to ``GAP`` unknown cells between two known ones of a row take the nearer label.
+    """A label map without narrow gaps: up to ``GAP`` unknown cells between two known ones of a row take the nearer one.
 
     Lasers of a sensor that moves, or of another one, leave such gaps on a model's grid. To a model, they would be rays
     without a return, as through a hedge. Columns wrap around.
