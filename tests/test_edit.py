@@ -203,7 +203,7 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "far": (lambda: edit.remove(SCAN, car(90, 0)), DataError, "90.0 m away; expected at most 80 m"),
     "empty": (lambda: edit.remove(SCAN, car(-9, 0) + np.float32([0, 0, 6, 0, 0, 0, 0])), DataError, "without a return"),
     "model": (lambda: edit.remove(SCAN, 0, model="nothing"), ConfigError, "model 'nothing'; expected a shipped one"),
-    "conditional": (lambda: edit.remove(SCAN, 0, model="town-semantic"), ConfigError, "expected an unconditional"),
+    "conditional": (lambda: edit.remove(SCAN, 0, model="town-camera"), ConfigError, "expected an unconditional"),
     "sensor": (
         lambda: edit.remove(cast([car(12, 0)], sensor=load_sensor("os1_128")), 0, model="town"),
         DataError, "a scan of sensor 'os1_128' .* for a model of 'town'.*model=None",
