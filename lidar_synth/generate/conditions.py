@@ -34,7 +34,6 @@ from lidar_synth.geometry.sensor import Sensor
 HEIGHT_TOLERANCE = 0.35
 """Metres between the heights of two sensors above the ground, up to which the layout of one suits the other."""
 
-
 GAP = 2
 """Cells of a gap in the labels of a scan that is closed."""
 
