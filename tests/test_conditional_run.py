@@ -22,6 +22,7 @@ from lidar_synth.generate.checkpoint import (
     load_checkpoint,
 )
 from lidar_synth.generate.generator import load_generator
+from lidar_synth.town import Town
 from lidar_synth.train.config import DistillConfig, load_config
 from lidar_synth.train.plan import make_plan, open_data
 
@@ -113,6 +114,21 @@ def test_a_camera_model(network: dict[str, Any], scans: Path, kitti: Path, codec
     assert np.allclose(scan.points, same.points)
     with pytest.raises(ConfigError, match="roll with the condition 'camera'"):
         call("train", config, "data.roll=true", f"output={tmp_path / 'rolled'}")
+
+
+def test_the_town_renders_the_images_of_a_camera_model(scans: Path, tmp_path: Path) -> None:
+    condition = CAMERA | {"image": [376, 1408]}
+    config = write_config(
+        scans, tmp_path, "camera", network=UNET, condition=condition, steps=3, data={"town": 2, "path": None}
+    )
+    call("train", config, "recipe.iterations=1")
+    kept = np.load(tmp_path / "camera" / "cache" / "camera.npy")
+    town = Town(0, SENSOR, 2, interval=1.0)
+    for i, image in enumerate(kept):
+        small = Image.fromarray(town.image(i)).resize((32, 16), Image.Resampling.BICUBIC)
+        assert np.array_equal(image, np.asarray(small).transpose(2, 0, 1))
+    with pytest.raises(DataError, match=r"the town's image of \(376, 1408\) rows and columns; expected \(40, 80\)"):
+        call("train", config, f"output={tmp_path / 'other'}", "condition.image=[40,80]")
 
 
 def test_the_camera_of_another_focal_length_is_refused(scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:

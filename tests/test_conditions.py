@@ -227,8 +227,8 @@ def conditioned_batches(tmp_path: Path, name: str, **options: Any) -> Batches:
     scans = [some_scan(tmp_path, seed) for seed in range(4)]
     shapes = {"camera": CAMERA_SHAPE, "layout": (5, *SENSOR.shape)}
 
-    def reader(kind: str) -> Callable[[Scan], NDArray[np.uint8]]:
-        return lambda scan: CONDITIONS[kind].read(scan, SENSOR, shapes[kind], OPTIONS)
+    def reader(kind: str) -> Callable[[int, Scan], NDArray[np.uint8]]:
+        return lambda i, scan: CONDITIONS[kind].read(scan, SENSOR, shapes[kind], OPTIONS)
 
     others = {kind: Other(shape, reader(kind)) for kind, shape in shapes.items()}
     about = {key: options.pop(key) for key in ("dropout", "reduction") if key in options}
@@ -282,7 +282,7 @@ def test_a_reduced_camera_image_keeps_one_view(tmp_path: Path) -> None:
 
 def test_a_cache_with_images_resumes_and_refuses_other_images(tmp_path: Path) -> None:
     scans = [some_scan(tmp_path, seed) for seed in range(3)]
-    others = {"camera": Other(CAMERA_SHAPE, lambda s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS))}
+    others = {"camera": Other(CAMERA_SHAPE, lambda i, s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS))}
     cache = cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others)
     again = cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others)
     assert np.array_equal(cache.fields["camera"], again.fields["camera"])

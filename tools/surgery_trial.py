@@ -1,26 +1,30 @@
 """Can a small classifier tell where an object was removed from a scan?
 
 Cars are removed from scans of the town and, with --labelled and --boxed, from real scans of KITTI. For each there is a
-control in the unedited scan: the same box, turned about the sensor to a free place on ground, so at the same distance
-and of the same size; of the free places, the one whose surroundings have the most similar classes. A small
-convolutional network sees both places in the range image (range relative to the object's, reflectance, lost returns,
-number of points), is trained on some scans and tested on others.
+control. In the town it is the same place in the scan that the town casts without these cars, which also shows how true
+the filled hole is. In a real scan it is another place of the unedited scan: the same box, turned about the sensor to a
+free place on ground, so at the same distance and of the same size; of the free places, the one whose surroundings have
+the most similar classes. A small convolutional network sees both places in the range image (range relative to the
+object's, reflectance, lost returns, number of points), is trained on some scans and tested on others.
 
     python tools/surgery_trial.py --town 40 --labelled $LIDAR_SYNTH_LABELLED_SCANS/semantic_kitti
 """
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
+from torch.utils.data import ConcatDataset
 from tqdm import tqdm
 
-from lidar_synth import Boxes, Scan, Town, load_generator, open_scans
+from lidar_synth import Boxes, Scan, Source, Town, load_generator, open_scans
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.projection import locate, project
 from lidar_synth.labels.boxes import turned
@@ -28,6 +32,7 @@ from lidar_synth.labels.edit.removal import returns_of, without
 from lidar_synth.labels.ground import ground_under
 from lidar_synth.labels.objects import instances_of
 from lidar_synth.noise import keyed_rng
+from lidar_synth.town.world import World
 
 PATCH = 24, 32
 FOLDS = 5
@@ -65,6 +70,69 @@ def control(scan: Scan, box: Boxes, rng: np.random.Generator) -> NDArray[np.floa
                 values[2] = ground.height + values[5] / 2
                 best, similar = values, alike
     return best
+
+
+class Emptied(Town):
+    """The town without some objects of its stretches.
+
+    Args:
+        town: the whole one.
+        instances: numbers of the objects that are missing.
+    """
+
+    def __init__(self, town: Town, instances: Sequence[int]) -> None:
+        super().__init__(town.seed, town.sensor, len(town), town.interval)
+        self._gone = list(instances)
+
+    def world(self, index: int) -> World:
+        """The stretch of road of a scan, without these objects."""
+        world = super().world(index)
+        kept = ~np.isin(world.surfaces.instance[world.faces], self._gone)
+        movers = [mover for mover in world.movers if mover.instance not in self._gone]
+        return replace(world, triangles=world.triangles[kept], faces=world.faces[kept], movers=movers)
+
+
+class Place(NamedTuple):
+    """Where a car is removed: its returns (N,), its box (7,), and the box (7,) of the control."""
+
+    mine: NDArray[np.bool_]
+    box: NDArray[np.float32]
+    control: NDArray[np.float32]
+
+
+class Collected(NamedTuple):
+    """Patches of edited places by edit and of controls, the scan of each place, and by edit the seconds per scan and
+    the cells of ``fidelity`` (the latter without a truth: none)."""
+
+    edited: dict[str, list[NDArray[np.float32]]]
+    controls: list[NDArray[np.float32]]
+    groups: list[int]
+    seconds: dict[str, float]
+    cells: dict[str, list[NDArray[np.float64]]]
+
+
+def places_of(scan: Scan, anywhere: bool, number: int) -> list[Place]:
+    """The cars that are removed from a scan, with controls in other places or in their own."""
+    rng, found = keyed_rng(0, number), []
+    for box in cars_of(scan):
+        mine = returns_of(scan, box)
+        if mine.sum() >= LEAST:
+            there = control(scan, box, rng) if anywhere else box.values[0]
+            if there is not None:
+                found.append(Place(mine, box.values[0], there))
+    return found[:MOST]
+
+
+def fidelity(scan: Scan, places: list[Place], result: Scan, truth: Scan) -> NDArray[np.float64]:
+    """(n, 3) for each cell of the holes: whether the edited scan and the truth agree on having a return; and, nan
+    without both returns, whether they are at the same range (to 0.3 m or 3 %) and of the same class."""
+    cells = locate(scan.points, scan.sensor).cell
+    hole = np.unique(cells[np.any([place.mine for place in places], 0) & (cells >= 0)])
+    (a, b), (c, d) = ((image.range.ravel()[hole], image.label.ravel()[hole])
+                      for image in (project(one, scan.sensor, ["label"]) for one in (result, truth)))  # fmt: skip
+    both = (a > 0) & (c > 0)
+    near = np.abs(a - c) < np.maximum(0.3, 0.03 * c)
+    return np.stack([(a > 0) == (c > 0), np.where(both, near, np.nan), np.where(both, b == d, np.nan)], 1)
 
 
 def surroundings(scan: Scan, box: Boxes) -> NDArray[np.float64]:
@@ -115,29 +183,29 @@ def edits(model: Generator | None, starts: list[float]) -> dict[str, object]:
     }
 
 
-def collect(scans: Iterator[Scan], ways: dict) -> tuple[dict[str, list], list, list, dict[str, float]]:
-    """Patches of edited places by edit, of controls, the scan of each place, and seconds per scan."""
-    edited, controls, groups = {name: [] for name in ways}, [], []
-    seconds = dict.fromkeys(ways, 0.0)
-    number = 0
-    for scan in scans:
-        rng, places = keyed_rng(0, number), []
-        for box in cars_of(scan):
-            mine = returns_of(scan, box)
-            if mine.sum() >= LEAST and (place := control(scan, box, rng)) is not None:
-                places.append((mine, box.values[0], place))
-        places = places[:MOST]
+def collect(source: Source, ways: dict) -> Collected:
+    """All places of a source; those of the town have their controls in the scan that it casts without the cars."""
+    found, number = Collected({name: [] for name in ways}, [], [], dict.fromkeys(ways, 0.0), {n: [] for n in ways}), 0
+    for i in tqdm(range(len(source)), leave=False, disable=None):
+        scan = source[i]
+        places = places_of(scan, not isinstance(source, Town), number)
         if not places:
             continue
+        truth = scan
+        if isinstance(source, Town):
+            assert scan.instance is not None
+            truth = Emptied(source, [int(np.bincount(scan.instance[p.mine]).argmax()) for p in places])[i]
         for name, way in ways.items():
             before = time.perf_counter()
-            result = way(scan, [(mine, box) for mine, box, _ in places], number)
-            seconds[name] += time.perf_counter() - before
-            edited[name] += [patch(result, box) for _, box, _ in places]
-        controls += [patch(scan, place) for _, _, place in places]
-        groups += [number] * len(places)
+            result = way(scan, [(place.mine, place.box) for place in places], number)
+            found.seconds[name] += time.perf_counter() - before
+            found.edited[name].extend(patch(result, place.box) for place in places)
+            if isinstance(source, Town):
+                found.cells[name].append(fidelity(scan, places, result, truth))
+        found.controls.extend(patch(truth, place.control) for place in places)
+        found.groups.extend([number] * len(places))
         number += 1
-    return edited, controls, groups, {name: value / max(number, 1) for name, value in seconds.items()}
+    return found._replace(seconds={name: value / max(number, 1) for name, value in found.seconds.items()})
 
 
 def auc(edited: list, controls: list, groups: list, epochs: int, seed: int) -> float:
@@ -198,22 +266,31 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     arguments = parser.parse_args()
     ways = edits(load_generator(arguments.model), arguments.starts)
-    sources = {"town": [Town(seed=977, scans=arguments.town)]} if arguments.town else {}
+    sources: dict[str, Source] = {"town": Town(seed=977, scans=arguments.town)} if arguments.town else {}
     if roots := arguments.labelled + arguments.boxed:
-        sources["KITTI"] = [open_scans(root) for root in roots]
-    for name, several in sources.items():
-        every = (source[i] for source in several for i in tqdm(range(len(source)), name, leave=False, disable=None))
-        edited, controls, groups, seconds = collect(every, ways)
+        sources["KITTI"] = ConcatDataset([open_scans(root) for root in roots])
+    for name, source in sources.items():
+        found = collect(source, ways)
         if arguments.save:
-            np.savez(f"{arguments.save}-{name}.npz", **edited, controls=controls, groups=groups)  # type: ignore[arg-type]
-        print(f"{name}: {len(controls)} cars in {max(groups) + 1} scans")
-        for way, patches in edited.items():
-            values = [auc(patches, controls, groups, arguments.epochs, seed) for seed in range(arguments.seeds)]
-            if way == "filled by geometry":
-                edge = surroundings_alone(patches), surroundings_alone(controls)
-                bias = [auc(*edge, groups, arguments.epochs, seed) for seed in range(arguments.seeds)]
-                print(f"  {'surroundings alone':<36} AUC {np.mean(bias):.3f} +- {np.std(bias):.3f}")
-            print(f"  {way:<36} AUC {np.mean(values):.3f} +- {np.std(values):.3f}   {seconds[way]:.2f} s a scan")
+            np.savez(f"{arguments.save}-{name}.npz", **found.edited, controls=found.controls, groups=found.groups)  # type: ignore[arg-type]
+        print(f"{name}: {len(found.controls)} cars in {max(found.groups) + 1} scans")
+
+        def show(name: str, edited: list, controls: list, more: str, groups: list[int] = found.groups) -> None:
+            values = [auc(edited, controls, groups, arguments.epochs, seed) for seed in range(arguments.seeds)]
+            print(f"  {name:<36} AUC {np.mean(values):.3f} +- {np.std(values):.3f}{more}")
+
+        around = found.edited["filled by geometry"], found.controls
+        show("surroundings alone", *(surroundings_alone(patches) for patches in around), more="")
+        for way, patches in found.edited.items():
+            show(way, patches, found.controls, f"   {found.seconds[way]:.2f} s a scan" + true_cells(found.cells[way]))
+
+
+def true_cells(cells: list[NDArray[np.float64]]) -> str:
+    """The fidelity of all cells in words; nothing without a truth."""
+    if not cells:
+        return ""
+    shares = np.nanmean(np.concatenate(cells), 0)
+    return "; true: return or none {:.1%}, range {:.1%}, class {:.1%}".format(*shares)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ To add a condition: write its class and enter it in ``CONDITIONS``; enter its en
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -30,6 +30,9 @@ from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as PILImage
 
 HEIGHT_TOLERANCE = 0.35
 """Metres between the heights of two sensors above the ground, up to which the layout of one suits the other."""
@@ -143,32 +146,18 @@ class CameraImage:
         return (3, *encoder.resolution)  # type: ignore[misc]  # every encoder has a resolution
 
     def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
-        """The image taken with the scan, resized.
-
-        ``options["image"]`` are the rows and columns that the image file must have. They identify the camera of the
-        training; an image with another field of view would mislead the model.
+        """The image taken with the scan, see ``resized``.
 
         Raises:
             DataError: on a scan without an image, one that cannot be read, or of another size.
         """
-        from PIL import Image
-
         if scan.image_path is None:
             raise DataError(f"scan {scan.id!r} has no camera image", "a scan with an image_path, to condition on")
         try:
             image = read_picture(scan.image_path)
         except FileError as error:
             raise DataError(f"the image {scan.image_path} cannot be read ({error})", "a PNG or JPEG") from error
-        size = (image.height, image.width)
-        small = image.convert("RGB").resize((shape[2], shape[1]), Image.Resampling.BICUBIC)
-        wanted = tuple(options.get("image") or size)
-        if size != wanted:
-            raise DataError(
-                f"the image {scan.image_path} of {size} rows and columns",
-                f"{wanted}, those of the camera that the model was trained on",
-                "Crop or pad it, by its calibration, to what that camera sees.",
-            )
-        return np.asarray(small, np.uint8).transpose(2, 0, 1).copy()
+        return resized(image, shape, options, f"the image {scan.image_path}")
 
     def check(self, values: Tensor) -> None:
         """Accept all values, since every byte is a valid colour."""
@@ -176,6 +165,37 @@ class CameraImage:
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
         """One view of each image."""
         return one_view(values, views)
+
+
+def resized(
+    image: "PILImage", shape: tuple[int, ...], options: Mapping[str, Any], what: str = "an image"
+) -> NDArray[np.uint8]:
+    """A camera image as a condition.
+
+    Args:
+        image: of the camera.
+        shape: (3, h, w) of the condition.
+        options: of the condition; ``options["image"]`` are the rows and columns that the image must have. They identify
+            the camera of the training; an image with another field of view would mislead the model.
+        what: the image, in an error's words.
+
+    Returns:
+        (3, h, w) uint8 red, green, blue.
+
+    Raises:
+        DataError: on an image of another size.
+    """
+    from PIL.Image import Resampling
+
+    size = (image.height, image.width)
+    if size != (wanted := tuple(options.get("image") or size)):
+        raise DataError(
+            f"{what} of {size} rows and columns",
+            f"{wanted}, those of the camera that the model was trained on",
+            "Crop or pad it, by its calibration, to what that camera sees.",
+        )
+    small = image.convert("RGB").resize((shape[2], shape[1]), Resampling.BICUBIC)
+    return np.asarray(small, np.uint8).transpose(2, 0, 1).copy()
 
 
 class LayoutImage:

@@ -77,11 +77,11 @@ class Other(NamedTuple):
 
     Args:
         shape: of one scan.
-        read: a scan to uint8 values of this shape.
+        read: the number of a scan in its source, and the scan, to uint8 values of this shape.
     """
 
     shape: tuple[int, ...]
-    read: Callable[[Scan], NDArray[np.uint8]]
+    read: Callable[[int, Scan], NDArray[np.uint8]]
 
 
 def cache_scans(
@@ -127,7 +127,7 @@ def cache_scans(
     for i in tqdm(range(done, len(source)), desc="scans", disable=not progress or done == len(source)):
         scan = source[i]
         image = project(scan, sensor, [n for n in names if n != "range"])
-        cache.write(i, image, {name: other.read(scan) for name, other in others.items()})
+        cache.write(i, image, {name: other.read(i, scan) for name, other in others.items()})
         if folder is not None and ((i + 1) % _SAVE_EVERY == 0 or i + 1 == len(source)):
             for values in cache.fields.values():
                 values.flush()  # type: ignore[attr-defined]  # a memmap

@@ -13,7 +13,6 @@ from lidar_synth.train.config import (
     ModelConfig,
     Run,
     Stage,
-    TownScans,
     TrainConfig,
     command_of,
     find_model_file,
@@ -59,7 +58,6 @@ class ModelPlan:
         stages: those that are needed, by name and in order.
         minutes: limit of the time of all stages without iterations of their own.
         out: the checkpoint that the last one makes.
-        town: scans of the town that are written first.
     """
 
     name: str
@@ -67,7 +65,6 @@ class ModelPlan:
     stages: Mapping[str, PlannedStage]
     minutes: float
     out: Path
-    town: TownScans | None = None
 
     @property
     def runs(self) -> StagedRuns:
@@ -78,9 +75,6 @@ class ModelPlan:
         """The plan in words."""
         runs, budgets = self.runs, self.runs.budgets(self.minutes)
         lines = [f"{self.name} -> {self.out}"]
-        if self.town is not None:
-            path = next(iter(self.stages.values())).config.data.path
-            lines.append(f"  {self.town.scans} scans of the town with images -> {path}")
         for name, stage in self.stages.items():
             limit = f"{stage.config.recipe.iterations} iterations"
             if name in budgets:
@@ -144,8 +138,7 @@ def plan_model(
     stages = _needed(stages, last, runs)
     limit = sum(stage.minutes or 0.0 for stage in stages.values()) if minutes is None else minutes
     out = runs.checkpoint(last) if until else folder / f"{name}.safetensors"
-    own = any(o.startswith(("data.path=", "data.town=")) for name in stages for o in given[name])
-    plan = ModelPlan(name, folder, stages, limit, out, None if own else settings.town)
+    plan = ModelPlan(name, folder, stages, limit, out)
     _check_minutes(plan)
     return plan
 

@@ -6,7 +6,6 @@ The folder of the model, ``runs/NAME``, holds::
     NAME.safetensors     the checkpoint of the last stage, in half precision where it would be large
 """
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from tqdm import tqdm
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import load_checkpoint, read_header, save_checkpoint
 from lidar_synth.generate.generator import find_model
-from lidar_synth.town import Town, export_town
 from lidar_synth.train.model_plan import ModelPlan, is_missing
 from lidar_synth.train.resume import check_resumed
 from lidar_synth.train.runs import run
@@ -50,13 +48,9 @@ def train_model(plan: ModelPlan) -> Path:
         teacher.init=runs/elsewhere/town-dense/teacher/teacher.safetensors, which does not exist
     """
     runs = plan.runs
-    left = [name for name in plan.stages if not runs.is_done(name)]
-    for name in left:
-        _check_starts(plan, name)
-    if plan.town is not None and left:
-        data, town = plan.stages[left[0]].config.data, plan.town
-        source = Town(town.seed, scans=town.scans, interval=town.interval)
-        export_town(source, str(data.path), str(data.layout), jobs=os.cpu_count() or 1)
+    for name in plan.stages:
+        if not runs.is_done(name):
+            _check_starts(plan, name)
     for number, (name, stage) in enumerate(plan.stages.items(), 1):
         if runs.is_done(name) and _still_done(plan, name):
             continue

@@ -4,7 +4,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 from tqdm import tqdm
 
@@ -23,10 +25,13 @@ from lidar_synth.generate.checkpoint import (
     split,
 )
 from lidar_synth.generate.codec import Codec, make_codec
-from lidar_synth.generate.conditions import CONDITIONS
+from lidar_synth.generate.conditions import CONDITIONS, resized
+from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.models import build_network
 from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.models.town_codec.autoencoder import Autoencoder
+from lidar_synth.town.town import Town
 from lidar_synth.train.autoencoder import Autoencoding, autoencoder_loss, reconstruction_task
 from lidar_synth.train.cache import Other, cache_latents, cache_scans
 from lidar_synth.train.config import Data, DistillConfig, Run, TrainConfig
@@ -187,6 +192,7 @@ def open_data(
     where the data names none."""
     given = config.data if data is None else data
     sensor, tensors = plan.header.sensor, plan.header.tensors
+    source = given.open(sensor)
     conditioning, channels, others = None, set(tensors.channels), {}
     for name, options in plan.header.conditioning.items():
         condition, encoder = CONDITIONS[name], plan.parts(plan.network)[ENCODER]
@@ -196,9 +202,8 @@ def open_data(
         if condition.field == "label":  # a channel of the range image
             channels.add("label")
         else:
-            others[condition.field] = Other(shape, _reader(name, sensor, shape, options))
+            others[condition.field] = Other(shape, _reader(name, source, sensor, shape, options))
     kept = given.cache or config.output / folder
-    source = given.open(sensor)
     cache = cache_scans(source, sensor, channels, kept, given.describe(), others=others)
     codec = plan.codec() if plan.autoencoder is not None else None
     batches = Batches(cache, tensors, config.seed, given.flip, given.roll, device, codec, conditioning)
@@ -208,8 +213,15 @@ def open_data(
     return replace(batches, latents=cache_latents(cache, tensors, codec, device, kept, made_by))
 
 
-def _reader(name: str, sensor: Any, shape: tuple[int, ...], options: dict[str, Any]) -> Callable[[Any], Any]:
-    return lambda scan: CONDITIONS[name].read(scan, sensor, shape, options)
+def _reader(
+    name: str, source: Source, sensor: Sensor, shape: tuple[int, ...], options: dict[str, Any]
+) -> Callable[[int, Scan], NDArray[np.uint8]]:
+    """What reads the condition of a scan; the town renders its images when they are needed."""
+    if name == "camera" and isinstance(source, Town):
+        from PIL import Image
+
+        return lambda i, scan: resized(Image.fromarray(source.image(i)), shape, options, "the town's image")
+    return lambda i, scan: CONDITIONS[name].read(scan, sensor, shape, options)
 
 
 def _selection(config: DistillConfig, velocity: Any, plan: TrainingPlan, accelerator: "Accelerator") -> Selection:

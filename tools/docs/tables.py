@@ -27,7 +27,6 @@ from lidar_synth.train.config import (
     Samples,
     SelectionSettings,
     Stage,
-    TownScans,
     TrainConfig,
     published,
     published_models,
@@ -88,7 +87,6 @@ SECTIONS: dict[str, tuple[type, ...]] = {
     "selection": (SelectionSettings,),
     "models": (ModelConfig,),
     "stages": (Stage,),
-    "town": (TownScans,),
 }
 """Keys of a recipe that hold further keys; "" = the keys on top, "distill" = those of a student besides,
 "models" = those of a model of several stages."""

@@ -12,7 +12,7 @@ from pydantic import Field
 from lidar_synth.errors import ConfigError
 from lidar_synth.train.config.load import validated
 from lidar_synth.train.config.recipes import SUFFIXES, Listed, folder, head_of, read_file, read_recipe
-from lidar_synth.train.config.sections import Count, Run, Section
+from lidar_synth.train.config.sections import Run, Section
 
 PARENTS = ("teacher", "weaker", "init", "codec")
 """Keys of a recipe that name checkpoints; a provenance holds their hashes under the same names."""
@@ -33,30 +33,14 @@ class Stage(Section):
     needs: Annotated[dict[str, str], Field(default_factory=dict)]
 
 
-class TownScans(Section):
-    """Scans of the town with images, for recipes with a ``data.path``.
-
-    Args:
-        scans: their number.
-        seed: of the town.
-        interval: seconds between consecutive scans.
-    """
-
-    scans: Count
-    seed: Annotated[int, Field(ge=0)] = 0
-    interval: float = 1.0
-
-
 class ModelConfig(Section):
     """A model and the stages that make it.
 
     Args:
         stages: {name: recipe, minutes and needs}, in order; the last one makes the model.
-        town: scans of the town that are written to the recipes' ``data.path`` first.
     """
 
     stages: Annotated[dict[str, Stage], Field(min_length=1)]
-    town: TownScans | None = None
 
 
 def find_model_file(given: str | Path) -> Path | None:
