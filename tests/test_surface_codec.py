@@ -197,6 +197,8 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int
     road = inside & (free.channels["label"] == TRAIN_ID["road"])  # rays through a box may miss the object
     assert np.array_equal(free.range[road], bounded.range[road])
     assert np.array_equal(free.range, image_of(torch.zeros_like(layout)).range)  # nothing is known of a blank layout
+    layout[:, 0][layout[:, 0] == CODES["Car"]] = CODES["Cyclist"]  # what stands in a box has its class
+    assert np.array_equal(object_, image_of(layout).channels["label"] == TRAIN_ID["bicyclist"])
 
 
 @pytest.mark.parametrize("width", [256, 128])

@@ -33,6 +33,13 @@ GROUND = np.isin(np.arange(256), [TRAIN_ID[n] for n in ("road", "parking", "side
 BOXED = tuple(TRAIN_ID[name] for name in ("car", "truck", "other-vehicle", "person", "bicyclist"))
 """Train ids of the objects that detectors' classes have boxes for."""
 
+LABELS = {
+    "Car": TRAIN_ID["car"], "Van": TRAIN_ID["car"], "Truck": TRAIN_ID["truck"], "Tram": TRAIN_ID["other-vehicle"],
+    "Pedestrian": TRAIN_ID["person"], "Person_sitting": TRAIN_ID["person"], "Cyclist": TRAIN_ID["bicyclist"],
+    "Motorcyclist": TRAIN_ID["motorcyclist"],
+}  # fmt: skip
+"""Train id of the points in a box, by the class of the box; those of KITTI's ``Misc`` are unknown."""
+
 COLOURS = np.array(
     [
         (100, 150, 245), (100, 230, 245), (30, 60, 150), (80, 30, 180), (0, 0, 255),

@@ -6,17 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND, IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import GROUND, IGNORE, LABELS
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grown, turned, turned_points
 from lidar_synth.labels.ground import ground_under
-
-LABELS = {
-    "Car": TRAIN_ID["car"], "Van": TRAIN_ID["car"], "Truck": TRAIN_ID["truck"], "Pedestrian": TRAIN_ID["person"],
-    "Person_sitting": TRAIN_ID["person"], "Cyclist": TRAIN_ID["bicyclist"], "Tram": TRAIN_ID["other-vehicle"],
-}  # fmt: skip
-"""Train id of a box's points if the scan has no labels; points of other names (KITTI's ``Misc``) are ignored."""
 
 THINGS = len(("car", "bicycle", "motorcycle", "truck", "other-vehicle", "person", "bicyclist", "motorcyclist"))
 """Train ids below this one have instances."""

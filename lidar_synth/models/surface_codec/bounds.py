@@ -1,15 +1,17 @@
-"""What a condition says of single cells: where objects may be, and classes that are given."""
+"""What a condition says of single cells: where objects may be and of which class, and classes that are given."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lidar_synth.datasets.classes import BOXED, IGNORE
+from lidar_synth.datasets.classes import BOXED, IGNORE, LABELS
 from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES
 from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.models.surface_codec.blocks import to_patches
+
+_LABELS = [LABELS.get(name, -1) for name in CODES]  # by the code of a layout's image
 
 
 class Bounds(NamedTuple):
@@ -18,11 +20,13 @@ class Bounds(NamedTuple):
     Args:
         near, far: (N, P) normalised ranges where the ray of a cell enters and leaves a box; near > far if it meets
             none.
+        label: (N, P) int64 class of the object in the box, -1 = unknown.
         codes: (C,) bool, the classes that stand in boxes only.
     """
 
     near: Tensor
     far: Tensor
+    label: Tensor
     codes: Tensor
 
 
@@ -30,7 +34,7 @@ def bounds_of(layout: Tensor, columns: int, patch: tuple[int, int], codes: int, 
     """The bounds of the cells of N patches.
 
     Rays that meet no box have near = 1 and far = -1, and all rays of a blank image -1 and 1, since nothing is known of
-    them. A column that stands for several has what is in any of them.
+    them. A column that stands for several has what is in any of them, and the class of the nearest box.
 
     Args:
         layout: (B, 5, H, W) uint8, images of layouts.
@@ -43,11 +47,14 @@ def bounds_of(layout: Tensor, columns: int, patch: tuple[int, int], codes: int, 
     boxed, blank = code >= CODES["Car"], (code == 0).all(2).all(1)[:, None, None]
     near = torch.where(boxed, normalisation.encode(depth), 1.0).masked_fill(blank, -1.0)
     far = torch.where(boxed, normalisation.encode(depth + chord), -1.0).masked_fill(blank, 1.0)
+    labels = torch.tensor(_LABELS, device=layout.device)[code.long()]
     shape = (*near.shape[:2], columns, -1)
-    ranges = torch.stack([near.reshape(shape).amin(3), far.reshape(shape).amax(3)], 1)
+    near, nearest = near.reshape(shape).min(3)
+    labels = labels.reshape(shape).gather(3, nearest[..., None])[..., 0]
+    parts = torch.stack([near, far.reshape(shape).amax(3), labels.float()], 1)
     kinds = torch.isin(torch.arange(codes, device=layout.device), torch.tensor(BOXED, device=layout.device))
-    near, far = to_patches(ranges, patch).unbind(1)
-    return Bounds(near, far, kinds)
+    near, far, labels = to_patches(parts, patch).unbind(1)
+    return Bounds(near, far, labels.long(), kinds)
 
 
 def codes_of(labels: Tensor, columns: int, patch: tuple[int, int]) -> Tensor:

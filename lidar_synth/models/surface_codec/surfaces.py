@@ -113,7 +113,7 @@ class Surfaces(NamedTuple):
             noise: of the cells.
             normalisation: of the ranges.
             bounds: (N, P) where objects may be. A cell without a box shows another surface of its patch, or nothing;
-                ranges of objects are clipped to the box.
+                objects in a box have its class, and their ranges are clipped to it.
             codes: (N, P) int64 classes that are given, negative where they are not. A cell shows each surface with its
                 probability given the class.
         """
@@ -134,13 +134,16 @@ class Surfaces(NamedTuple):
         if codes is not None:
             own = self._of(codes).gather(1, chosen)[:, 0].exp().clamp_min(_SURE)  # above 0, for the signs of its bits
             likely, kind = torch.where(codes < 0, likely, own), torch.where(codes < 0, kind, codes)
+        if bounds is not None:
+            object_ = bounds.codes[kind.long()]
+            kind = torch.where(object_ & (bounds.label >= 0), bounds.label, kind)
         tables = torch.cat([noise.reflectance[:, None], noise.roughness[:, None], noise.relief], 1)
         alike, rough, *bumps = F.embedding(kind.long(), tables).unbind(2)
         values = ZeroInflatedLogistic(median, dull, blank).sample(_mixed(dim, alike, patch))
         error = rough * laplace_noise(near) + sum(a * b for a, b in zip(bumps, relief.unbind(1), strict=True))
         distance = normalised(distance, normalisation) + scale * error
         if bounds is not None:  # where no box is, far = -1: no return
-            distance = torch.where(bounds.codes[kind.long()], distance.clamp(bounds.near, bounds.far), distance)
+            distance = torch.where(object_, distance.clamp(bounds.near, bounds.far), distance)
         distance = torch.where(returned + torch.logit(back) > 0, distance, -1.0)
         return torch.stack([distance, values, kind, likely], 1)
 
