@@ -3,8 +3,6 @@
     python tools/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64] [--picture OUT.png]
 
     python tools/condition_card.py "student, 4 steps=town-semantic" "teacher, 50 steps=RUN/teacher.safetensors:50"
-    lidar-synth town unseen --seed 1 --scans 64 --interval 1 --layout kitti360          # camera models need images
-    python tools/condition_card.py "student, 4 steps=RUN/student.safetensors" --root unseen
 
 Every model gets the same noise and the conditions of the same real scans, from an unseen town or from ROOT. The first
 table measures how close the generated scans are as a set. The second one measures how well each agrees with the scan of
@@ -18,20 +16,22 @@ its own condition, and with another scan, half the set away:
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import REFERENCE, SEED, Comparison, Measured, shrink, table, town
+from model_card import REFERENCE, SEED, Comparison, Measured, needs_images, shrink, table, town, with_images
 from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from lidar_synth import Scan, load_generator, open_scans
+from lidar_synth import Scan, Town, load_generator, open_scans
 from lidar_synth.evaluate.conditions import AGREEMENTS
 from lidar_synth.evaluate.segmentation import Judge, load_judge
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.town import STRETCH_FRAMES
 from lidar_synth.viz import picture, render
 
 SHOWN = 8
@@ -93,7 +93,12 @@ def main() -> None:
     parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
     parser.add_argument("--picture", type=Path, help="PNG of the first model's scans; do not publish it for real data")
     given = parser.parse_args()
+    with TemporaryDirectory() as folder:
+        report(given, Path(folder))
 
+
+def report(given: argparse.Namespace, folder: Path) -> None:
+    """Print the tables; images of the town go to a folder."""
     judge = load_judge()
     if given.root:
         source = open_scans(given.root, split=given.split)
@@ -101,6 +106,8 @@ def main() -> None:
         real = [source[int(i)] for i in tqdm(chosen, desc=given.root, unit="scan")]
     else:
         real = town(REFERENCE, given.count)
+        if needs_images(given.models):
+            real = with_images(real, Town(REFERENCE, scans=given.count * STRETCH_FRAMES, interval=1.0), folder)
     comparison = Comparison(real, judge, given.intervals)
     sets: list[Measured] = []
     verdicts = []

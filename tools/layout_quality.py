@@ -4,19 +4,20 @@
                                    [--dump OUT.json] [--intervals 200]
 
 Layouts are those of scans of a town that no model was trained on, each from another stretch of road. The first row is
-the town's own scans: boxes are larger than objects, so that some of their rays return from behind. Unconditional and
-semantic models are compared by the distances alone, on the same scans.
+the town's own scans: boxes are larger than objects, so that some of their rays return from behind. Other models
+are compared by the distances alone, with the labels or images of the same scans as conditions.
 """
 
 import argparse
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import SEED, Comparison, Measured, shrink, table
+from model_card import SEED, Comparison, Measured, needs_images, shrink, table, with_images
 from tqdm import tqdm
 
 from lidar_synth import Scan, Town, layout_of, load_generator
@@ -75,10 +76,16 @@ def main() -> None:
     parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
     parser.add_argument("--dump", type=Path, help="JSON of the counts")
     given = parser.parse_args()
+    with TemporaryDirectory() as folder:
+        report(given, Path(folder))
 
+
+def report(given: argparse.Namespace, folder: Path) -> None:
+    """Print the tables; images of the town go to a folder."""
     town = Town(given.seed, "hdl64e_lasers", given.count * STRETCH_FRAMES, interval=2.0, motion=False)
     real = [town[i * STRETCH_FRAMES] for i in tqdm(range(given.count), desc="town", unit="scan")]
     layouts = [layout_of(scan) for scan in real]
+    real = with_images(real, town, folder) if needs_images(given.models) else real
     comparison = Comparison(real, load_judge(), given.intervals) if given.distances else None
     counts: dict[str, Any] = {"the town's own scans": layout_agreement(real, layouts, real)}
     distances: list[Measured] = []

@@ -113,6 +113,21 @@ def town(seed: int, count: int) -> list[Scan]:
     return [source[i * STRETCH_FRAMES] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")]
 
 
+def needs_images(models: Sequence[str]) -> bool:
+    """Whether one of the models NAME=MODEL[:STEPS] is conditioned on camera images."""
+    return any(load_generator(text.split("=", 1)[1].partition(":")[0]).condition == "camera" for text in models)
+
+
+def with_images(scans: Sequence[Scan], source: Town, folder: Path) -> list[Scan]:
+    """The first scan of each street of a town, with the image taken with it, which goes to a folder."""
+    found: list[Scan] = []
+    for i, scan in enumerate(tqdm(scans, desc="images", unit="image")):
+        path = folder / f"{i:06d}.png"
+        Image.fromarray(source.image(i * STRETCH_FRAMES)).save(path)
+        found.append(replace(scan, image_path=path))
+    return found
+
+
 class Measured(NamedTuple):
     """The figures of one set of scans.
 
