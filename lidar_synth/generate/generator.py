@@ -36,9 +36,8 @@ BATCH = {"cpu": 1, "cuda": 16}
 
 SHIPPED = {
     "town": "2d8d08119dc4a1c0002040ff47e66dea71bf87c7ae82d667c0ccfff15778202b",
-    "town-camera": "5d96b6af7d5479f45e8ece7120bc5cf0493e639d783c0725f5f87581a6a1dc78",
 }
-"""Hashes of the shipped checkpoints, whose older format has no checksum of the header."""
+"""Hashes of shipped checkpoints whose older format has no checksum of the header."""
 
 
 class SamplingOptions(TypedDict, total=False):
