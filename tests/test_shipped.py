@@ -4,12 +4,14 @@ import json
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch.utils.data import DataLoader
 
 from lidar_synth import MixedScans, RollingBank, SemanticKITTI, Source, Town, load_generator
@@ -18,12 +20,14 @@ from lidar_synth.bank.encoding import Encoding
 from lidar_synth.cli.bake import bake
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError
+from lidar_synth.evaluate.conditions import sight_agreement
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.generator import Generator, shipped_models
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.labels import POLICIES
 from lidar_synth.mixing import Generated
+from lidar_synth.town import STRETCH_FRAMES
 
 SCANS = 3
 FIELDS = ("reflectance", "label", "confidence")
@@ -49,6 +53,19 @@ def test_returns_of_a_label_map_have_its_labels(columns: int) -> None:
         assert same == 1 or (columns == 1024 and same > 0.9)  # a column that stands for two has the label of one
         near = np.abs(image.range - wanted.range)[known] < 0.05 * wanted.range[known]
         assert near.mean() > 0.5  # it stands where the map's scan stood, roughly
+
+
+@pytest.mark.slow
+def test_scans_follow_their_images(tmp_path: Path) -> None:
+    town, streets = Town(3, "hdl64e_lasers", 6 * STRETCH_FRAMES, motion=False), []
+    for i in range(0, len(town), STRETCH_FRAMES):
+        Image.fromarray(town.image(i)).save(path := tmp_path / f"{i}.png")
+        streets.append(replace(town[i], image_path=path))
+    generator = load_generator("town-camera")
+    made = [generator.scans(0, [0], scan, steps=2)[0] for scan in streets]  # the same noise for all
+    assert made[0].sensor == streets[0].sensor
+    own, other = (sight_agreement(made, some).value for some in (streets, [*streets[1:], streets[0]]))
+    assert own > other + 0.02
 
 
 @pytest.fixture(scope="module")
