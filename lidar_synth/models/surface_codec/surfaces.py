@@ -113,7 +113,8 @@ class Surfaces(NamedTuple):
             noise: of the cells.
             normalisation: of the ranges.
             bounds: (N, P) where objects may be. A cell without a box shows another surface of its patch, or nothing;
-                objects in a box have its class, and their ranges are clipped to it.
+                objects in a box have its class, with the probability of the class that they were drawn as, and their
+                ranges are clipped to it.
             codes: (N, P) int64 classes that are given, negative where they are not. A cell shows each surface with its
                 probability given the class.
         """
