@@ -263,7 +263,7 @@ def test_a_drawn_road_is_level_where_rays_start_above_the_origin(monkeypatch: py
     x, y, _ = scan.points.T
     removed = GROUND[scan.label] & (x > 6) & (x < 20) & (np.abs(y) < 0.15 * x)
     box = np.array([13, 0, -1, 10, 3, 2, 0], np.float32)
-    result = without(scan, [(removed, box)], SimpleNamespace(sensor=sensor), 0)
+    result = without(scan, [(removed, box)], SimpleNamespace(condition=None, sensor=sensor), 0)
     assert removed.sum() > 500 and np.allclose(result.points, scan.points, atol=1e-3)
 
 

@@ -64,13 +64,10 @@ def inpaint(
         >>> bool((drawn.range[~hole] == image.range[~hole]).all())
         True
     """
-    if generator.condition is not None:
-        raise ConfigError(f"{generator.name!r}, a model conditioned on {generator.condition!r}, to fill holes",
-                          "an unconditional model", "Use model='town', or no model.")  # fmt: skip
     if not 0 < start <= 1:
         raise ConfigError(f"start={start}", "a time in (0, 1]")
     for image in images:
-        check_grid(image.sensor, generator.sensor)
+        check_model(generator, image.sensor)
     drawn = []
     for first in range(0, len(images), generator.batch):
         part = slice(first, first + generator.batch)
@@ -78,12 +75,17 @@ def inpaint(
     return drawn
 
 
-def check_grid(given: Sensor, wanted: Sensor) -> None:
-    """Check that two sensors have one grid; names and range limits may differ.
+def check_model(generator: Generator, given: Sensor) -> None:
+    """Check that a model fills holes in scans of a sensor; names and range limits of sensors may differ.
 
     Raises:
+        ConfigError: on a conditional model.
         DataError: on different rows or columns.
     """
+    if generator.condition is not None:
+        raise ConfigError(f"{generator.name!r}, a model conditioned on {generator.condition!r}, to fill holes",
+                          "an unconditional model", "Use model='town', or no model.")  # fmt: skip
+    wanted = generator.sensor
     if given.shape != wanted.shape or not np.array_equal(given.edges, wanted.edges):
         raise DataError(
             f"a scan of sensor {given.name!r} ({given.shape[0]} x {given.shape[1]}) for a model of {wanted.name!r} "

@@ -64,11 +64,12 @@ def redrawn(
         start: see ``inpaint``; None = its default.
 
     Raises:
+        ConfigError: on a conditional model.
         DataError: on a scan of another sensor than the model's.
     """
-    from lidar_synth.generate.inpaint import START, check_grid, inpaint
+    from lidar_synth.generate.inpaint import START, check_model, inpaint
 
-    check_grid(kept.sensor, model.sensor)
+    check_model(model, kept.sensor)
     there = np.linalg.norm(filled.points, axis=1) > 0
     asked = np.where(there[:, None], filled.points, rays.points(which, np.full(len(which), FAR)))
     everything = locate(np.concatenate([kept.points, filled.points]).astype(np.float32), kept.sensor)
