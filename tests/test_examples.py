@@ -3,6 +3,7 @@
 import ast
 import doctest
 import re
+from functools import cache
 from pathlib import Path
 from pkgutil import resolve_name
 
@@ -50,8 +51,14 @@ def named_in(text: str) -> set[str]:
     blocks = re.findall(r"```python\n(.*?)```", text, re.S)
     spans = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.S))
     words = set(re.findall(r"(?<!\w)(?:[A-Z]\w+|\w+(?=\())", " ".join(blocks + spans)))
+    return words & definitions()
+
+
+@cache
+def definitions() -> set[str]:
+    """The names of all classes and functions of the package."""
     trees = [ast.parse(path.read_text()) for path in PACKAGE.rglob("*.py")]
-    return words & {node.name for t in trees for node in t.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
+    return {node.name for t in trees for node in t.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
 
 
 def example_of(name: str) -> doctest.DocTest:

@@ -4,8 +4,9 @@
                                         [--layout-model CHECKPOINT] [--minutes M] [--out TABLE.md]
 
 All arms have the same network, iterations, augmentation (turned, mirrored, scaled) and test. Half of each batch of an
-arm with synthetic scans is synthetic. Each seed has its own 30 scans of the town, the same in every arm. Scans and
-finished trainings are kept in WORK: the same command resumes. docs/research/detectors.md has the protocol.
+arm with synthetic scans is synthetic, unless its row says otherwise. Each seed has its own 30 scans of the town, the
+same in every arm. Scans and finished trainings are kept in WORK: the same command resumes. docs/research/detectors.md
+has the protocol.
 """
 
 import argparse
@@ -60,6 +61,7 @@ class Arm:
         labels: the label policy of these scans.
         pasted: whether objects of the 30 scans are pasted into all scans.
         first: whether the first three quarters of the training have synthetic scans alone.
+        share: of synthetic scans in a batch.
     """
 
     title: str
@@ -68,6 +70,7 @@ class Arm:
     labels: str = "boxes"
     pasted: bool = False
     first: bool = False
+    share: float = 0.5
 
 
 _MODEL = "the generator's: 6,000 scans of the town of seed 0 with point labels"
@@ -80,6 +83,7 @@ ARMS = {
     "closed": Arm("unconditional scans without unboxed objects, objects pasted", _MODEL, "closed", "mix"),
     "layout": Arm("layout scans", _LAYOUT, "layout"),
     "layout_gt": Arm("layout scans, GT sampling", _LAYOUT, "layout", pasted=True),
+    "layout_quarter": Arm("layout scans in a quarter, GT sampling", _LAYOUT, "layout", pasted=True, share=0.25),
     "layout_first": Arm("layout scans first, GT sampling", _LAYOUT, "layout", pasted=True, first=True),
     "town": Arm("town scans of the same layouts (upper bound)", _TOWN, "town"),
     "town_gt": Arm("town scans of the same layouts, GT sampling (upper bound)", _TOWN, "town", pasted=True),
@@ -143,7 +147,7 @@ def mixture(arm: Arm, labelled: Source, pool: Source | None, seed: int, count: i
     steps: list[Augmentation] = [partial(yaw, limit=45), flip_x, flip_y, scale]
     if arm.pasted:
         steps.insert(0, make_policy("mix", fields=frozenset({"label", "boxes"}), **options))
-    share = {0: 1.0, PHASES - 1: 0.5} if arm.first else 0.5
+    share = {0: 1.0, PHASES - 1: arm.share} if arm.first else arm.share
     return MixedScans(
         labelled, pool, share if pool is not None else 0, arm.labels,
         label_options=options if arm.labels == "mix" else None, seed=seed, balanced=True,
