@@ -2,12 +2,12 @@
 
 import re
 from collections.abc import Callable
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fuzzing.server import forkserver
 
 _STATUS = Path("/proc/self/status")
 
@@ -26,8 +26,7 @@ def in_limits(call: Callable[..., object], *arguments: Any, megabytes: int = 500
     Returns:
         ``""`` where it returned, ``"DataError: its message"`` where it raised, or how its process ended.
     """
-    context = get_context("forkserver")  # its server has no threads and the imports behind it: a process in 0.1 s
-    context.set_forkserver_preload(["lidar_synth.formats.convert", "lidar_synth.train.config", "hypothesis", "pytest"])
+    context = forkserver()
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_limited, args=(sender, megabytes, call, arguments), daemon=True)
     process.start()

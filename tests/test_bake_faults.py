@@ -47,6 +47,14 @@ def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     return files(plan.out)
 
 
+@pytest.fixture(scope="module")
+def sixty(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of the bank that ``start`` bakes, without interruption in this process."""
+    plan = plan_in(tmp_path_factory.mktemp("sixty") / "bank", model, count=60, shard_size=5)
+    bake(plan, progress=False)
+    return files(plan.out)
+
+
 def stop_after(plan: BakePlan, scans: int, stop: Callable[[], object]) -> None:
     """Bake in this process; call ``stop`` after this many scans."""
     made = 0
@@ -99,9 +107,7 @@ def wait_for_shards(process: subprocess.Popen[str], out: Path, count: int) -> No
 
 
 @pytest.mark.slow
-def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path) -> None:
-    reference = plan_in(tmp_path / "reference" / "bank", model, count=60, shard_size=5)
-    bake(reference, progress=False)
+def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path, sixty: dict[str, bytes]) -> None:
     out = tmp_path / "bank"
     process = start(out, model)
     wait_for_shards(process, out, 2)
@@ -116,7 +122,7 @@ def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path) -> None:
     assert f"stopped; finished shards are kept in {out}, the same command resumes" in errors
     assert "Traceback" not in errors
     bake(plan_in(out, model, count=60, shard_size=5), progress=False)
-    assert files(out) == files(reference.out)
+    assert files(out) == sixty
 
 
 @pytest.mark.slow
@@ -190,15 +196,15 @@ SHARES = {"all": [()] * 3, "shares": [("--shard-index", str(k), "--num-shards", 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shares", ["all", pytest.param("shares", marks=pytest.mark.slow)])
-def test_three_concurrent_bakes_write_the_same_bytes(model: Path, tmp_path: Path, shares: str) -> None:
+def test_three_concurrent_bakes_write_the_same_bytes(
+    model: Path, tmp_path: Path, sixty: dict[str, bytes], shares: str
+) -> None:
     """Three processes; none removes a file that another one is writing."""
-    reference = plan_in(tmp_path / "reference" / "bank", model, count=60, shard_size=5)
-    bake(reference, progress=False)
     out = tmp_path / "bank"
     processes = [start(out, model, *options) for options in SHARES[shares]]
     ended = [(process.communicate()[1], process.returncode) for process in processes]
     assert [code for _, code in ended] == [0, 0, 0], ended
-    assert files(out) == files(reference.out)
+    assert files(out) == sixty
 
 
 @pytest.mark.slow

@@ -5,12 +5,12 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from fuzzing.server import forkserver
 from fuzzing.targets import Target
 from fuzzing.worker import DIED, FOREIGN, MEMORY, SLOW, UNSOUND, Limits, Outcome, work
 
@@ -116,9 +116,7 @@ def _start(
     name: str, target: Target, numbers: range, seed: int, limits: Limits, folder: Path
 ) -> tuple[BaseProcess, Connection]:
     """A worker and the end of the pipe on which it tells what it does."""
-    context = get_context("forkserver")
-    # A fork of a process that has imported all of it starts at once, and shares nothing with a case that went wrong.
-    context.set_forkserver_preload(["lidar_synth.generate.checkpoint", "lidar_synth.formats", "h5py", "numba", "yaml"])
+    context = forkserver()
     with _starting:
         ours, theirs = context.Pipe(duplex=False)
         process = context.Process(target=work, args=(name, target, seed, numbers, limits, folder, theirs), daemon=True)
