@@ -65,7 +65,7 @@ def first_hits(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upri
     lasers = rays.slope, rays.height, rays.first, rays.step
     solid, vertex = np.full(shape, np.inf), np.zeros(shape, np.int32)
     mean, facing = np.zeros(shape), np.ones(shape)
-    hit_triangles(points, azimuth, rho, rows, value, triangles, *lasers, solid, vertex, mean, facing)
+    hit_triangles(points, azimuth, rho, rows, value, triangles, *lasers, rays.directions, solid, vertex, mean, facing)
     patch, of = np.full(shape, np.inf), np.zeros(shape, np.int32)
     rim = surfaces.rim & there & (rho > 0.05)
     recorded = np.linalg.norm(scan.points[rim], axis=1)

@@ -77,6 +77,15 @@ def _joined(points, key, ground, level, i, j, across):  # type: ignore[no-untype
     return np.sqrt(cx * cx + cy * cy + cz * cz) >= least * (far - (xi * xj + yi * yj + zi * zj))
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _around(azimuth, start, i, count):  # type: ignore[no-untyped-def]
+    """Return ``i`` of a ring that begins at ``start``, which may be past its end, and its azimuth, radians."""
+    if i < count:
+        return start + i, azimuth[start + i]
+    i = start + (i - count if i < 2 * count else i % count)
+    return i, azimuth[i] + 2 * np.pi
+
+
 @numba.njit(cache=True, nogil=True)
 def triangulate(rings, starts, azimuth, points, key, ground, level, below, step, bridge):  # type: ignore[no-untyped-def]
     """Join neighbouring rings by triangles.
@@ -113,16 +122,16 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
                 continue
             i = j = 0
             while i < n or j < m:
-                a, b = a0 + i % n, b0 + j % m
-                at_a, at_b = azimuth[a] + (2 * np.pi if i == n else 0.0), azimuth[b] + (2 * np.pi if j == m else 0.0)
-                to_a = azimuth[a0 + (i + 1) % n] + (2 * np.pi if i + 1 >= n else 0.0)
-                to_b = azimuth[b0 + (j + 1) % m] + (2 * np.pi if j + 1 >= m else 0.0)
+                a, at_a = _around(azimuth, a0, i, n)
+                b, at_b = _around(azimuth, b0, j, m)
+                next_a, to_a = _around(azimuth, a0, i + 1, n)
+                next_b, to_b = _around(azimuth, b0, j + 1, m)
                 upper = i < n and (j == m or to_a <= to_b)  # the next return of the upper ring comes first
                 if upper:
-                    c, before, other, gap, across = a0 + (i + 1) % n, a, b, to_a - at_a, to_a - at_b
+                    c, before, other, gap, across = next_a, a, b, to_a - at_a, to_a - at_b
                     i += 1
                 else:
-                    c, before, other, gap, across = b0 + (j + 1) % m, b, a, to_b - at_b, to_b - at_a
+                    c, before, other, gap, across = next_b, b, a, to_b - at_b, to_b - at_a
                     j += 1
                 if further == 2 and (0 <= below[a] < b0 or (upper and 0 <= below[c] < b0)):
                     continue  # the ring between has a return
@@ -160,8 +169,10 @@ def _above(rho, z, slope, height):  # type: ignore[no-untyped-def]
     return low
 
 
-@numba.njit(cache=True, nogil=True)
-def hit_triangles(points, azimuth, rho, rows, value, triangles, slope, height, first, step, out, vertex, mean, facing):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def hit_triangles(
+    points, azimuth, rho, rows, value, triangles, slope, height, first, step, table, out, vertex, mean, facing
+):  # type: ignore[no-untyped-def]
     """Find the first triangle that each ray hits.
 
     Args:
@@ -169,12 +180,13 @@ def hit_triangles(points, azimuth, rho, rows, value, triangles, slope, height, f
         value: (N,) is interpolated.
         triangles: (T, 3).
         slope, height, first, step: of ``Rays``.
+        table: (H, F, 2) x and y of the rays' directions, or empty.
         out: (H, F) rho of the hit, metres; inf = none. Nearer hits replace what is there.
         vertex: (H, F) the nearest corner of the triangle.
         mean: (H, F) the interpolated value.
         facing: (H, F) cosine of the angle between the ray and the normal.
     """
-    firings = out.shape[1]
+    firings, known = out.shape[1], table.shape[1]
     end, weight = np.zeros((2, 6)), np.zeros(3)  # of each end of the segment: x, y, azimuth, weights of the corners
     for t in range(len(triangles)):
         corner = triangles[t]
@@ -204,7 +216,10 @@ def hit_triangles(points, azimuth, rho, rows, value, triangles, slope, height, f
                 continue
             f = int(np.ceil((low - first[r]) / step))
             while first[r] + f * step < high:
-                dx, dy = np.cos(first[r] + f * step), -np.sin(first[r] + f * step)
+                if 0 <= f < known:
+                    dx, dy = table[r, f, 0], table[r, f, 1]
+                else:
+                    dx, dy = np.cos(first[r] + f * step), -np.sin(first[r] + f * step)
                 side0, side1 = end[0, 0] * dy - end[0, 1] * dx, end[1, 0] * dy - end[1, 1] * dx
                 s = min(max(side0 / (side0 - side1), 0.0), 1.0) if side0 != side1 else 0.0
                 x, y = end[0, 0] + s * (end[1, 0] - end[0, 0]), end[0, 1] + s * (end[1, 1] - end[0, 1])

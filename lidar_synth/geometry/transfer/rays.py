@@ -18,6 +18,8 @@ class Rays(NamedTuple):
         first: (H,) radians, clockwise.
         step: radians.
         firings: F.
+        directions: (H, F, 2) x and y of each ray's direction, per unit of horizontal distance; empty = computed when
+            needed.
     """
 
     slope: NDArray[np.float64]
@@ -25,6 +27,7 @@ class Rays(NamedTuple):
     first: NDArray[np.float64]
     step: float
     firings: int
+    directions: NDArray[np.float64] = np.empty((0, 0, 2))
 
 
 @lru_cache(maxsize=16)
@@ -33,4 +36,8 @@ def rays_of(sensor: Sensor) -> Rays:
     elevation, height = sensor.optics()
     azimuth = sensor.firing_azimuths()
     count = azimuth.shape[1]
-    return Rays(np.tan(elevation), height, azimuth[:, 0].copy(), 2 * np.pi / count, count)
+    first = azimuth[:, 0].copy()
+    step = 2 * np.pi / count
+    turned = first[:, None] + np.arange(count) * step
+    directions = np.stack([np.cos(turned), -np.sin(turned)], -1)
+    return Rays(np.tan(elevation), height, first, step, count, directions)
