@@ -59,6 +59,33 @@ def test_a_bank_with_a_stray_array_is_read(bank: ObjectBank, tmp_path: Path) -> 
     assert len(ObjectBank.load(tmp_path / "objects.npz")) == len(bank)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("points", np.inf),
+        ("points", 1e30),
+        ("ground", np.nan),
+        ("reflectance", -5),
+        ("label", 19),
+        ("box_values", 1e30),
+    ],
+)
+def test_a_bank_with_values_that_no_scan_may_hold_is_refused(
+    bank: ObjectBank, tmp_path: Path, name: str, value: float
+) -> None:
+    bank.save(tmp_path / "objects.npz")
+    arrays = dict(np.load(tmp_path / "objects.npz"))
+    arrays[name].flat[3] = value
+    np.savez(tmp_path / "objects.npz", **arrays)
+    with pytest.raises(DataError, match=r"objects\.npz.*a bank of objects"):
+        ObjectBank.load(tmp_path / "objects.npz")
+
+
+def test_a_bank_of_other_types_is_refused(bank: ObjectBank) -> None:
+    with pytest.raises(DataError, match="float64"):
+        replace(bank, reflectance=bank.reflectance.astype(np.float64))
+
+
 def test_a_bank_survives_the_disk(bank: ObjectBank, tmp_path: Path) -> None:
     bank.save(tmp_path / "objects.npz")
     again = ObjectBank.load(tmp_path / "objects.npz")

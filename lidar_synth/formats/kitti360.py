@@ -33,7 +33,7 @@ from lidar_synth.datasets.recordings import KITTI360_SPLITS
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import list_files, read_file, read_values
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES, WorldBoxes, read_boxes, write_boxes
+from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES, MOST_INSTANCE, WorldBoxes, read_boxes, write_boxes
 from lidar_synth.formats.kitti360_poses import CAMERA, read_calibration, read_poses, write_calibration, write_poses
 from lidar_synth.formats.point_labels import decode_labels, encode_labels, mismatch, write_labels
 from lidar_synth.formats.points import read_points
@@ -205,7 +205,14 @@ def label_values(scan: Scan) -> NDArray[np.uint32]:
 
 
 def _facts(scan: Scan) -> dict[str, Any]:
+    """The note of a scan.
+
+    Raises:
+        DataError: on an instance of a box that the file cannot hold.
+    """
     boxes, pose = scan.boxes, scan.pose
+    if boxes is not None and boxes.instance.max(initial=0) > MOST_INSTANCE:
+        raise DataError(f"scan {scan.id!r}: a box of instance {boxes.instance.max()}", f"at most {MOST_INSTANCE}")
     if boxes is not None and pose is None:
         pose = np.eye(4)
     return {

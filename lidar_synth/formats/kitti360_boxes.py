@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import numbers, unreadable, write_file
-from lidar_synth.formats.points import FARTHEST
-from lidar_synth.geometry.scan import Boxes
+from lidar_synth.geometry.scan import FARTHEST, Boxes
 
 MARGIN = 100
 """Maximum distance in frames (about 80 m) from an object's window at which the object is listed."""
@@ -47,6 +46,9 @@ BY_NAME = {
 
 MAX_INSTANCES = 1000
 """A ``Boxes``' instance is id * 1000 + instanceId, as in the dataset's label images and tools."""
+
+MOST_INSTANCE = (1 << 31) - 1 - 100 * MAX_INSTANCES
+"""Maximum instance of a box to write: the reader adds its class to it."""
 
 CUBE = np.array(
     [(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, -1), (-1, 1, 1), (-1, -1, -1), (-1, -1, 1)], np.float64
@@ -154,19 +156,19 @@ def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64
 
     Raises:
         FileError: if it cannot be read or written.
-        DataError: if the existing file is not XML.
+        DataError: if the existing file is not XML, or a timestamp in it is no frame.
     """
-    root = ElementTree.Element("opencv_storage")
+    root, kept = ElementTree.Element("opencv_storage"), []
     if path.is_file():
         try:
             root = ElementTree.parse(path).getroot()
+            kept = [node for node in root if int(node.findtext("timestamp") or -1) not in frames]
         except OSError as error:
             raise unreadable(path, error) from error
-        except ElementTree.ParseError as error:
+        except (ElementTree.ParseError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
             raise DataError(
                 f"{path}: {error}", "KITTI-360's data_3d_bboxes", "Remove it to write a new one."
             ) from error
-    kept = [node for node in root if int(node.findtext("timestamp") or -1) not in frames]
     objects = [node for frame, (boxes, pose) in sorted(frames.items()) for node in _objects(frame, boxes, pose)]
     root[:] = [*kept, *objects]
     for index, node in enumerate(root):

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.points import FARTHEST
-from lidar_synth.geometry.scan import Boxes
+from lidar_synth.geometry.scan import FARTHEST, Boxes
 
 
 def read_label_2(path: Path, camera: Calibration) -> Boxes:
@@ -25,7 +24,16 @@ def read_label_2(path: Path, camera: Calibration) -> Boxes:
         FileError: if it cannot be read.
         DataError: on a line without 15 fields (16 with a score), or a value that no label has.
     """
-    rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
+    return decode_label_2(read_text(path), path, camera)
+
+
+def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
+    """``read_label_2`` for the text of the file ``path``.
+
+    Raises:
+        DataError: as ``read_label_2``.
+    """
+    rows = [line.split() for line in text.splitlines() if line.strip()]
     bad = [row for row in rows if len(row) not in (15, 16)]
     if bad:
         raise DataError(f"{path}: a line with {len(bad[0])} fields", "15 fields: a name and 14 numbers")
@@ -101,19 +109,24 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
 
     Raises:
         FileError: if it cannot be written.
+        DataError: on a name of several words, or a value that readers refuse.
     """
     image_box, truncation = _in_image(boxes, camera)
     floor, size, rotation_y = boxes_to_camera(boxes.values, camera)
     seen = floor - camera.camera_from_sensor[:3, 3]
     alpha = np.where(boxes.alpha > -10, boxes.alpha, _wrap(rotation_y - np.arctan2(seen[:, 0], seen[:, 2])))
     lines = []
-    for i in np.flatnonzero((image_box >= 0).all(axis=1)):
+    listed = np.flatnonzero((image_box >= 0).all(axis=1))
+    for i in listed:
         occlusion = boxes.occlusion[i] if boxes.occlusion[i] >= 0 else 3
         row = (alpha[i], *image_box[i], *size[i], *floor[i], rotation_y[i])
         lines.append(f"{boxes.names[i]} {_two(truncation[i])} {occlusion} {' '.join(map(_two, row))}")
     for rectangle in boxes.dont_care:
         lines.append(f"DontCare -1 -1 -10 {' '.join(map(_two, rectangle))} -1 -1 -1 -1000 -1000 -1000 -10")
-    write_file(path, "".join(line + "\n" for line in lines).encode())
+    text, names = "".join(line + "\n" for line in lines), tuple(boxes.names[i] for i in listed)
+    if decode_label_2(text, path, camera).names != names:
+        raise DataError(f"{path}: boxes called {sorted(set(names))}", "names of one word, such as Person_sitting")
+    write_file(path, text.encode())
 
 
 def _in_image(boxes: Boxes, camera: Calibration) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

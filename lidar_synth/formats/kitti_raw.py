@@ -20,9 +20,9 @@ import numpy as np
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import list_files, naming, png_size, read_file, read_named_matrices
 from lidar_synth.formats.calibration import Calibration, homogeneous, read_image_size
-from lidar_synth.formats.points import FARTHEST, read_points
+from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 DRIVES = "*_drive_*/velodyne_points/data"

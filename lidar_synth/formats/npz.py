@@ -64,7 +64,8 @@ def stored(arrays: Mapping[str, NDArray[Any]], where: Path | str) -> dict[str, N
         wanted = np.dtype(TYPES.get(name, values.dtype))
         if values.dtype.kind not in "biuf":
             raise DataError(f"{where}: {name} is {values.dtype}", "numbers")
-        cast = np.ascontiguousarray(values, wanted)
+        with np.errstate(all="ignore"):  # what overflows is refused below, or by ``check_scan``
+            cast = np.ascontiguousarray(values, wanted)
         if wanted.kind in "iu" and not np.array_equal(cast, values):
             outside = values[cast != values].flat[0]
             raise DataError(f"{where}: {name} holds {outside}", f"whole numbers that {wanted} can hold")

@@ -27,8 +27,8 @@ from lidar_synth.formats.description import check_provenance
 from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import Picture, Writer
-from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.formats.writer import Picture, Writer, projected
+from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
@@ -124,7 +124,7 @@ class PNGWriter(Writer):
         return f"range/{(name or f'{index:06d}').replace('/', '_')}.png"
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
-        image = project(scan)
+        image = projected(scan)
         scale = image.sensor.range_max / STEPS
         facts = {"scale": scale, "sensor": image.sensor.to_dict(), "id": scan.id, "domain": scan.domain}
         facts |= {"provenance": dict(scan.provenance)} if scan.provenance else {}

@@ -15,10 +15,10 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import SKIP_HINT, unreadable, write_file
 from lidar_synth.formats.calibration import check_rigid
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import FARTHEST, Scan
 
-FARTHEST = 1e5
-"""Maximum coordinate, metres; no LiDAR measures farther."""
+LONGEST = 60.0
+"""Maximum time of a point from the moment of its scan's pose, seconds."""
 
 _bad_points_kept = ContextVar("bad points kept", default=False)
 
@@ -138,17 +138,22 @@ def bad_points_kept() -> Iterator[None]:
 
 
 def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
-    """Check the points of a scan, and its labels, confidence and pose.
+    """Check the points of a scan, and its labels, confidence, times and pose.
 
     Raises:
-        DataError: as ``check_points``; on labels that are not train ids, a confidence outside [0, 1], and a pose that
-            is not rigid.
+        DataError: as ``check_points``; on labels that are not train ids, a confidence outside [0, 1], times beyond
+            ``LONGEST``, and a pose that is not rigid.
     """
     check_points(scan.points, scan.reflectance, where, reflectance_max)
     if scan.label is not None and ((scan.label >= len(NAMES)) & (scan.label != IGNORE)).any():
         raise DataError(f"{where}: labels {np.unique(scan.label)[-8:].tolist()}", "train ids 0..18, or 255 = ignore")
     if scan.confidence is not None and not ((scan.confidence >= 0) & (scan.confidence <= 1)).all():
         raise DataError(f"{where}: confidence from {scan.confidence.min()} to {scan.confidence.max()}", "0 to 1")
+    if scan.time is not None and not (np.abs(scan.time[finite(scan.points, scan.reflectance)]) <= LONGEST).all():
+        raise DataError(
+            f"{where}: times from {scan.time.min():g} to {scan.time.max():g}",
+            f"seconds from the moment of the pose, within {LONGEST:g}",
+        )
     if scan.pose is not None:
         check_rigid(scan.pose, f"{where}: its pose")
 

@@ -30,8 +30,8 @@ from lidar_synth.formats.npz import (
 from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
-from lidar_synth.formats.writer import FileWriter, Picture
-from lidar_synth.geometry.projection import project, unproject
+from lidar_synth.formats.writer import FileWriter, Picture, projected
+from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
@@ -191,4 +191,4 @@ class RangeWriter(FileWriter):
     suffix = ".npz"
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
-        write_range_image(path, project(scan), scan)
+        write_range_image(path, projected(scan), scan)

@@ -33,7 +33,7 @@ from lidar_synth.errors import ConfigError, DataError, shorten
 from lidar_synth.files.disk import SKIP_HINT, list_files, unreadable, write_file
 from lidar_synth.files.parsing import parse_json, parse_npy
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.npz import decode_scan, stored
+from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import NOTES, Picture, Writer, clear_notes
@@ -137,7 +137,7 @@ def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
     facts |= {"provenance": dict(scan.provenance)} if scan.provenance else {}
     facts |= {} if scan.pose is None else {"pose": scan.pose.tolist()}
     facts |= {} if scan.boxes is None else {"names": list(scan.boxes.names)}
-    fields = stored({"label": np.full(len(scan), IGNORE, np.uint8)} | scan.fields(), f"scan {key!r}")
+    fields = {"label": np.full(len(scan), IGNORE, np.uint8)} | scan.fields()
     points = np.column_stack([scan.points, fields.pop("reflectance")]).astype(np.float32)
     arrays = {"points": points, **fields}
     arrays |= {} if scan.boxes is None else {"boxes": scan.boxes.values}

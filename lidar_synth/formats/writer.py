@@ -10,6 +10,7 @@ import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,20 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import inside, list_files, read_file, read_text, refuse_links, write_file
 from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.description import NAME, Description, Origin, read_description, record, require_grid
-from lidar_synth.formats.points import write_points
+from lidar_synth.formats.description import (
+    NAME,
+    Description,
+    Origin,
+    check_provenance,
+    read_description,
+    record,
+    require_grid,
+)
+from lidar_synth.formats.npz import check_pose, stored
+from lidar_synth.formats.points import check_scan, write_points
 from lidar_synth.formats.source import ScanFiles
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 Image = NDArray[np.uint8]
@@ -95,9 +106,14 @@ class Writer(ABC):
         Raises:
             ConfigError: if the folder holds scans on another grid.
             FileError: if the folder cannot be written or the disk is full.
-            DataError: on a scan that the layout cannot represent.
+            DataError: on a scan that a reader would refuse, or that the layout cannot represent.
         """
         self.require_grid(scan.sensor)
+        where = f"scan {scan.id!r}"
+        check_facts(scan, where)
+        typed: dict[str, Any] = stored({"points": scan.points, **scan.fields()}, where)
+        scan = replace(scan, **typed)
+        check_scan(scan, where)
         picture = scan.image_path if image is None else image
         self._put(scan, self.path(index, name), picture, calibration or self.calibration)
 
@@ -150,6 +166,35 @@ class FileWriter(Writer):
 
     def _place(self, index: int, name: str | None) -> str:
         return f"{name or f'{index:06d}'}{self.suffix}"
+
+
+def check_facts(scan: Scan, where: str) -> None:
+    """Refuse a domain, provenance or pose that readers refuse.
+
+    Raises:
+        DataError: on one.
+    """
+    try:
+        check_provenance(dict(scan.provenance))
+        if scan.pose is not None:
+            check_pose(scan.pose)
+        if scan.domain not in (REAL, SYNTHETIC):
+            raise ValueError(f"domain is {scan.domain}, not {REAL} (real) or {SYNTHETIC} (synthetic)")
+    except ValueError as error:
+        raise DataError(f"{where}: {error}", "what files can hold") from error
+
+
+def projected(scan: Scan) -> RangeImage:
+    """The scan on its sensor's grid.
+
+    Raises:
+        DataError: if none of its points lies on the grid.
+    """
+    image = project(scan)
+    if not image.mask.any():
+        given = f"scan {scan.id!r}: none of its {len(scan)} points"
+        raise DataError(given, f"points in the view and range of sensor {scan.sensor.name!r}")
+    return image
 
 
 def write_image(path: Path, picture: Picture) -> None:

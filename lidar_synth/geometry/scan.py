@@ -17,6 +17,9 @@ from lidar_synth.geometry.sensor import Sensor
 REAL, SYNTHETIC = 0, 1
 """Values of ``Scan.domain``."""
 
+FARTHEST = 1e5
+"""Maximum coordinate, and size of a box, metres; no LiDAR measures farther."""
+
 
 @dataclass
 class Boxes:
@@ -35,7 +38,8 @@ class Boxes:
         dont_care: (K, 4) float32 image rectangles of KITTI's ``DontCare`` regions, which have no box.
 
     Raises:
-        DataError: on shapes that do not match each other, non-finite values or sizes that are not positive.
+        DataError: on shapes that do not match each other, non-finite values, sizes that are not positive, or values
+            beyond ``FARTHEST``.
 
     Example:
         >>> import numpy as np
@@ -77,6 +81,8 @@ class Boxes:
         known = (self.values, self.truncation, self.image_box, self.alpha, self.dont_care)
         if not all(np.isfinite(values).all() for values in known) or (self.values[:, 3:6] <= 0).any():
             raise DataError("boxes with a non-finite value or a size that is not positive", "metres and radians")
+        if (np.abs(self.values) > FARTHEST).any():
+            raise DataError(f"boxes with a value of {np.abs(self.values).max():g}", f"metres within {FARTHEST:g}")
 
     def __len__(self) -> int:
         return len(self.values)

@@ -23,10 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
-from lidar_synth.geometry.scan import Boxes, Scan, Source
+from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import joined
 from lidar_synth.labels.objects import Object, objects_of
@@ -42,7 +43,7 @@ class ObjectBank:
     """Objects cut out of many scans; the module's docstring describes the arrays.
 
     Raises:
-        DataError: on shapes that do not match each other.
+        DataError: on shapes that do not match each other, other types, and values that no scan may hold.
 
     Example:
         >>> from lidar_synth import ObjectBank, Town
@@ -81,6 +82,19 @@ class ObjectBank:
         }.items():
             if getattr(self, name).shape != (size,):
                 raise DataError(f"objects: {name} has shape {getattr(self, name).shape}", f"({size},)")
+        self._check_values()
+
+    def _check_values(self) -> None:
+        types = {"start": "i8", "number": "i4", "ground": "f4", "points": "f4", "reflectance": "f4", "label": "u1"}
+        if wrong := {n: str(getattr(self, n).dtype) for n, kind in types.items() if getattr(self, n).dtype != kind}:
+            raise DataError(f"objects: {wrong}", f"{types}")
+        for name in ("ground", "points"):
+            if not (np.abs(getattr(self, name)) <= FARTHEST).all():  # NaN is not
+                raise DataError(f"objects: {name} not finite, or too large", f"metres within {FARTHEST:g}")
+        if not ((self.reflectance >= 0) & (self.reflectance <= 1)).all():
+            raise DataError(f"objects: reflectance {self.reflectance.min()} to {self.reflectance.max()}", "0 to 1")
+        if ((self.label >= len(NAMES)) & (self.label != IGNORE)).any():
+            raise DataError(f"objects: labels up to {self.label.max()}", "train ids 0..18, or 255 = ignore")
 
     @classmethod
     def from_scans(cls, source: Source, scans: Iterable[int] | None = None, least: int = 5) -> "ObjectBank":
@@ -118,8 +132,8 @@ class ObjectBank:
             number=np.array([n for n, _ in objects], np.int32),
             ground=np.array([o.ground for _, o in objects], np.float32),
             start=np.cumsum([0, *map(len, parts)], dtype=np.int64),
-            points=np.concatenate([o.scan.points - o.box[:3] for _, o in objects]),
-            reflectance=np.concatenate([p.reflectance for p in parts]),
+            points=np.concatenate([o.scan.points - o.box[:3] for _, o in objects]).astype(np.float32),
+            reflectance=np.concatenate([p.reflectance for p in parts]).astype(np.float32),
             label=np.concatenate([p.fields()["label"] for p in parts]),
         )
 

@@ -11,13 +11,13 @@ import torch
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.formats import Calibration
-from lidar_synth.formats.points import FARTHEST
 from lidar_synth.generate.checkpoint import Checkpoint, Header
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, RangeImage, Scan
+from lidar_synth.geometry.scan import FARTHEST, REAL, SYNTHETIC, Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 FIELD_TYPES = {
     "reflectance": "f4", "label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2", "confidence": "f4",
+    "time": "f4",
 }  # fmt: skip
 
 BOX_TYPES = {
