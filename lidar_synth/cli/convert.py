@@ -51,6 +51,7 @@ OnBad = Annotated[
         "and infinite points"
     ),
 ]
+Strict = Annotated[bool, typer.Option("--strict", help="stop at a scan with something that the format cannot hold")]
 Jobs = Annotated[int, typer.Option(help="number of worker processes")]
 
 
@@ -71,6 +72,7 @@ def convert(
     fields: Fields = None,
     reflectance_max: ReflectanceMax = None,
     on_bad: OnBad = "error",
+    strict: Strict = False,
     jobs: Jobs = 1,
 ) -> None:
     """Converts scans from one format to another. Run it again to resume an interrupted conversion.
@@ -97,11 +99,12 @@ def convert(
     given = {"layout": layout, "split": split, "fields": fields, "reflectance_max": reflectance_max}
     scans = open_scans(source, sensor=sensor, on_bad=on_bad, **given)  # type: ignore[arg-type]
     change = _change(scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach)
-    report = run(scans, writer, jobs=jobs, on_bad=on_bad, as_sensor=change, unfold=unfold)  # type: ignore[arg-type]
-    _print(report, out, as_sensor)
+    how: dict[str, Any] = {"jobs": jobs, "on_bad": on_bad, "unfold": unfold, "strict": strict}
+    report = run(scans, writer, as_sensor=change, **how)
+    _print(report, out, to, as_sensor)
 
 
-def _print(report: "Report", out: Path, as_sensor: str | None) -> None:
+def _print(report: "Report", out: Path, to: str, as_sensor: str | None) -> None:
     """What was written, and on standard error what was not."""
     print(f"{out}: {report.written} scans written, {report.kept} were there already, {len(report.skipped)} skipped")
     if report.seen:
@@ -110,6 +113,10 @@ def _print(report: "Report", out: Path, as_sensor: str | None) -> None:
         print(f"  skipped {name}: {reason}", file=sys.stderr)
     for name, count in report.dropped.items():
         print(f"  dropped {count} points of {name}, which are NaN or infinite", file=sys.stderr)
+    for name, count in report.lost.items():
+        print(f"  dropped {name} of {count} scans, which {to} cannot hold", file=sys.stderr)
+    if report.unlabelled:
+        print(f"  labels of {report.unlabelled} scans are unknown: written as 0, unlabelled", file=sys.stderr)
     for what in report.left_out:
         print(f"  left out {what}", file=sys.stderr)
 

@@ -9,6 +9,9 @@ from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.transfer import Mount, Transfer, Transferred
 from lidar_synth.noise import keyed_rng
 
+_SURFACE = 0.1  # metres that returns stick out of their box
+_FLOOR = 0.1  # metres above a box's bottom, below which a return is the road's
+
 
 @dataclass(frozen=True)
 class AsSensor:
@@ -33,11 +36,17 @@ class AsSensor:
     def cast(self, scan: Scan, source: Source, index: int) -> Transferred:
         """The scan at ``index`` of a source, which has been read; its noise depends on the index.
 
+        Boxes in which the other sensor has no return are left out.
+
         Raises:
             DataError, FileError: as ``Transfer.cast``; also if a neighbouring sweep cannot be read.
         """
         others = [source.load(i) if isinstance(source, ScanFiles) else source[i] for i in self._around(source, index)]
-        return self.transfer.cast(scan, keyed_rng(0, index), others)
+        cast, seen = self.transfer.cast(scan, keyed_rng(0, index), others)
+        if cast.boxes is not None:
+            held = cast.boxes.enlarged(_SURFACE).contain(cast.points, above_floor=_FLOOR + _SURFACE)
+            cast.boxes = cast.boxes[held.any(axis=1)]
+        return Transferred(cast, seen)
 
     def _around(self, source: Source, index: int) -> list[int]:
         """The scans of the same sequence around a scan, without it."""

@@ -7,6 +7,7 @@ of the whole folder at the end.
 
 import os
 import signal
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -49,6 +50,8 @@ class Report:
         dropped: {id: number} of points that were dropped because they are NaN or infinite.
         left_out: descriptions of files that the format supports but the source does not have.
         seen: for each scan that another sensor saw, the share of its rays within the first sensor's field of view.
+        lost: {field: number of written scans that had it, though the format cannot hold it}.
+        unlabelled: number of written scans without labels, where the format has labels of every scan.
     """
 
     written: int = 0
@@ -57,6 +60,8 @@ class Report:
     dropped: dict[str, int] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list, compare=False)
     seen: list[float] = field(default_factory=list, compare=False)
+    lost: Counter[str] = field(default_factory=Counter, compare=False)
+    unlabelled: int = field(default=0, compare=False)
 
 
 class Outcome(NamedTuple):
@@ -68,6 +73,8 @@ class Outcome(NamedTuple):
         dropped: number of points that were dropped.
         origin: where the scan comes from; None if it was not written.
         seen: as in ``Report``; None without another sensor.
+        lost: names of what the scan had, though the format cannot hold it.
+        unlabelled: whether it got labels of 0 because its labels are unknown.
     """
 
     number: int
@@ -75,6 +82,8 @@ class Outcome(NamedTuple):
     dropped: int = 0
     origin: Origin | None = None
     seen: float | None = None
+    lost: tuple[str, ...] = ()
+    unlabelled: bool = False
 
 
 def convert(
@@ -85,6 +94,7 @@ def convert(
     on_bad: OnBad = "error",
     as_sensor: AsSensor | Transfer | Sensor | None = None,
     unfold: bool = False,
+    strict: bool = False,
     progress: bool = True,
 ) -> Report:
     """Write every scan of a source; a rerun resumes an interrupted conversion.
@@ -98,6 +108,7 @@ def convert(
             stops at any other fault.
         as_sensor: turn every scan into one of this sensor first (``geometry.transfer``).
         unfold: unfold every scan to a grid with one row per laser (``projection.unfold``).
+        strict: refuse a scan with something that the format cannot hold, such as boxes, instead of counting it.
         progress: whether to show a progress bar.
 
     Returns:
@@ -105,7 +116,7 @@ def convert(
 
     Raises:
         ConfigError: on fewer than one job, an output folder with the scans of another conversion or sensor, or a source
-            whose points are not those of its sensor.
+            whose points are not those of its sensor; with ``strict``, on a scan that would lose something.
         FileError: if the output cannot be written, for any ``on_bad``.
         DataError: on a bad scan, unless ``on_bad="skip"``; if what lies beside the scans is damaged.
     """
@@ -118,13 +129,20 @@ def convert(
         writer.require_grid(target.by_beams() if unfold else target)
     models = models_of(source.root) if isinstance(source, ScanFiles) else []
     with claimed(writer.root / SETTINGS, _settings(source, writer, change, unfold)):
-        report = _write_missing(source, writer, change, unfold, on_bad, jobs, progress)
+        work = partial(convert_one, source, writer, change, unfold, on_bad, strict)
+        report = _write_missing(source, writer, change, work, on_bad, jobs, progress)
         write_models(writer.root, models if report.written or report.kept else [])
     return report
 
 
 def _write_missing(
-    source: Source, writer: Writer, change: AsSensor | None, unfold: bool, on_bad: OnBad, jobs: int, progress: bool
+    source: Source,
+    writer: Writer,
+    change: AsSensor | None,
+    work: Callable[[int], Outcome],
+    on_bad: OnBad,
+    jobs: int,
+    progress: bool,
 ) -> Report:
     """The part of ``convert`` that writes."""
     missing, report = _compare(source, writer, on_bad)
@@ -133,7 +151,6 @@ def _write_missing(
             report.left_out = ["files such as times.txt, which are copied only where the sensor stays in its place"]
     elif isinstance(source, ScanFiles):
         report.left_out = writer.carry(source)
-    work = partial(convert_one, source, writer, change, unfold, on_bad)
     with in_processes(work, missing, jobs, CHUNK) as results:
         for done in tqdm(results, total=len(missing), unit="scan", disable=not (progress and missing)):
             _count(report, done, name_of(source, done.number) or str(done.number))
@@ -152,6 +169,8 @@ def _count(report: Report, done: Outcome, name: str) -> None:
         report.dropped[name] = done.dropped
     if done.seen is not None:
         report.seen.append(done.seen)
+    report.lost.update(done.lost)
+    report.unlabelled += done.unlabelled
 
 
 def _change(as_sensor: AsSensor | Transfer | Sensor | None) -> AsSensor | None:
@@ -189,12 +208,12 @@ def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], 
 
 
 def convert_one(
-    source: Source, writer: Writer, change: AsSensor | None, unfold: bool, on_bad: OnBad, index: int
+    source: Source, writer: Writer, change: AsSensor | None, unfold: bool, on_bad: OnBad, strict: bool, index: int
 ) -> Outcome:
     """Write the scan at ``index``, as another sensor would have recorded it if one is given.
 
     Raises:
-        DataError, FileError: as ``convert``.
+        ConfigError, DataError, FileError: as ``convert``.
     """
     camera, dropped, seen = None, 0, None
     try:
@@ -212,13 +231,21 @@ def convert_one(
         if on_bad != "skip":
             raise
         return Outcome(index, str(error))
+    lost = writer.loses(scan)
+    if strict and lost:
+        raise ConfigError(
+            f"scan {scan.id!r} has {', '.join(lost)}, which {type(writer).__name__} cannot hold",
+            "a format that holds all that a scan has",
+            "Choose another, such as npz or webdataset, or convert without --strict (strict=True).",
+        )
     try:
         writer.write(scan, index, name=name_of(source, index), calibration=camera)
     except DataError as error:
         if on_bad != "skip":
             raise
         return Outcome(index, str(error))
-    return Outcome(index, "", dropped, Origin.of(scan), seen)
+    unlabelled = writer.always_labels and scan.label is None
+    return Outcome(index, "", dropped, Origin.of(scan), seen, tuple(lost), unlabelled)
 
 
 def reproject(scan: Scan, sensor: Sensor | None = None, unfold: bool = False) -> Scan:

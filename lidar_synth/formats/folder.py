@@ -3,12 +3,14 @@
 - ``.bin``: float32 x, y, z, reflectance per point, as in KITTI; optional ``NAME.label`` with SemanticKITTI's labels.
 - ``.npy``: the same as an array (N, 4); further columns are ignored.
 - ``.npz``: the package's own format, see npz.py.
-- ``.pcd``, ``.ply``: see pcd.py and ply.py.
+- ``.pcd``, ``.ply``: see pcd.py and ply.py; optional ``NAME.boxes.json`` with the fields of ``Boxes`` as lists.
 
 Files in subfolders are included; a scan's id is its relative path without the suffix.
 """
 
+import json
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.parsing import read_arrays
+from lidar_synth.files.disk import read_text, write_file
+from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import Description
 from lidar_synth.formats.npz import check_numbers, decode_scan, stored_sensor, write_scan
@@ -26,11 +29,14 @@ from lidar_synth.formats.ply import read_ply, read_ply_description, write_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import check_scan, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import FileWriter, Picture
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.formats.writer import DETAILS, LABELS, FileWriter, Picture
+from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
+
+BOXES = ".boxes.json"
+"""Suffix of the boxes beside a file of points."""
 
 
 class Folder(ScanFiles):
@@ -94,10 +100,43 @@ class Folder(ScanFiles):
             said = _description(path)
             scan = Scan(sensor=self._given or (said.sensor if said else None) or self.sensor, **arrays)
             scan = said.origin.apply(scan) if said else scan
+            scan.boxes = read_boxes(path)
             check_scan(scan, str(path), self._reflectance_max)
         if self._reflectance_max != 1:
             scan.reflectance = scan.reflectance / np.float32(self._reflectance_max)
         return scan
+
+
+def read_boxes(path: Path) -> Boxes | None:
+    """The boxes beside a file of points; None if there are none.
+
+    Raises:
+        FileError: if they cannot be read.
+        DataError: if they are damaged.
+    """
+    beside = path.with_suffix(BOXES)
+    if not beside.is_file():
+        return None
+    expected = "the fields of Boxes, one value per box"
+    given = parse_json(read_text(beside), str(beside), expected)
+    try:
+        if not all(isinstance(name, str) for name in given["names"]):
+            raise TypeError("names that are not text")
+        with np.errstate(over="ignore"):  # Boxes refuses what is not finite
+            return Boxes(**given)
+    except (TypeError, KeyError, ValueError, OverflowError) as error:
+        raise DataError(f"{beside}: {error!r}", expected) from error
+
+
+def write_boxes(path: Path, boxes: Boxes | None) -> None:
+    """The inverse of ``read_boxes``.
+
+    Raises:
+        FileError: if they cannot be written.
+    """
+    if boxes is not None:
+        values = {f.name: np.asarray(getattr(boxes, f.name)).tolist() for f in fields(Boxes)}
+        write_file(path.with_suffix(BOXES), json.dumps(values).encode())
 
 
 def _columns(path: Path) -> dict[str, NDArray[Any]]:
@@ -162,12 +201,14 @@ def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]
 
 
 class KITTIWriter(FileWriter):
-    """Writes ``NAME.bin`` as in KITTI, and always ``NAME.label`` as in SemanticKITTI; unlabelled points are 0."""
+    """Writes ``NAME.bin`` as in KITTI, and ``NAME.label`` of labelled scans as in SemanticKITTI."""
 
     suffix = ".bin"
+    keeps = LABELS
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
-        write_labels(path.with_suffix(".label"), encode_labels(scan, SEMANTIC_KITTI))
+        if scan.label is not None:
+            write_labels(path.with_suffix(".label"), encode_labels(scan, SEMANTIC_KITTI))
         self._write_points(path, scan)
 
 
@@ -175,24 +216,29 @@ class NPZWriter(FileWriter):
     """Writes the package's own ``NAME.npz``, with all fields of the scan except its image."""
 
     suffix = ".npz"
+    keeps = frozenset(DETAILS) - {"image_path"}
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         write_scan(path, scan)
 
 
 class PCDWriter(FileWriter):
-    """Writes ``NAME.pcd`` with the scan's points and fields, without boxes and pose."""
+    """Writes ``NAME.pcd`` with the scan's points and fields, and its boxes to ``NAME.boxes.json``, without pose."""
 
     suffix = ".pcd"
+    keeps = frozenset({*POINT_FIELDS, "boxes"})
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        write_boxes(path, scan.boxes)
         write_pcd(path, scan)
 
 
 class PLYWriter(FileWriter):
-    """Writes ``NAME.ply`` with the scan's points and fields, without boxes and pose."""
+    """Writes ``NAME.ply`` with the scan's points and fields, and its boxes to ``NAME.boxes.json``, without pose."""
 
     suffix = ".ply"
+    keeps = frozenset({*POINT_FIELDS, "boxes"})
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+        write_boxes(path, scan.boxes)
         write_ply(path, scan)

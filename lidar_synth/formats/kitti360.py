@@ -38,7 +38,7 @@ from lidar_synth.formats.kitti360_poses import CAMERA, read_calibration, read_po
 from lidar_synth.formats.point_labels import decode_labels, encode_labels, mismatch, write_labels
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
-from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
+from lidar_synth.formats.writer import LABELS, Picture, Writer, clear_notes, read_notes, write_image, write_note
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -145,6 +145,8 @@ class KITTI360Writer(Writer):
         drive: folder of scans without a drive of their own.
         calibration: see ``Writer``.
     """
+
+    keeps = LABELS | {"boxes", "pose", "image_path"}
 
     def __init__(
         self,

@@ -153,9 +153,13 @@ class KITTIObjectWriter(Writer):
         calibration: see ``Writer``.
     """
 
+    keeps = frozenset({"boxes", "image_path"})
+
     def __init__(self, root: str | Path, *, part: Part = "training", calibration: Calibration | None = None) -> None:
         super().__init__(root, calibration=calibration)
         self.part = part
+        if part == "testing":
+            self.keeps -= {"boxes"}
 
     def _place(self, index: int, name: str | None) -> str:
         match = re.fullmatch(r"(training|testing)/0*([0-9]{1,10})", name or "")

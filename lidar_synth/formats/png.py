@@ -119,6 +119,8 @@ def _steps(path: Path, values: NDArray[Any] | None = None) -> NDArray[Any]:
 class PNGWriter(Writer):
     """Writes the scan, projected onto its sensor's grid, as ``range``, ``reflectance`` and ``label`` PNG files."""
 
+    keeps = frozenset({"label"})
+
     def _place(self, index: int, name: str | None) -> str:
         # One flat folder per channel, which other programs can read as a list of images.
         return f"range/{(name or f'{index:06d}').replace('/', '_')}.png"

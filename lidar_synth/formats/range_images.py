@@ -30,7 +30,7 @@ from lidar_synth.formats.npz import (
 from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
-from lidar_synth.formats.writer import FileWriter, Picture, projected
+from lidar_synth.formats.writer import DETAILS, FileWriter, Picture, projected
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -189,6 +189,7 @@ class RangeWriter(FileWriter):
     """Writes the package's own ``NAME.npz``: the scan projected onto its sensor's grid, with all its fields."""
 
     suffix = ".npz"
+    keeps = frozenset(DETAILS) - {"image_path"}
 
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
         write_range_image(path, projected(scan), scan)

@@ -35,7 +35,7 @@ from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneou
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles, choose
-from lidar_synth.formats.writer import Picture, Writer, clear_notes, read_notes, write_image, write_note
+from lidar_synth.formats.writer import LABELS, Picture, Writer, clear_notes, read_notes, write_image, write_note
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -144,6 +144,9 @@ class SemanticKITTIWriter(Writer):
         sequence: sequence of scans without one of their own.
         calibration: see ``Writer``.
     """
+
+    keeps = LABELS | {"pose", "image_path"}
+    always_labels = True
 
     def __init__(self, root: str | Path, *, sequence: str = "00", calibration: Calibration | None = None) -> None:
         super().__init__(root, calibration=calibration)

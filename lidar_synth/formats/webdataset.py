@@ -7,7 +7,8 @@ as %2E and %25::
       KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml); if known also
                               provenance, pose (4 x 4, sensor to world) and names of the boxes
       KEY.points.npy          (N, 4) float32: x, y, z in metres, reflectance in [0, 1]
-      KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always written, so that samples have the same keys
+      KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always written, so that samples have the same keys,
+                              with "labelled": false in KEY.json if the scan has no labels
       KEY.confidence.npy      and other known fields per point: raw_label, instance, ring
       KEY.boxes.npy           (M, 7) float32, if there are boxes: x, y, z, l, w, h, yaw
 
@@ -36,7 +37,7 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import NOTES, Picture, Writer, clear_notes
+from lidar_synth.formats.writer import DETAILS, NOTES, Picture, Writer, clear_notes
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -86,6 +87,8 @@ class WebDatasetWriter(Writer):
     Raises:
         ConfigError: on fewer than one scan in a file.
     """
+
+    keeps = frozenset(DETAILS) - {"image_path"}
 
     def __init__(self, root: str | Path, *, shard_size: int = 1000, calibration: Calibration | None = None) -> None:
         super().__init__(root, calibration=calibration)
@@ -137,6 +140,7 @@ def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
     facts |= {"provenance": dict(scan.provenance)} if scan.provenance else {}
     facts |= {} if scan.pose is None else {"pose": scan.pose.tolist()}
     facts |= {} if scan.boxes is None else {"names": list(scan.boxes.names)}
+    facts |= {} if scan.label is not None else {"labelled": False}
     fields = {"label": np.full(len(scan), IGNORE, np.uint8)} | scan.fields()
     points = np.column_stack([scan.points, fields.pop("reflectance")]).astype(np.float32)
     arrays = {"points": points, **fields}
@@ -165,6 +169,8 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
         boxes = Boxes(arrays.pop("boxes"), _texts(facts["names"])) if "boxes" in arrays else None
         points = arrays.pop("points")
         arrays |= {"points": points[:, :3], "reflectance": points[:, 3]}
+        if facts.get("labelled") is False:
+            del arrays["label"]
         texts = {name: json.dumps(facts[name]) for name in ("sensor", "provenance") if name in facts}
         arrays |= {name: np.array(text) for name, text in texts.items()}
         arrays |= {name: np.array(facts[name]) for name in ("id", "domain", "pose") if name in facts}

@@ -34,12 +34,18 @@ from lidar_synth.formats.npz import check_pose, stored
 from lidar_synth.formats.points import check_scan, write_points
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
+from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 Image = NDArray[np.uint8]
 Picture = Image | Path
 """An image as an array, (H, W, 3) RGB, or as the path of a file."""
+
+LABELS = frozenset({"label", "raw_label", "instance"})
+"""The fields of a scan that KITTI's label files hold."""
+
+DETAILS = (*POINT_FIELDS[1:], "boxes", "pose", "image_path")
+"""What a scan may have besides points and reflectance."""
 
 NOTES = ".lidar_synth"
 """Folder of the notes that ``finish`` gathers and then removes."""
@@ -52,7 +58,14 @@ class Writer(ABC):
         root: the folder; it is created.
         calibration: the camera, for layouts with a calibration; by default an ideal camera at the sensor that faces
             forward.
+
+    Attributes:
+        keeps: those of ``DETAILS`` that the layout can hold.
+        always_labels: whether it has labels of every scan, 0 (unlabelled) where they are unknown.
     """
+
+    keeps: frozenset[str]
+    always_labels = False
 
     def __init__(self, root: str | Path, *, calibration: Calibration | None = None) -> None:
         self.root = Path(root)
@@ -135,6 +148,10 @@ class Writer(ABC):
         if self._description is None or origin not in self._description.origins:
             self._description = record(self.root, scan.sensor, origin)
         write_points(path, scan)
+
+    def loses(self, scan: Scan) -> list[str]:
+        """What the scan has, but the layout cannot hold; names of ``DETAILS``."""
+        return [name for name in DETAILS if name not in self.keeps and getattr(scan, name) is not None]
 
     @abstractmethod
     def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
