@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from lidar_synth import KITTI360, MixedScans
 from lidar_synth.cli import app
-from lidar_synth.errors import ConfigError, DataError, LidarSynthError
+from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
+from lidar_synth.formats import kitti360_labels
 from lidar_synth.formats.kitti360 import boxes_path, confidence_path, label_file, labels_folder, scans_folder
 from lidar_synth.formats.kitti360_accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
 from lidar_synth.formats.kitti360_boxes import WorldBoxes, read_boxes
@@ -323,6 +324,32 @@ def test_a_missing_part_of_the_dataset_is_named(copy: Path, tmp_path: Path, miss
     shutil.rmtree(copy / missing)
     with pytest.raises(DataError, match=message):
         label_scans(copy, tmp_path / "labels", progress=False)
+
+
+def test_a_run_that_ended_before_its_first_record_is_resumed(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, written = kitti360_labels.write_labels, []
+
+    def full(path: Path, values: NDArray[np.uint32]) -> None:
+        if len(written) == 2:
+            raise FileError(f"{path} cannot be written", "a disk with free space")
+        written.append(path)
+        write(path, values)
+
+    monkeypatch.setattr(kitti360_labels, "write_labels", full)
+    with pytest.raises(FileError):
+        label_scans(copy, tmp_path / "labels", progress=False)
+    monkeypatch.undo()
+    assert len(list((tmp_path / "labels").rglob("*.label"))) == 2
+    assert not list((tmp_path / "labels").rglob("*.json"))
+    assert label_scans(copy, tmp_path / "labels", progress=False).labelled == {DRIVE: SCANS}
+
+
+def test_a_file_in_place_of_the_output_is_named(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(FileError, match=r"out.*cannot be made"):
+        label_scans(root, tmp_path / "out", progress=False)
 
 
 def test_labels_from_elsewhere_are_not_overwritten(root: Path) -> None:

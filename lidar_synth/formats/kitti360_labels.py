@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import KITTI360 as CLASSES
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import list_files, read_text, sha256, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.convert import in_processes
@@ -170,8 +170,7 @@ def label_scans(
         cached.cache_clear()  # files may have changed since an earlier call
     plan = plan_labels(root, split)
     for drive in {job.drive for job in plan.jobs}:
-        if labels_folder(out, drive).is_dir() and not (labels_folder(out, drive).parent / "windows").is_dir():
-            raise ConfigError(f"{labels_folder(out, drive)} holds labels from elsewhere", "a folder without labels")
+        _claim(labels_folder(out, drive))
     work = partial(_label_window, root, out, None if against is None else Path(against))
     report = LabelReport(plan.without_pose, plan.outside, plan.without_clouds)
     with (
@@ -184,6 +183,17 @@ def label_scans(
     write_file(out / "data_3d_semantics_scan" / "report.json", json.dumps(report.to_dict(), indent=1).encode())
     report.check()
     return report
+
+
+def _claim(labels: Path) -> None:
+    """Mark a folder of labels as one of this command, before there is a label, so that a killed run can be resumed."""
+    records = labels.parent / "windows"
+    if labels.is_dir() and not records.is_dir():
+        raise ConfigError(f"{labels} holds labels from elsewhere", "a folder without labels")
+    try:
+        records.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{records} cannot be made ({error.strerror})", "a folder to write labels to") from error
 
 
 def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -> dict[str, Any]:
