@@ -11,15 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
 from lidar_synth.bank import Bank, is_bank
 from lidar_synth.bank.storage import is_url
 from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
-from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files.disk import read_text
+from lidar_synth.errors import ConfigError, DataError, shorten
+from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.generator import load_generator
 from lidar_synth.geometry.scan import Scan
@@ -44,10 +43,12 @@ def open_synthetic(where: Any) -> Any:
     """
     if not isinstance(where, str | Path):
         return where
-    if is_url(where) or is_bank(where):
+    if is_url(where):
         return Bank(where)
-    if not Path(where).is_dir():
+    if not os.path.isdir(where):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
         return load_generator(where)
+    if is_bank(where):
+        return Bank(where)
     scans = open_scans(where)
     own = scans[0].sensor  # files may store their own sensor
     return scans if scans.sensor.shape == own.shape else open_scans(where, sensor=own)
@@ -65,7 +66,7 @@ def read_settings(given: Any = None) -> dict[str, Any]:
     """
     source = given if given is not None else os.environ.get(VARIABLE)
     if isinstance(source, str | Path):
-        given = yaml.safe_load(read_text(Path(source)))
+        given = read_yaml(Path(source), "the settings of a mixture")
     if not isinstance(given, Mapping):
         raise ConfigError(
             f"{source!r} as the settings of a mixture",
@@ -73,8 +74,11 @@ def read_settings(given: Any = None) -> dict[str, Any]:
             f"Set the file in the trainer's configuration or by {VARIABLE}=mix.yaml.",
         )
     settings = {str(key).lower(): value for key, value in given.items()}
-    if isinstance(options := settings.get("label_options"), Mapping):
+    options = settings.get("label_options")
+    if isinstance(options, Mapping):
         settings["label_options"] = {str(key).lower(): value for key, value in options.items()}
+    elif options is not None:
+        raise ConfigError(f"label_options: {shorten(str(options), 40)}", "options by name, such as threshold: 0.5")
     return settings
 
 

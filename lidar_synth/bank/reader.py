@@ -86,6 +86,11 @@ class Bank:
     def __len__(self) -> int:
         return self.index.scans
 
+    def __repr__(self) -> str:
+        size = f"{len(self)} scans in {len(self.index.shards)} shards"
+        fields = ", ".join(sorted(self.fields))
+        return f"Bank({str(self.root)!r}): {size}\n  sensor {self.sensor.grid_text()}; {fields}"
+
     def __getitem__(self, number: int) -> Scan:
         """The returns of ``image(number)`` through the centres of their cells.
 

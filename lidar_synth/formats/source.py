@@ -161,6 +161,10 @@ class ScanFiles(ABC):
     def __len__(self) -> int:
         return len(self.ids)
 
+    def __repr__(self) -> str:
+        names = f"{len(self)} scans, {self.ids[0]!r} to {self.ids[-1]!r}"
+        return f"{type(self).__name__}({str(self.root)!r}): {names}\n  sensor {self.sensor.grid_text()}"
+
     def __getitem__(self, index: int) -> Scan:
         if not -len(self) <= index < len(self):
             raise IndexError(f"scan {index} of {len(self)}")

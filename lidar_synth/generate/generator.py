@@ -93,6 +93,11 @@ class Generator:
         if self.columns is not None and self.columns not in widths:
             raise ConfigError(f"{self.columns} columns of {self.name!r}", f"one of {', '.join(map(str, widths))}")
 
+    def __repr__(self) -> str:
+        size = f"{sum(p.numel() for p in self.network.parameters()) / 1e6:.1f} M parameters"
+        fields = ", ".join(sorted(self.fields))
+        return f"Generator {self.name!r}: {size}\n  sensor {self.sensor.grid_text()}; {fields}"
+
     @property
     def sensor(self) -> Sensor:
         """The sensor that defines the grid of the range images."""

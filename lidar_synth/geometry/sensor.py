@@ -245,6 +245,11 @@ class Sensor:
         """(H, W, 3) unit vector x, y, z of every cell; the array is read-only and shared between calls."""
         return _ray_directions(self, rays)
 
+    def grid_text(self) -> str:
+        """Name, rows, columns and field of view for people: ``'town' (64 x 1024, -25.0 to 3.0 degrees)``."""
+        rows, columns = self.shape
+        return f"{self.name!r} ({rows} x {columns}, {self.down:.1f} to {self.up:.1f} degrees)"
+
     def by_beams(self) -> "Sensor":
         """The same sensor with one row per laser, at the elevation of its returns, for unfolded scans."""
         if self.beams is None:
@@ -345,6 +350,8 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
     """
     if isinstance(sensor, Sensor):
         return sensor
+    if not isinstance(sensor, str | Path):
+        raise ConfigError(f"sensor {shorten(repr(sensor), 40)}", "a preset's name, a file or a Sensor")
     if str(sensor) in presets():
         return presets()[str(sensor)]
     path = Path(sensor)

@@ -5,12 +5,13 @@ labels that they set.
 """
 
 from dataclasses import dataclass, replace
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, shorten
 from lidar_synth.geometry.scan import Scan, Source
 
 
@@ -138,8 +139,8 @@ def checked_share(name: str, value: float) -> float:
     Raises:
         ConfigError: on any other value.
     """
-    if not 0 <= value <= 1:
-        raise ConfigError(f"{name} {value!r}", "a number from 0 to 1")
+    if not (isinstance(value, Real) and 0 <= value <= 1):
+        raise ConfigError(f"{name} {shorten(repr(value), 40)}", "a number from 0 to 1")
     return value
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.mixing.schedules import Schedule, settled, share_of
+from lidar_synth.mixing.schedules import Schedule, settled, share_of, to_integer
 
 EpochSize = Literal["add", "replace"] | int
 """The length of an epoch: ``"add"`` uses every real scan once and adds synthetic ones to reach the ratio;
@@ -78,7 +78,7 @@ class Mixture:
         size = self.epoch_size
         if size not in ("add", "replace") and not (isinstance(size, int) and not isinstance(size, bool) and size > 0):
             raise ConfigError(f"epoch_size={size!r}", "'add', 'replace' or a number of samples")
-        if self.reuse < 1:
+        if to_integer(self.reuse, "reuse") < 1:
             raise ConfigError(f"reuse={self.reuse}", "the number of epochs that use a synthetic scan, at least 1")
         if not 0 <= self.seed < 2**64:
             raise ConfigError(f"seed {self.seed}", "0 <= seed < 2^64")

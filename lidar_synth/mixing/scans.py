@@ -4,7 +4,6 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
-from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from lidar_synth.mixing.items import to_item
 from lidar_synth.mixing.notices import Notices
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
-from lidar_synth.mixing.schedules import Schedule, make_schedule
+from lidar_synth.mixing.schedules import Schedule, make_schedule, to_integer
 from lidar_synth.mixing.sources import check_together, each, identity_of
 from lidar_synth.mixing.synthetic import make_synthetic
 from lidar_synth.noise import keyed_rng
@@ -120,7 +119,7 @@ class MixedScans(Dataset[Any]):
         real_as_is: bool = False,
         compare: bool = True,
     ) -> None:
-        reals, seed = each(real), index(seed)
+        reals, seed = each(real), to_integer(seed, "seed")
         synthetics = [(make_synthetic(source, seed), weight) for source, weight in each(synth)]
         self.real = tuple(source for source, _ in reals)
         self.synthetic = tuple(source for source, _ in synthetics)
@@ -267,6 +266,12 @@ class MixedScans(Dataset[Any]):
         """Number of samples in an epoch."""
         planned = self._planned
         return len(planned[1] if planned is not None and planned[0] == epoch else MixingPlan(self.mixture, epoch))
+
+    def __repr__(self) -> str:
+        plan = MixingPlan(self.mixture, self.epoch)
+        size = f"{len(plan)} samples in epoch {self.epoch}, {plan.synthetics} of them synthetic; seed {self.seed}"
+        kinds = [", ".join(type(source).__name__ for source in kind) for kind in (self.real, self.synthetic)]
+        return f"{type(self).__name__}: {size}\n  real: {kinds[0] or 'none'}; synthetic: {kinds[1] or 'none'}"
 
     def __len__(self) -> int:
         return self.length(self.epoch)

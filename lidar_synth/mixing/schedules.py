@@ -8,9 +8,10 @@ every epoch.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from operator import index
 from typing import Any
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, shorten
 
 Schedule = Callable[[int], float]
 """``epoch -> share``: from an epoch, counted from 0, to the share of synthetic samples in [0, 1]."""
@@ -103,7 +104,7 @@ def make_schedule(ratio: float | Sequence[float] | Mapping[int, float] | Schedul
     if callable(ratio):
         return ratio
     if isinstance(ratio, Mapping):
-        return Steps(tuple(sorted(ratio.items())))
+        return Steps(tuple(sorted((to_integer(epoch, "epoch of a ratio"), share) for epoch, share in ratio.items())))
     if isinstance(ratio, Sequence) and not isinstance(ratio, str):
         return Steps(tuple(enumerate(ratio)), length=len(ratio))
     return Steps(((0, ratio),))
@@ -115,9 +116,23 @@ def share_of(schedule: Schedule, epoch: int) -> Fraction:
     Raises:
         ConfigError: on a share outside [0, 1], a negative epoch, or one after the schedule's end.
     """
-    if epoch < 0:
+    if to_integer(epoch, "epoch") < 0:
         raise ConfigError(f"epoch {epoch}", "0 or more")
     return _checked(schedule(epoch), epoch)
+
+
+def to_integer(value: Any, name: str) -> int:
+    """Convert an integer of any type, such as numpy's, to a plain one.
+
+    Raises:
+        ConfigError: on anything else: a real number, text, a truth value.
+    """
+    try:
+        if not isinstance(value, bool):
+            return index(value)
+    except TypeError:
+        pass
+    raise ConfigError(f"{name}={shorten(repr(value), 40)}", "an integer", "Write it without quotes or decimals.")
 
 
 def settled(schedule: Schedule) -> int | None:

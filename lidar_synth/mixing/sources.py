@@ -107,7 +107,7 @@ def check_together(sources: Sequence[Any], as_sensors: Sequence[Sensor | None]) 
     for sensor in sensors[1:]:
         if sensor.shape != sensors[0].shape or not np.array_equal(sensor.edges, sensors[0].edges):
             raise ConfigError(
-                f"sources of the sensors {_grid(sensors[0])} and {_grid(sensor)}",
+                f"sources of the sensors {sensors[0].grid_text()} and {sensor.grid_text()}",
                 "one grid for all real and synthetic scans",
                 "Turn the synthetic scans into scans of the real ones' sensor (as_sensor=real.sensor), or open the "
                 "real scans with the generator's sensor (sensor=generator.sensor).",
@@ -121,8 +121,3 @@ def check_together(sources: Sequence[Any], as_sensors: Sequence[Sensor | None]) 
                 "Map its labels when they are read (Taxonomy.decode), then remove its attribute 'classes'.",
             )
     return sensors
-
-
-def _grid(sensor: Sensor) -> str:
-    rows, columns = sensor.shape
-    return f"{sensor.name!r} ({rows} x {columns}, {sensor.down:.1f} to {sensor.up:.1f} degrees)"

@@ -14,6 +14,7 @@ import torch
 import yaml
 from banks import SENSOR, some_image, write_bank
 from layouts import some_camera, some_scan, write_kitti_raw, write_nuscenes
+from lidar_synth.integrations.mixture import mix, read_settings
 from ouster_files import ouster_metadata
 from pandaset_files import write_pandaset
 
@@ -183,6 +184,36 @@ def make_checkpoint(root: Path) -> None:
     save_checkpoint(root / "model.safetensors", header, {VELOCITY: network})
 
 
+def make_mixture(root: Path) -> None:
+    """A bank, and the settings of a mixture with it that use every key."""
+    write_bank(root / "bank", [some_image(i) for i in range(3)], fields=("reflectance", "label", "confidence"))
+    settings = {
+        "synthetic": "bank",
+        "ratio": {0: 0.5, 3: 0.25},
+        "labels": "generated",
+        "label_options": {"threshold": 0.3},
+        "seed": 7,
+        "reuse": 2,
+        "epoch_size": "add",
+        "unboxed": "close",
+        "as_sensor": None,
+    }
+    (root / "mix.yaml").write_text("# a comment\n" + yaml.safe_dump(settings))
+
+
+def read_mixture(root: Path) -> list[Any]:
+    """The synthetic scans of the first epochs of a mixture."""
+    settings = read_settings(root / "mix.yaml")
+    if settings.get("synthetic") == "bank":
+        settings["synthetic"] = root / "bank"
+    mixed = mix(4, settings, lambda scan, rng: scan)
+    found: list[Any] = []
+    for epoch in range(4):
+        mixed.set_epoch(epoch)
+        found += [mixed[i] for i in range(min(len(mixed), SCANS)) if mixed.domain(i)]
+    return found
+
+
 def read(layout: str, root: Path, **options: Any) -> list[Any]:
     """Scans, images and cameras of a dataset, through the reader and through what recognises its layout."""
     layout_of(root)
@@ -263,6 +294,7 @@ TARGETS: dict[str, Target] = {
     "bank_index": Target(make_bank, partial(read, "bank"), files=("index.json",), mend=mend_index),
     "bank_shard": Target(make_bank, read_shard, files=("shard-00000.h5",)),
     "sensor": Target(make_sensors, read_sensors),
+    "mixture": Target(make_mixture, read_mixture, files=("mix.yaml",)),
     "checkpoint": Target(make_checkpoint, read_checkpoint, mend=mend_checkpoint),
 }
 """By name. A reader of ``READERS`` is read by ``partial(read, LAYOUT)``; a test sees that none is left out."""
