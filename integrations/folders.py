@@ -70,7 +70,7 @@ def export_mixture(
     })  # fmt: skip
     writer: Writer = SemanticKITTIWriter(root) if layout == "semantic_kitti" else KITTIObjectWriter(root)
     rows, written = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"], 0
-    for position in tqdm(range(mixed.length(epoch)), unit="scan", disable=not progress):
+    for position in tqdm(range(len(mixed)), unit="scan", disable=not progress):
         scan = _sample(mixed, epoch, position)
         rows.append(f"{position:06d},{scan.domain},{scan.id}")
         if writer.complete(position):

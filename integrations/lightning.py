@@ -3,9 +3,8 @@
     data = MixedData(train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8, num_workers=4)
     trainer.fit(model, data)
 
-Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among ranks itself. Lightning
-reads the number of batches once; if a later epoch has more (an increasing ratio with ``epoch_size="add"``), also set
-``reload_dataloaders_every_n_epochs=1``. A checkpoint within an epoch resumes after its last batch.
+Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among ranks itself. A
+checkpoint within an epoch resumes after its last batch.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.geometry.scan import Source
 from lidar_synth.mixing import Collate, Generated, MixedBatches, MixedScans, to_item
-from lidar_synth.mixing.batches import cut_steps
+from lidar_synth.mixing.batches import CutSteps, cut_steps
 from lidar_synth.mixing.state import after_epoch, checked_state, make_state
 from lidar_synth.noise import keyed_rng
 
@@ -193,20 +192,16 @@ class _Epochs:
 
     def __len__(self) -> int:
         """Number of batches in the complete epoch; Lightning adds the batches before a checkpoint to its count."""
-        try:
-            return len(self._steps(self._current()))
-        except ConfigError:  # after the last epoch of a schedule, when Lightning tidies up
-            return len(self._steps(self._epoch))
+        return len(self._steps())
 
     def __iter__(self) -> Iterator[list[int]]:
         self._epoch = self._current()
         self._batches.set_epoch(self._epoch)
-        self._check_limit()
         return iter(self._batches)
 
     def state_dict(self) -> dict[str, Any]:
         """The state after the processed batches, and the number of samples in a step of all ranks."""
-        steps, trainer = self._steps(self._epoch), self._data.trainer
+        steps, trainer = self._steps(), self._data.trainer
         done = trainer.fit_loop.epoch_loop.batch_progress.current.processed if trainer else 0
         mixture = self._batches.dataset.mixture
         place = (self._epoch, steps[done].start) if done < len(steps) else after_epoch(mixture, self._epoch)
@@ -218,7 +213,7 @@ class _Epochs:
         Raises:
             ConfigError: as ``MixedData.load_state_dict``.
         """
-        size = self._steps(0).size
+        size = self._steps().size
         if state["position"] and state.get("step", size) != size:
             raise ConfigError(
                 f"a checkpoint from the middle of an epoch, {state['step']} samples a step, for {size} a step",
@@ -232,23 +227,9 @@ class _Epochs:
         trainer = self._data.trainer
         return self._batches.dataset.epoch if trainer is None else max(self._first, trainer.current_epoch)
 
-    def _steps(self, epoch: int) -> Any:
+    def _steps(self) -> CutSteps:
         batches = self._batches
-        return cut_steps(0, batches.dataset.length(epoch), batches.batch_size, batches.world_size)
-
-    def _check_limit(self) -> None:
-        """Refuse an epoch with more batches than the first one, because Lightning would skip the additional ones."""
-        trainer = self._data.trainer
-        limit = None if trainer is None else trainer.limit_train_batches
-        if trainer is None or isinstance(limit, int) or limit != 1.0:  # 1 is one batch, as of fast_dev_run; 1.0 is all
-            return
-        limits = getattr(trainer.fit_loop._combined_loader, "limits", None)
-        if limits and limits[0] < len(self):
-            raise ConfigError(
-                f"epoch {self._epoch} of {len(self)} batches, but Lightning expects {limits[0]} as in the first epoch",
-                "epochs that do not grow",
-                "Set Trainer(reload_dataloaders_every_n_epochs=1), or epoch_size='replace' or a number of samples.",
-            )
+        return cut_steps(0, len(batches.dataset), batches.batch_size, batches.world_size)
 
 
 class _Loader(DataLoader[Any]):

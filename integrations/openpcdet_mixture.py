@@ -43,7 +43,7 @@ class Mixed:
                 "OpenPCDet counts the iterations of an epoch once.",
             )
         self.mixed = mix(super().__len__(), settings, lambda scan, rng: scan)  # type: ignore[misc]
-        self._length = self.mixed.length(0)
+        self._length = len(self.mixed)
         self._check_boxes({*self.class_names, *known})
 
     def merge_all_iters_to_one_epoch(self, merge: bool = True, epochs: int | None = None) -> None:

@@ -123,7 +123,7 @@ def expected_samples(root: Path, real: int, settings: dict[str, Any]) -> dict[st
     )
     found: dict[str, Any] = {}
     for epoch in range(EPOCHS):
-        for position in range(mixed.length(epoch)):
+        for position in range(len(mixed)):
             sample = mixed.sample(epoch, position)
             if isinstance(sample, int):
                 found[f"{epoch} {position} real"] = np.array(sample)

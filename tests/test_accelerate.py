@@ -1,4 +1,4 @@
-"""Mixtures through ``Accelerator.prepare`` with two processes, which shares batches itself."""
+"""Mixtures in Accelerate's loaders with two processes: the epoch that was set or resumed, each sample once."""
 
 import os
 import socket
@@ -15,10 +15,13 @@ from torch.utils.data import DataLoader
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans, MixedStream
+from lidar_synth.mixing.state import make_state
 
 pytest.importorskip("accelerate")
 
-REAL = 40
+from lidar_synth.integrations.accelerate import prepare
+
+FALLING = {0: 1.0, 5: 0.2}
 
 
 def number(scan: Scan, rng: Any) -> torch.Tensor:
@@ -28,25 +31,36 @@ def number(scan: Scan, rng: Any) -> torch.Tensor:
 
 
 def mixed() -> MixedScans:
-    """54 samples in epoch 0, 53 in the next two."""
-    return MixedScans(Scans("r", REAL), Endless(), 0.25, to_sample=number, collate=torch.stack)
+    """47 samples an epoch."""
+    return MixedScans(Scans("r", 37), Endless(), FALLING, epoch_size=47, to_sample=number, collate=torch.stack)
 
 
-def planned(epoch: int) -> list[int]:
+def planned(epoch: int, start: int = 0) -> list[int]:
     made = mixed().plan(epoch)
-    return [-1 - i if d else i for d, i in zip(made.domain.tolist(), made.index.tolist(), strict=True)]
+    both = zip(made.domain.tolist(), made.index.tolist(), strict=True)
+    return [-1 - i if d else i for d, i in both][start:]
 
 
-def seen(loader: Any) -> list[int]:
+def batched(train: MixedScans, workers: int, **options: Any) -> DataLoader[Any]:
+    batches = train.batches(4, **options)
+    return DataLoader(train, batch_sampler=batches, num_workers=workers, collate_fn=train.collate)
+
+
+def streamed(train: MixedScans, workers: int, **options: Any) -> DataLoader[Any]:
+    stream = MixedStream(train, batch_size=4, endless=False, **options)
+    return DataLoader(stream, 4, num_workers=workers, collate_fn=train.collate)
+
+
+def seen(loader: Any) -> Counter[int]:
     """By all processes."""
     every: list[Any] = [None] * dist.get_world_size()
     dist.all_gather_object(every, [int(x) for batch in loader for x in batch])
-    return [x for part in every for x in part]
+    return Counter(x for part in every for x in part)
 
 
 def run(rank: int, port: int) -> None:
-    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2", "RANK": str(rank)}
-    os.environ |= {"LOCAL_RANK": str(rank), "ACCELERATE_USE_CPU": "true"}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "ACCELERATE_USE_CPU": "true"}
     from accelerate import Accelerator
     from accelerate.state import AcceleratorState, PartialState
 
@@ -55,50 +69,62 @@ def run(rank: int, port: int) -> None:
     accelerator = Accelerator(cpu=True)
     try:
         assert accelerator.num_processes == 2
-        check(accelerator)
+        check_prepared(accelerator)
+        check_refusals(accelerator)
+        check_unprepared(accelerator)
     finally:
         dist.destroy_process_group()
 
 
-def check(accelerator: Any) -> None:
-    for make in (lambda train: train.batches(4), lambda train: MixedStream(train, batch_size=4, endless=False)):
-        train = mixed()
-        by_default = make(train)
-        twice = (
-            DataLoader(by_default, 4, collate_fn=train.collate)
-            if isinstance(by_default, MixedStream)
-            else DataLoader(train, batch_sampler=by_default, collate_fn=train.collate)
-        )
-        with pytest.raises(ConfigError, match=r"of 2 and an Accelerator.*rank=0, world_size=1"):
-            iter(by_default)
-        prepared = accelerator.prepare(twice)
-        if accelerator.is_main_process:  # that of a stream is the only one to read
-            with pytest.raises(ConfigError, match="most samples would never be seen"):
-                list(prepared.base_dataloader)
+def check_prepared(accelerator: Any) -> None:
+    """The very samples that remain, then whole epochs, whether they are set or counted."""
+    for make in (batched, streamed):
+        for workers in (0, 1):
+            train = mixed()
+            plain = make(train, workers)
+            order: Any = plain.dataset if make is streamed else plain.batch_sampler
+            order.load_state_dict(make_state(train.mixture, 7, 24))
+            loader = prepare(accelerator, plain)
+            assert seen(loader) == Counter(planned(7, 24))
+            assert seen(loader) == Counter(planned(8))
+            train.set_epoch(2)
+            assert seen(loader) == Counter(planned(2))
+            loader.set_epoch(6)
+            assert seen(loader) == Counter(planned(6))
 
-    for workers in (0, 1):
-        train = mixed()
-        batches = train.batches(4, rank=0, world_size=1)
-        loader = DataLoader(train, batch_sampler=batches, num_workers=workers, collate_fn=train.collate)
-        prepared = accelerator.prepare(loader)
-        plain = accelerator.prepare(DataLoader(mixed(), 4, num_workers=workers, collate_fn=torch.stack))
-        for epoch in (0, 1):  # which it counts itself
-            for way in (prepared, plain):
-                found = seen(way)
-                assert set(found) == set(planned(epoch))
-                assert len(found) == 56  # made even: 14 batches of 4
-        own = DataLoader(train, batch_sampler=train.batches(
-            4, rank=accelerator.process_index, world_size=accelerator.num_processes
-        ), collate_fn=train.collate)  # fmt: skip
-        train.set_epoch(2)
-        assert Counter(seen(own)) == Counter(planned(2))
-        stream = MixedStream(mixed(), batch_size=4, endless=False, rank=0, world_size=1)
-        dispatched = accelerator.prepare(DataLoader(stream, 4, num_workers=workers))
-        assert set(seen(dispatched)) == set(planned(0))
+
+def check_refusals(accelerator: Any) -> None:
+    for make in (batched, streamed):
+        for sharing in ({}, {"rank": 0, "world_size": 1}):
+            train = mixed()
+            train.set_epoch(5)
+            loader = accelerator.prepare(make(train, 0, **sharing))
+            if make is batched or accelerator.is_main_process:  # which alone reads a stream
+                with pytest.raises(ConfigError, match="integrations.accelerate import prepare"):
+                    loader.set_epoch(loader.iteration)
+        with pytest.raises(ConfigError, match=r"of 2 and an Accelerator.*accelerate.prepare"):
+            iter(make(mixed(), 0))
+    with pytest.raises(ConfigError, match="batches come from BatchSampler"):
+        prepare(accelerator, DataLoader(mixed(), 4))
+
+
+def check_unprepared(accelerator: Any) -> None:
+    """Accelerate's own sharing from epoch 0 on, which repeats samples; and a loader that it does not know."""
+    ours = accelerator.prepare(batched(mixed(), 0, rank=0, world_size=1))
+    theirs = accelerator.prepare(DataLoader(mixed(), 4, collate_fn=torch.stack))
+    for epoch in (0, 1):
+        for loader in (ours, theirs):
+            found = seen(loader)
+            assert set(found) == set(planned(epoch))
+            assert found.total() == 48
+    train = mixed()
+    train.set_epoch(2)
+    place = {"rank": accelerator.process_index, "world_size": accelerator.num_processes}
+    assert seen(batched(train, 0, **place)) == Counter(planned(2))
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_two_processes_see_every_sample_or_refuse() -> None:
+def test_two_processes_see_every_sample_once_or_refuse() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = int(free.getsockname()[1])

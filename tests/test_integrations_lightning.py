@@ -176,7 +176,7 @@ def test_a_checkpoint_resumes_after_its_last_batch(workers: int, how: str, tmp_p
     }[how]
 
     def data() -> Any:
-        mixed = MixedScans(Scans("r", 10), Endless(), ratio=0.25, seed=1)  # 14, 13, 13 samples
+        mixed = MixedScans(Scans("r", 10), Endless(), ratio=0.25, seed=1)  # 14 samples
         return module.MixedData(mixed, batch_size=3, num_workers=workers)
 
     whole = Model()
@@ -198,16 +198,6 @@ def test_a_checkpoint_within_an_epoch_needs_steps_of_its_size() -> None:
         data.train_dataloader()
     data.load_state_dict(make_state(data.train.mixture, 1, 0) | {"step": 4})
     data.train_dataloader()
-
-
-def test_epochs_that_grow_are_not_cut_short(tmp_path: Path) -> None:
-    mixed = MixedScans(Scans("r", 8), Endless(), ratio=[0.0, 0.5])
-    data = module.MixedData(mixed, batch_size=4)
-    with pytest.raises(ConfigError, match="epoch 1 of 4 batches, but Lightning expects 2.*reload_dataloaders"):
-        trainer(tmp_path, 2, enable_checkpointing=False).fit(Model(), data)
-    model = Model()
-    trainer(tmp_path, 2, enable_checkpointing=False, reload_dataloaders_every_n_epochs=1).fit(model, data)
-    assert Counter(epoch for epoch, *_ in model.seen) == {0: 8, 1: 16}
 
 
 class Shared(Model):

@@ -65,7 +65,7 @@ def test_counts_are_exact_over_epochs(
     assert (int(made.domain.sum()), len(made)) == (made.synthetics, sum(made.counts))
     if size == "add":
         assert sorted(made.index[~made.domain]) == list(range(real))
-        exact = real * share / (1 - share)
+        exact = Fraction(ceil(real * share / (1 - share)))
     else:
         assert len(made) == (real if size == "replace" else size)
         exact = len(made) * share
@@ -104,16 +104,23 @@ def test_every_source_gets_its_share_over_epochs(
 def test_rare_sources_and_small_ratios_get_their_turn() -> None:
     mixed = Mixture((PlannedSource(4),), (PlannedSource(None, 9.0), PlannedSource(None, 1.0)), make_schedule(0.5))
     assert running_counts(mixed, 50) == (200, 180, 20)
-    assert [quotas(mixture(4, 0.1), epoch) for epoch in range(5)] == [(4, 1), (4, 0), (4, 1), (4, 0), (4, 1)]
-    assert running_counts(mixture(4, 0.1), 900) == (3600, 400)
+    turns = [quotas(mixture(4, 0.1, epoch_size="replace"), epoch) for epoch in range(5)]
+    assert turns == [(3, 1), (4, 0), (3, 1), (4, 0), (4, 0)]
+    assert running_counts(mixture(4, 0.1, epoch_size="replace"), 900) == (3240, 360)
 
 
-def test_the_first_epoch_of_one_ratio_is_the_longest() -> None:
-    """A ``DistributedSampler`` or a trainer that asks for the length once never leaves a sample out."""
+@pytest.mark.parametrize("size", ["add", "replace", 17])
+@pytest.mark.parametrize("ratio", [0.1, 0.25, 1 / 3, Linear(0, 0.6, 4), {0: 0.6, 5: 0.2}, lambda e: 0.5 / (e + 1)])
+def test_all_epochs_have_one_length(ratio: object, size: str | int) -> None:
+    """What wraps a dataset asks for its length once."""
     for real in range(1, 30):
-        for ratio in (0.1, 0.25, 1 / 3, 0.37):
-            lengths = [sum(quotas(mixture(real, ratio), epoch)) for epoch in range(12)]
-            assert max(lengths) == lengths[0] <= min(lengths) + 1
+        mixed = mixture(real, ratio, epoch_size=size)
+        for epoch in range(8):
+            counts = quotas(mixed, epoch)
+            share = share_of(mixed.ratio, epoch)
+            assert sum(counts) == mixed.length
+            assert abs(counts[1] - mixed.length * share) < 1
+            assert size != "add" or counts[0] >= real
 
 
 @settings(max_examples=60)
@@ -261,8 +268,8 @@ def test_a_late_epoch_costs_no_more_than_the_first() -> None:
             return super().__call__(epoch)
 
     mixed = mixture(3, Counted(0.0, 0.5, 4))
-    # 0, 3/5 and 3/2 samples, then 3 an epoch
-    assert running_counts(mixed, 10**9) == (3 * 10**9, ceil(Fraction(21, 10)) + 3 * (10**9 - 3))
+    # 0, 1 and 2 synthetic samples of 6, then 3 in every epoch
+    assert running_counts(mixed, 10**9) == (15 + 3 * (10**9 - 3), 3 + 3 * (10**9 - 3))
     assert len(calls) < 20
 
 

@@ -78,13 +78,13 @@ def test_a_position_beyond_the_epoch_is_refused(make: Callable[[MixedScans], Any
 def test_the_last_epoch_of_a_schedule_ends_where_it_ends() -> None:
     train = mixed(ratio=[0.5, 0.25])
     assert after_epoch(train.mixture, 0) == (1, 0)
-    assert after_epoch(train.mixture, 1) == (1, 16)
+    assert after_epoch(train.mixture, 1) == (1, 24)
     train.set_epoch(1)
-    state = train.batches(4).state_dict(4)
-    assert (state["epoch"], state["position"]) == (1, 16)
+    state = train.batches(4).state_dict(6)
+    assert (state["epoch"], state["position"]) == (1, 24)
 
 
 def test_the_next_epochs_ratio_may_change() -> None:
     """What is still to come is not part of a state."""
-    state = make_state(mixed(ratio=[0.25, 0.25]).mixture, 0, 8)
-    batches(mixed(ratio=[0.25, 0.5])).load_state_dict(state)
+    state = make_state(mixed(ratio=[0.25, 0.25], epoch_size=16).mixture, 0, 8)
+    batches(mixed(ratio=[0.25, 0.5], epoch_size=16)).load_state_dict(state)

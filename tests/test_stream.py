@@ -190,6 +190,17 @@ def test_an_epochs_end_that_is_loaded_after_the_next_has_begun() -> None:
         assert len(list(resumed)) == (15 if isinstance(resumed, MixedStream) else 4)
 
 
+@pytest.mark.parametrize("persistent", [False, True])
+def test_a_resumed_epoch_ends_once(persistent: bool) -> None:
+    stream = MixedStream(mixed(), batch_size=4, endless=False)
+    stream.load_state_dict(state(2, 7))
+    loader = load(stream, 2, persistent_workers=persistent)
+    assert list(loader) == cut(sequence()[37:45], 4)
+    for epoch in (3, 4):
+        stream.set_epoch(epoch)
+        assert list(loader) == cut(sequence()[15 * epoch : 15 * epoch + 15], 4)
+
+
 def test_a_workers_state_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = MixedStream(mixed(), batch_size=4, endless=False)
     stream.set_epoch(3)

@@ -37,7 +37,7 @@ class Epochs(Protocol):
 
     def expect(self, epoch: int, positions: Iterable[int]) -> None: ...
 
-    def length(self, epoch: int) -> int: ...
+    def __len__(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def go_to(dataset: Epochs, epoch: int, position: int) -> None:
     A ``StatefulDataLoader`` loads its state when it begins to iterate, which is after ``set_epoch``. If the state marks
     the end of an epoch and the trainer has set the next epoch already, that epoch is kept.
     """
-    if not (dataset.epoch == epoch + 1 and position >= dataset.length(epoch)):
+    if not (dataset.epoch == epoch + 1 and position >= len(dataset)):
         dataset.set_epoch(epoch)
 
 
@@ -117,8 +117,8 @@ class MixedBatches(Sampler[list[int]]):
 
     Pass it to a ``DataLoader`` as ``batch_sampler``. Over all ranks every position is yielded once. Each position
     carries the epoch in which iteration began, so that ``set_epoch`` may be called at any time: it takes effect with
-    the next pass. If a library divides batch samplers among ranks itself (Accelerate's ``prepare``), use
-    ``rank=0, world_size=1``.
+    the next pass. If a library divides batch samplers among ranks itself, use ``rank=0, world_size=1``; Accelerate's
+    ``prepare`` does so too, and repeats samples: use ``lidar_synth.integrations.accelerate.prepare``.
 
     Args:
         dataset: a ``MixedScans``.
@@ -196,7 +196,7 @@ class MixedBatches(Sampler[list[int]]):
             position = steps[number].start
         elif done is None:
             # Not the next epoch yet: a trainer that resumes here still has to see the end of this one.
-            position = self.dataset.length(epoch)
+            position = len(self.dataset)
         else:
             epoch, position = after_epoch(self.dataset.mixture, epoch)
         return make_state(self.dataset.mixture, epoch, position)
@@ -224,6 +224,11 @@ class MixedBatches(Sampler[list[int]]):
                 yield [Position(position, epoch) for position in share]
         self._passed, self._fetched = (epoch, steps.start), (before, yielded)
 
+    def divide(self, rank: int, world_size: int) -> None:
+        """Change the rank of this process and the number of ranks, before iterating."""
+        self.rank, self.world_size = place(rank, world_size)
+        self._by_default = False
+
     def _check(self) -> None:
         if self._by_default:
             check_unshared("train.batches(...)", self.rank, self.world_size)
@@ -231,4 +236,4 @@ class MixedBatches(Sampler[list[int]]):
     def _steps(self) -> CutSteps:
         epoch = self.dataset.epoch
         start = self._start[1] if self._start[0] == epoch else 0
-        return cut_steps(start, self.dataset.length(epoch), self.batch_size, self.world_size, self.drop_last)
+        return cut_steps(start, len(self.dataset), self.batch_size, self.world_size, self.drop_last)

@@ -10,14 +10,15 @@ import sys
 import warnings
 from types import FrameType
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakSet
 
 import torch
 from torch import Tensor
-from torch.utils.data import get_worker_info
+from torch.utils.data import Subset, get_worker_info
 from torch.utils.data._utils.fetch import _MapDatasetFetcher
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.mixing.state import count_accelerated
 
 REPEATED = (
     "epoch {} begins again, with the same scans in the same order as before. Call set_epoch(epoch) before each pass."
@@ -65,11 +66,13 @@ class CurrentEpoch:
     """The current epoch of a dataset in all its processes, and the epochs in which passes over it began."""
 
     def __init__(self) -> None:
-        self._shared = shared_integers(0, -1, 0)  # current epoch; epoch of the latest pass; 1 once it has warned
+        # current epoch; epoch of the latest pass; 1 once it has warned; 1 once the current epoch is used
+        self._shared = shared_integers(0, -1, 0, 0)
         self._fetched = shared_integers(*[0] * _COUNTERS)  # number of positions fetched, by worker
         self._own = 0  # the epoch that this process set, or the current epoch when this process started
         self._process = os.getpid()
         self._passes: WeakKeyDictionary[Any, int] = WeakKeyDictionary()  # {fetcher: epoch of its pass}
+        self._followers: WeakSet[Any] = WeakSet()
 
     def __int__(self) -> int:
         return int(self._shared[0])
@@ -85,15 +88,36 @@ class CurrentEpoch:
         return self._own
 
     def set(self, epoch: int) -> None:
-        """Set the epoch for all processes."""
+        """Set the epoch for all processes.
+
+        Raises:
+            ConfigError: if Accelerate sets an epoch before the one that was set or resumed and never used.
+        """
+        unused = self._shared[3] == 0
+        if epoch < self._own and unused and not self._followers and count_accelerated():
+            raise ConfigError(
+                f"epoch {epoch} where epoch {self._own} was set or resumed: a loader of accelerator.prepare counts its "
+                "passes from 0",
+                "the epoch that was set or resumed",
+                "from lidar_synth.integrations.accelerate import prepare; loader = prepare(accelerator, loader).",
+            )
         self._shared[0], self._own = epoch, epoch
+        self._shared[3] = 0
+        for loader in self._followers:
+            loader.iteration = epoch
+
+    def follow(self, loader: Any) -> None:
+        """Keep the attribute ``iteration`` of a loader, the epoch of its next pass, at the current epoch."""
+        self._followers.add(loader)
+        loader.iteration = int(self)
 
     def of(self, index: int) -> int:
         """The epoch of an index that is being fetched.
 
         Raises:
-            ConfigError: if another epoch was set since the DataLoader's pass began.
+            ConfigError: if another epoch was set since the DataLoader's pass began, or if it loads a ``Subset``.
         """
+        self._shared[3] = 1
         if isinstance(index, Position):
             worker = get_worker_info()
             self._fetched[worker.id % _COUNTERS if worker else 0] += 1
@@ -106,6 +130,7 @@ class CurrentEpoch:
             self._process = os.getpid()
             self._passes.clear()
         if fetcher not in self._passes:
+            check_whole(fetcher.dataset)
             self._passes[fetcher] = self._own if forked else epoch
             self.note_pass(self._passes[fetcher])
         check_pass(self._passes[fetcher], epoch)
@@ -113,6 +138,7 @@ class CurrentEpoch:
 
     def note_pass(self, epoch: int) -> None:
         """Note that a pass begins, and warn once if the pass before had the same epoch; only worker 0 does this."""
+        self._shared[3] = 1
         worker = get_worker_info()
         if worker is not None and worker.id > 0:
             return
@@ -126,10 +152,10 @@ class CurrentEpoch:
         self._shared[1] = -1
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_passes"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_passes", "_followers")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__ |= state | {"_passes": WeakKeyDictionary()}
+        self.__dict__ |= state | {"_passes": WeakKeyDictionary(), "_followers": WeakSet()}
 
 
 def check_pass(begun: int, epoch: int) -> None:
@@ -144,6 +170,21 @@ def check_pass(begun: int, epoch: int) -> None:
             "set_epoch before iter(loader), as the workers fetch ahead",
             "Call set_epoch before the loop over the loader. If a trainer's hook runs later, pass the DataLoader "
             "batch_sampler=train.batches(batch_size): its batches keep the epoch in which iteration began.",
+        )
+
+
+def check_whole(dataset: Any) -> None:
+    """Refuse a ``Subset`` of a mixture.
+
+    Raises:
+        ConfigError: if a DataLoader's dataset is one.
+    """
+    if isinstance(dataset, Subset):
+        raise ConfigError(
+            "a Subset of a mixture, of random_split for instance: its indices mean other scans in every epoch, so that "
+            "held-out real scans would be trained on",
+            "the real scans split, then mixed",
+            "kept, held_out = random_split(real, [0.9, 0.1]); train = MixedScans(kept, synth, ...)",
         )
 
 

@@ -74,7 +74,7 @@ class MixingPlan:
         return sum(self.counts[self.reals :])
 
     def __len__(self) -> int:
-        return self._total
+        return self.mixture.length
 
     def __getitem__(self, position: int) -> tuple[int, int]:
         """The source and the local index of the sample at a position.
@@ -143,10 +143,6 @@ class MixingPlan:
     def hash(self) -> str:
         """SHA-256 of ``facts``, as hexadecimal digits."""
         return hashlib.sha256(json.dumps(self.facts, sort_keys=True).encode()).hexdigest()
-
-    @cached_property
-    def _total(self) -> int:
-        return sum(self.counts)
 
     @cached_property
     def _starts(self) -> NDArray[np.int64]:

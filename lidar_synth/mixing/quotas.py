@@ -1,7 +1,10 @@
 """The number of samples from each source in an epoch, and in all epochs before it.
 
-Exact shares are fractions. They are added up over the epochs and only the sum is rounded, so that rounding errors do
-not add up: after any number of epochs, the number of synthetic samples is the exact number, rounded up.
+Every epoch of a mixture has the same length, because samplers and datasets that wrap another one ask for its length
+once. With ``epoch_size="add"`` that is the number of real scans and of the synthetic ones that the largest share of the
+schedule adds to them, rounded up; each epoch's share of it is rounded up too. Otherwise exact shares, which are
+fractions, are added up over the epochs and only the sum is rounded: after any number of epochs, the number of synthetic
+samples is the exact number, rounded up.
 
 Several sources of a kind divide its samples by their weights in the same way. The sources are the leaves of a binary
 tree, and each node sends ``round(m * share)`` of its first m samples to the left and the rest to the right. Both
@@ -13,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property, lru_cache
+from itertools import takewhile
 from math import ceil
 from typing import Any, Literal, TypeVar
 
@@ -23,11 +27,12 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.mixing.schedules import Schedule, settled, share_of, to_integer
 
 EpochSize = Literal["add", "replace"] | int
-"""The length of an epoch: ``"add"`` uses every real scan once and adds synthetic ones to reach the ratio;
-``"replace"`` has as many samples as there are real scans, some of them synthetic; a number is the length itself."""
+"""The length of all epochs: ``"add"`` uses every real scan once and adds synthetic ones to reach the ratio, or the
+largest ratio of a schedule (where the ratio is smaller, real scans are used more often, all equally); ``"replace"`` has
+as many samples as there are real scans, some of them synthetic; a number is the length itself."""
 
 _FINEST = 2**30  # largest denominator of a source's share: products stay within 64 bits
-_LAP_EPOCHS = 100  # number of epochs of a changing schedule that determine the length of a lap
+_FIRST_EPOCHS = 100  # number of epochs of a changing schedule that determine lengths of epochs and laps
 
 
 @dataclass(frozen=True)
@@ -114,18 +119,42 @@ class Mixture:
     def laps(self) -> tuple[int, ...]:
         """For each synthetic source, the largest number of scans that an epoch takes from it, at least 1.
 
-        With ``reuse``, scans come in laps of this length, so that no epoch contains a scan twice. For a schedule that
-        is a function, the first hundred epochs count.
+        With ``reuse``, scans come in laps of this length, so that no epoch contains a scan twice.
         """
+        most = max(ceil(exact_synthetic(self, epoch)) for epoch in self._deciding)
+        return tuple(max(1, lap) for lap in _most(_tree(self.synthetic_weights), most))
+
+    @cached_property
+    def length(self) -> int:
+        """Number of samples in an epoch, the same in all of them.
+
+        Raises:
+            ConfigError: on ``epoch_size="add"`` with a ratio of 1, which no number of synthetic samples reaches.
+        """
+        if self.epoch_size != "add":
+            return self.real_length if self.epoch_size == "replace" else int(self.epoch_size)
+        share, epoch = max((share_of(self.ratio, epoch), -epoch) for epoch in self._deciding)
+        if share == 1:
+            raise ConfigError(
+                f"ratio 1 in epoch {-epoch} with epoch_size='add', which keeps every real scan",
+                "a ratio below 1",
+                "Use epoch_size='replace' or a number of samples.",
+            )
+        return self.real_length + ceil(self.real_length * share / (1 - share))
+
+    @cached_property
+    def _deciding(self) -> tuple[int, ...]:
+        """The epochs that determine lengths: all until the schedule settles, the first hundred if it never does."""
         last = settled(self.ratio)
-        epochs = [*range(_LAP_EPOCHS if last is None else min(last, _LAP_EPOCHS)), last or 0]
-        exact = [Fraction(0)]
-        for epoch in epochs:
-            try:
-                exact.append(exact_synthetic(self, epoch))
-            except ConfigError:  # the schedule ends here
-                break
-        return tuple(max(1, lap) for lap in _most(_tree(self.synthetic_weights), ceil(max(exact))))
+        epochs = [*range(_FIRST_EPOCHS if last is None else min(last, _FIRST_EPOCHS)), last or 0]
+        return tuple(takewhile(self._has_ratio, epochs))
+
+    def _has_ratio(self, epoch: int) -> bool:
+        try:
+            share_of(self.ratio, epoch)
+        except ConfigError:
+            return False
+        return True
 
     @cached_property
     def _sums(self) -> dict[int, Fraction]:
@@ -141,24 +170,16 @@ def exact_synthetic(mixture: Mixture, epoch: int) -> Fraction:
         DataError: if the ratio needs real scans and there are none.
     """
     share, size = share_of(mixture.ratio, epoch), mixture.epoch_size
-    real = mixture.real_length
     if share > 0 and not mixture.synthetic:
         raise ConfigError(f"ratio {float(share):g} in epoch {epoch} without a synthetic source", "one, or ratio 0")
-    if not real and (share < 1 or not isinstance(size, int)):
+    if not mixture.real_length and (share < 1 or not isinstance(size, int)):
         raise DataError(
             f"no real scans, with ratio {float(share):g} and epoch_size={size!r}",
             "a real source with scans",
             "For synthetic scans only, use ratio=1 and set epoch_size to the number of samples.",
         )
-    if size != "add":
-        return (real if size == "replace" else int(size)) * share
-    if share == 1:
-        raise ConfigError(
-            f"ratio 1 in epoch {epoch} with epoch_size='add', which keeps every real scan",
-            "a ratio below 1",
-            "Use epoch_size='replace' or a number of samples.",
-        )
-    return real * share / (1 - share)
+    exact = mixture.length * share
+    return Fraction(ceil(exact)) if size == "add" else exact
 
 
 def synthetic_before(mixture: Mixture, epoch: int) -> Fraction:
@@ -174,12 +195,8 @@ def synthetic_before(mixture: Mixture, epoch: int) -> Fraction:
 
 def running_counts(mixture: Mixture, epoch: int) -> tuple[int, ...]:
     """The number of samples from each source in all epochs before this one together, real sources first."""
-    synthetic, size = ceil(synthetic_before(mixture, epoch)), mixture.epoch_size
-    if size == "add":
-        reals = tuple(epoch * (source.length or 0) for source in mixture.real)
-    else:
-        total = epoch * (mixture.real_length if size == "replace" else int(size))
-        reals = split(mixture.real_weights, total - synthetic)
+    synthetic = ceil(synthetic_before(mixture, epoch))
+    reals = split(mixture.real_weights, epoch * mixture.length - synthetic)
     return reals + split(mixture.synthetic_weights, synthetic)
 
 

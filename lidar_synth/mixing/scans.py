@@ -53,8 +53,9 @@ class MixedScans(Dataset[Any]):
         labels: label policy of the synthetic scans: a name of ``lidar_synth.labels.POLICIES`` or a function.
         seed: of the order, of all random numbers of a sample, and of a generator's scans.
         label_options: keyword arguments of the label policy.
-        epoch_size: ``"add"`` uses every real scan once and adds synthetic ones; ``"replace"`` has as many samples as
-            there are real scans; a number is the length.
+        epoch_size: the length of every epoch. ``"add"`` uses every real scan once and adds synthetic ones, as many as
+            the largest ratio of a schedule needs; where the ratio is smaller, real scans are used more often.
+            ``"replace"`` has as many samples as there are real scans; a number is the length.
         reuse: number of epochs in which each synthetic scan is used, with different random augmentations.
         balanced: whether to spread synthetic samples evenly, so that every batch in the order of the plan holds its
             exact share (up to one sample if that is not a whole number).
@@ -262,11 +263,6 @@ class MixedScans(Dataset[Any]):
                 if hasattr(source, "expect"):
                     source.expect(indices[sources == number].tolist())
 
-    def length(self, epoch: int) -> int:
-        """Number of samples in an epoch."""
-        planned = self._planned
-        return len(planned[1] if planned is not None and planned[0] == epoch else MixingPlan(self.mixture, epoch))
-
     def __repr__(self) -> str:
         plan = MixingPlan(self.mixture, self.epoch)
         size = f"{len(plan)} samples in epoch {self.epoch}, {plan.synthetics} of them synthetic; seed {self.seed}"
@@ -274,11 +270,11 @@ class MixedScans(Dataset[Any]):
         return f"{type(self).__name__}: {size}\n  real: {kinds[0] or 'none'}; synthetic: {kinds[1] or 'none'}"
 
     def __len__(self) -> int:
-        return self.length(self.epoch)
+        return self.mixture.length
 
     def __getitem__(self, index: int) -> Any:
         epoch = self.epoch_of(index)
-        length = len(self.plan(epoch))
+        length = len(self)
         if not -length <= index < length:
             raise IndexError(f"sample {index} of {length}")
         return self.sample(epoch, int(index) % length)

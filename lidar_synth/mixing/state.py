@@ -40,20 +40,25 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
     return rank, world_size
 
 
+def count_accelerated() -> int:
+    """Number of processes of an ``Accelerator`` that is set up, 0 without one."""
+    state = sys.modules.get("accelerate.state")
+    return int(state.PartialState().num_processes) if state and state.is_initialized() else 0
+
+
 def check_unshared(what: str, rank: int, world_size: int) -> None:
     """Refuse default ranks if an ``Accelerator`` may divide the batches among the same processes a second time.
 
     Raises:
         ConfigError: if an ``Accelerator`` is set up for several processes.
     """
-    accelerate = sys.modules.get("accelerate.state")
-    if world_size > 1 and accelerate and accelerate.PartialState._shared_state.get("num_processes", 1) > 1:
+    if world_size > 1 and count_accelerated() > 1:
         raise ConfigError(
             f"{what} with the default rank {rank} of {world_size} and an Accelerator, which divides prepared loaders "
             "among the same processes again: most samples would never be seen",
             "only one of the two to divide the samples",
-            f"For a loader that is passed to accelerator.prepare, call {what} with rank=0, world_size=1; for any other "
-            "loader with rank=accelerator.process_index, world_size=accelerator.num_processes.",
+            "Prepare the loader by lidar_synth.integrations.accelerate.prepare(accelerator, loader); if it is not "
+            f"prepared, call {what} with rank=accelerator.process_index, world_size=accelerator.num_processes.",
         )
 
 

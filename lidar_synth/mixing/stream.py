@@ -72,7 +72,8 @@ class MixedStream(IterableDataset[Any]):
         self._start = shared_integers(0, 0)  # epoch and position of the loaded state
         self._given = 0  # samples that this process has yielded since it began to iterate
         self._begun: tuple[int, int] | None = None  # epoch and position where it began
-        self._resume: dict[str, Any] = {}  # the state from which this process has to resume
+        self._resume: dict[str, Any] = {}  # the state from which the process that loaded it has to resume
+        self._loaded_by = 0  # that process
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch in which iterating begins."""
@@ -107,7 +108,7 @@ class MixedStream(IterableDataset[Any]):
         for number in islice(chain.from_iterable(batches), self._given, None):
             if guarded:
                 check_pass(begin, self.scans.epoch)
-            while number >= (end := first + self.scans.length(epoch)):
+            while number >= (end := first + len(self.scans)):
                 epoch, first, announced = epoch + 1, end, 0
                 if worker == 0:
                     self.scans.tell_sources(epoch)
@@ -139,7 +140,7 @@ class MixedStream(IterableDataset[Any]):
         after = self._after(epoch, position, done + (part > 0))
         if not self.endless and after[0] > epoch:
             # Not the next epoch yet: a trainer that resumes here still has to see the end of this one.
-            after = epoch, self.scans.length(epoch)
+            after = epoch, len(self.scans)
         return make_state(self.scans.mixture, *after)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -150,6 +151,7 @@ class MixedStream(IterableDataset[Any]):
         """
         epoch, position = checked_state(state, self.scans.mixture)
         self._begun, self._resume = None, {k: v for k, v in state.items() if k not in ("plan", "mixture")}
+        self._loaded_by = os.getpid()
         self.scans.current.forget_pass()
         if get_worker_info() is None:
             # A worker does not write to shared memory, which the main process may have changed since.
@@ -161,7 +163,7 @@ class MixedStream(IterableDataset[Any]):
         in_worker = get_worker_info() is not None
         if self._begun is not None and (in_worker or self._begun[0] == self.scans.epoch):
             return *self._begun, self._given
-        if in_worker and self._resume:
+        if in_worker and self._resume and self._loaded_by == os.getpid():
             return self._resume["epoch"], self._resume["position"], self._resume.get("given", 0)
         # A worker that has just started begins in the epoch that the main process had at iter(loader).
         started = in_worker and self._process != os.getpid()
@@ -185,9 +187,14 @@ class MixedStream(IterableDataset[Any]):
         size = self.batch_size * self.world_size
         steps: Iterable[range] = (range(i * size, (i + 1) * size) for i in count(since // size))
         if not self.endless:
-            cut = self._steps(0, self.scans.length(epoch) - position)
+            cut = self._steps(0, len(self.scans) - position)
             steps = (cut[i] for i in range(since // size, len(cut)))
         return (rank_share(step, self.rank, self.world_size) for step in steps)
+
+    def divide(self, rank: int, world_size: int) -> None:
+        """Change the rank of this process and the number of ranks, before iterating."""
+        self.rank, self.world_size = place(rank, world_size)
+        self._by_default = False
 
     def _check(self) -> None:
         if self._by_default:
@@ -204,11 +211,9 @@ class MixedStream(IterableDataset[Any]):
     def _after(self, epoch: int, position: int, done: int) -> tuple[int, int]:
         """The epoch and position after a number of batches."""
         if not self.endless:
-            steps = self._steps(position, self.scans.length(epoch))
+            steps = self._steps(position, len(self.scans))
             if not 0 <= done <= len(steps):
                 raise ConfigError(f"{done} batches done of {len(steps)}", "a number of batches of this epoch")
             return (epoch, steps[done].start) if done < len(steps) else after_epoch(self.scans.mixture, epoch)
-        position += done * self.batch_size * self.world_size
-        while position >= (length := self.scans.length(epoch)):
-            epoch, position = epoch + 1, position - length
-        return epoch, position
+        epochs, position = divmod(position + done * self.batch_size * self.world_size, len(self.scans))
+        return epoch + epochs, position
