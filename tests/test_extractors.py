@@ -253,7 +253,7 @@ def _cut(file: str) -> Callable[[Path], object]:
 
 
 FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], str]] = {
-    "code": ("lidm_spvcnn", lambda f: torch.save({"state_dict": print}, f / "model.ckpt"), DataError, "was not loaded"),
+    "code": ("lidm_spvcnn", lambda f: torch.save({"state_dict": print}, f / "model.ckpt"), DataError, "not tensors by"),
     "truncated": ("lidm_spvcnn", _cut("model.ckpt"), DataError, "model.ckpt is truncated"),
     "no weights": ("lidm_spvcnn", lambda f: (f / "model.ckpt").unlink(), FileError, "model.ckpt"),
     "no state": ("lidm_minkowski", _reweigh("model.ckpt", lambda c: c.pop("state_dict")), DataError, "not tensors"),

@@ -2,7 +2,6 @@
 
 import copy
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -277,25 +276,22 @@ def test_a_missing_config_yaml_is_reported(tmp_path: Path) -> None:
         read_lidm(path)
 
 
-class Evil:
-    """An object that creates a folder when it is unpickled."""
-
-    def __init__(self, trace: Path) -> None:
-        self.trace = trace
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os.mkdir, (str(self.trace),)
-
-
-def test_code_in_a_pickle_does_not_run(tmp_path: Path) -> None:
+def test_a_pickle_of_something_else_is_refused(tmp_path: Path) -> None:
     path = release(tmp_path, config_of(FIRST), {})
-    torch.save({"state_dict": {}, "callbacks": Evil(tmp_path / "ran")}, path)
-    with pytest.raises(DataError, match=r"would call \w+\.mkdir .*was not loaded"):
-        read_lidm(path)
-    assert not (tmp_path / "ran").exists()
     torch.save([1], path)
     with pytest.raises(DataError, match="state_dict among its keys"):
         read_lidm(path)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_bare_state_dictionary_of_a_wrapped_network_is_imported(tmp_path: Path, zipped: bool) -> None:
+    weights = random_weights(FIRST, tmp_path)
+    wanted = read_lidm(release(tmp_path, config_of(FIRST), weights))[1][CODEC].state_dict()
+    bare = {f"module._orig_mod.{name}": tensor for name, tensor in weights.items()}
+    torch.save(bare, path := tmp_path / "model.ckpt", _use_new_zipfile_serialization=zipped)
+    found = read_lidm(path)[1][CODEC].state_dict()
+    assert found.keys() == wanted.keys()
+    assert all(torch.equal(found[name], tensor) for name, tensor in wanted.items())
 
 
 def test_an_imported_checkpoint_gives_the_results_of_lidm(golden: Golden, tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ def test_recognition_by_hand() -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[Path], object], type[LidarSynthError], str]] = {
-    "code": (lambda a: torch.save({"a": print}, a / "backbone"), DataError, "was not loaded"),
+    "code": (lambda a: torch.save({"a": print}, a / "backbone"), DataError, "not tensors by name"),
     "truncated": (lambda a: (a / "backbone").write_bytes((a / "backbone").read_bytes()[:9000]), DataError, "backbone"),
     "missing": (lambda a: (a / "segmentation_head").unlink(), FileError, "segmentation_head"),
     "other weights": (

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 MOST_BYTES = 128 << 20
 """Maximum size of all decompressed arrays of a file in bytes: 8 million points with reflectance."""
 
+PICTURES = ("PNG", "JPEG")
+"""Formats of images; Pillow's other readers start programs (PostScript) or are little tested."""
+
 MOST_PIXELS = 1 << 25
 """Maximum number of pixels of an image."""
 
@@ -40,6 +43,18 @@ LONGEST_PLAIN = 3000
 
 MOST_NODES, DEEPEST = 20_000, 64
 """Maximum number of values in a YAML text, with all aliases expanded, and maximum number of levels."""
+
+DAMAGED_ZIP = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    OSError,
+    EOFError,
+    ValueError,
+    OverflowError,
+    RuntimeError,
+)
+"""Exceptions of ``zipfile`` on a damaged file; encrypted members and unknown methods are a RuntimeError."""
 
 ARRAYS = "arrays of numbers written by numpy, none of them pickled"
 
@@ -160,23 +175,21 @@ def _unzip(content: bytes, where: str, only: Collection[str] | None, most: int) 
     try:
         with zipfile.ZipFile(BytesIO(content)) as archive:
             infos = archive.infolist()
-            fault = _zip_fault(infos, len(content), most)
+            fault = zip_fault(infos, len(content), most)
             members: dict[str, bytes] = {}
             for info in [] if fault else infos:
                 name = info.filename.removesuffix(".npy")
                 if only is None or name in only:
                     with archive.open(info) as file:
                         members[name] = file.read(info.file_size)  # read() alone has no limit
-    # The exceptions of zipfile on a damaged file; encrypted members and unknown methods are a RuntimeError.
-    except (zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, OverflowError,
-            RuntimeError) as error:  # fmt: skip
+    except DAMAGED_ZIP as error:
         raise DataError(f"{where}: {error or type(error).__name__}", ARRAYS, SKIP_HINT) from error
     if fault:
         raise DataError(f"{where} {fault}", ARRAYS, SKIP_HINT)
     return members
 
 
-def _zip_fault(infos: list[zipfile.ZipInfo], size: int, most: int) -> str:
+def zip_fault(infos: list[zipfile.ZipInfo], size: int, most: int) -> str:
     """Why the members of a ZIP file of this size are refused; "" if they are accepted."""
     names = [info.filename for info in infos]
     if len(set(names)) < len(names):
@@ -248,7 +261,7 @@ def read_picture(path: Path, expected: str = "a PNG or JPEG file") -> "Image":
 
     content = BytesIO(read_file(path))
     try:
-        with warnings.catch_warnings(), Image.open(content) as opened:
+        with warnings.catch_warnings(), Image.open(content, formats=PICTURES) as opened:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             size = opened.size
             if prod(size) <= MOST_PIXELS:

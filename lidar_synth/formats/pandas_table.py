@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import SKIP_HINT, read_file
 from lidar_synth.files.parsing import MOST_BYTES
-from lidar_synth.files.pickles import Call, parse_pickle
+from lidar_synth.files.pickles import DTYPE, ENCODE, Call, bytes_of, dtype_of, parse_pickle
 
 EXPECTED = "a pickled pandas table of numbers and text"
 
@@ -39,16 +39,13 @@ STRINGS = (
 ARRAYS = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 BUFFERS = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
 PLAIN_OBJECTS = ("copy_reg._reconstructor", "copyreg._reconstructor")
-DTYPE, ENCODE, SLICES = "numpy.dtype", "_codecs.encode", ("builtins.slice", "__builtin__.slice")
+SLICES = ("builtins.slice", "__builtin__.slice")
 
 KNOWN = frozenset(
     (*MANAGERS, *BLOCKS, *FRAMES, *INDICES, *MAKE_INDEX, *OTHER_INDICES, *BACKED_ARRAYS, *STRINGS, *ARRAYS, *BUFFERS,
      *PLAIN_OBJECTS, DTYPE, ENCODE, *SLICES, "numpy.ndarray", "builtins.object", "__builtin__.object")
 )  # fmt: skip
 """The names that may occur in a pickled table; none of them is imported."""
-
-TYPES = frozenset(("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"))
-"""Types of arrays of numbers; arrays of objects (``O8``) may hold text, numbers, truth values and None."""
 
 MOST_COLUMNS = 1000
 """Maximum number of columns of a table, and of their blocks; PandaSet's have at most 17."""
@@ -166,11 +163,11 @@ class _Arrays:
         lengths = shape if isinstance(shape, tuple) else ()
         if len(lengths) not in (1, 2) or not all(type(length) is int and length >= 0 for length in lengths):
             raise ValueError("an array of another shape than (N,) or (N, M)")
-        kind = _dtype(dtype)
+        kind = dtype_of(dtype)
         self.left -= prod(shape) * kind.itemsize
         if self.left < 0:
             raise ValueError(f"more than {MOST_BYTES} bytes of arrays")
-        flat = _objects(data) if kind.hasobject else np.frombuffer(_bytes(data), kind)
+        flat = _objects(data) if kind.hasobject else np.frombuffer(bytes_of(data), kind)
         return flat.reshape(shape, order="F" if order == "F" else "C")
 
     def places(self, value: Any, count: int) -> list[int]:
@@ -183,34 +180,9 @@ class _Arrays:
         return [range(count)[place] for place in places.tolist()]
 
 
-def _dtype(value: Any) -> np.dtype[Any]:
-    call = _call(value, (DTYPE,))
-    [text, *_] = call.args
-    _, order, *structure = call.state
-    if order not in ("<", ">", "|", "=") or any(part is not None for part in structure[:3]):
-        raise ValueError("an array of structures")
-    if text in ("O8", "O4", "O"):
-        return np.dtype(object)
-    if text not in TYPES:
-        raise ValueError(f"an array of {text!r}")
-    dtype: np.dtype[Any] = np.dtype(f"{order}{text}")
-    return dtype
-
-
 def _objects(values: Any) -> NDArray[Any]:
     if not isinstance(values, list) or not all(v is None or type(v) in (str, int, float, bool) for v in values):
         raise TypeError("objects that are neither numbers nor text")
     array = np.empty(len(values), object)
     array[:] = values
     return array
-
-
-def _bytes(value: Any) -> bytes | bytearray:
-    """The bytes of an array; protocol 2 writes them as text with one character for each byte."""
-    if isinstance(value, Call) and value.name == ENCODE:
-        [value, _] = value.args
-    if isinstance(value, str):
-        return value.encode("latin-1")
-    if not isinstance(value, bytes | bytearray):
-        raise TypeError(f"a {type(value).__name__} instead of an array's bytes")
-    return value

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from lidar_synth.evaluate.extractors.archive import load_weights
 from lidar_synth.evaluate.extractors.inputs import preparation
 from lidar_synth.evaluate.extractors.per_scan import PerScan, some
-from lidar_synth.generate.importers.pickled import load_pickle
+from lidar_synth.files.torch_files import load_pickle
 from lidar_synth.geometry.scan import Scan
 
 METRES = 80.0

@@ -27,10 +27,10 @@ from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, Recording
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import read_yaml
+from lidar_synth.files.torch_files import load_pickle, state_of
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
-from lidar_synth.generate.importers.pickled import load_pickle, state_of
 from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.models import assemble
@@ -66,9 +66,11 @@ def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
     """
     config = _config(path.with_name("config.yaml"))
     content = load_pickle(path, "LiDM")
-    if not isinstance(content, dict) or "state_dict" not in content:
-        given = sorted(map(str, content))[:8] if isinstance(content, dict) else type(content).__name__
-        raise DataError(f"{path} holds {given}", "LiDM's dictionary with state_dict among its keys")
+    if not isinstance(content, dict) or not content:
+        raise DataError(
+            f"{path} holds {type(content).__name__}",
+            "LiDM's dictionary with state_dict among its keys, or a state dictionary",
+        )
     weights = {k: v for k, v in state_of(content, "state_dict", path).items() if not k.startswith("loss.")}
     try:
         model, data = config["model"]["params"], config["data"]["params"]

@@ -22,9 +22,9 @@ from torch import Tensor, nn
 from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, whole
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import sha256
+from lidar_synth.files.torch_files import load_pickle, state_of
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec
-from lidar_synth.generate.importers.pickled import load_pickle, state_of
 from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.models import assemble
@@ -68,7 +68,7 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         FileError: if the file cannot be read.
         DataError: on a file that is not such a checkpoint, is truncated or contains code, or whose keys do not fit.
     """
-    content = _load(path)
+    content, weights = _load(path)
     try:
         data, model = content["cfg"]["data"], content["cfg"]["model"]
         part, normalisation = _network(data, model, path), _normalisation(data, path)
@@ -84,16 +84,16 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         raise
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: a configuration that does not fit ({error!r})", "R2Flow's groups and keys") from error
-    return header, {VELOCITY: convert(content["weights"], part, str(path))}
+    return header, {VELOCITY: convert(weights, part, str(path))}
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The content of a file, and its weights."""
     content = load_pickle(path, "R2Flow")
     if not isinstance(content, dict) or not {"cfg", "weights"} <= set(content):
         given = sorted(map(str, content))[:8] if isinstance(content, dict) else type(content).__name__
         raise DataError(f"{path} holds {given}", "R2Flow's dictionary with cfg and weights among its keys")
-    state_of(content, "weights", path)
-    return content
+    return content, state_of(content, "weights", path)
 
 
 def _network(data: Mapping[str, Any], model: Mapping[str, Any], path: Path) -> NetworkSpec:
