@@ -6,14 +6,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.geometry.scan import POINT_FIELDS
+from lidar_synth.datasets.classes import GROUND, IGNORE
+from lidar_synth.geometry.scan import POINT_FIELDS, Scan
 from lidar_synth.geometry.transfer.kernels import hit_footprints, hit_triangles, rows_above
 from lidar_synth.geometry.transfer.rays import Rays
 from lidar_synth.geometry.transfer.surfaces import Surfaces
 
 FRONT = 0.5, 0.03
 """Metres, and share of its distance, by which the footprint of a return has to lie in front of a surface to hide it."""
+
+REACH = 0.3
+"""Metres by which the level patch of a return that is not of the ground reaches along a ray: roofs end, the road goes
+on."""
 
 
 @dataclass
@@ -74,10 +78,19 @@ def first_hits(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upri
     normal = points[rim] - np.outer(points[rim] @ upright, upright)  # vertical patches face the sensor
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     normal[surfaces.level[rim]] = upright
-    hit_footprints(points[rim], azimuth[rim], rho[rim], normal, half, up, down, *lasers, patch, of)
+    reach = _reach(scan, rim)
+    hit_footprints(points[rim], azimuth[rim], rho[rim], normal, half, up, down, reach, *lasers, patch, of)
     front = patch * (1 + FRONT[1]) + FRONT[0] < solid
     front |= np.isinf(solid) & np.isfinite(patch)
     vertex[front] = np.flatnonzero(rim)[of[front]]
     solid[front], mean[front], facing[front] = patch[front], value[vertex[front]], 1.0
     names = [n for n in POINT_FIELDS if n not in ("reflectance", "ring") and getattr(scan, n) is not None]
     return Hits(solid, mean, facing, {n: getattr(scan, n)[vertex] for n in names})
+
+
+def _reach(scan: Scan, which: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(n,) metres by which the patches of some returns reach along a ray; without limit on ground and unlabelled."""
+    if scan.label is None:
+        return np.full(int(which.sum()), np.inf)
+    label = scan.label[which]
+    return np.where(GROUND[label] | (label == IGNORE), np.inf, REACH)

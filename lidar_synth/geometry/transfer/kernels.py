@@ -253,7 +253,7 @@ def _normal(points, i, j, k):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def hit_footprints(points, azimuth, rho, normal, half, up, down, slope, height, first, step, out, vertex):  # type: ignore[no-untyped-def]
+def hit_footprints(points, azimuth, rho, normal, half, up, down, reach, slope, height, first, step, out, vertex):  # type: ignore[no-untyped-def]
     """Find the first footprint that each ray hits: the patch of a surface that one return of the source stands for.
 
     Args:
@@ -261,6 +261,7 @@ def hit_footprints(points, azimuth, rho, normal, half, up, down, slope, height, 
         normal: (N, 3) of each footprint, unit length.
         half: (N,) radians to either side.
         up, down: (N,) metres above and below the return.
+        reach: (N,) metres along a ray beyond which it ends.
         slope, height, first, step: of ``Rays``.
         out: (H, F) rho of the hit, metres; inf = none. Nearer hits replace what is there.
         vertex: (H, F) the return.
@@ -277,9 +278,10 @@ def hit_footprints(points, azimuth, rho, normal, half, up, down, slope, height, 
                 over = nx * x + ny * y + nz * (z - height[r])
                 towards = nx * dx + ny * dy + nz * slope[r]
                 along = over / towards if over * towards > 0 else distance
+                beyond = abs(along - distance) > reach[i]
                 along = min(max(along, NEAREST * distance), FARTHEST * distance)
                 column = f % firings
-                if along < out[r, column]:
+                if along < out[r, column] and not beyond:
                     out[r, column] = along
                     vertex[r, column] = i
                 f += 1

@@ -35,6 +35,9 @@ TURN = 30.0
 NEARER = 0.5
 """Smallest new distance of an object as a share of the recorded one; nearer, it would need returns that it lacks."""
 
+BESIDE = 0.05
+"""Metres outside its box at which an object may still be hit: patches at its rim reach beyond the returns."""
+
 GRAZE = 0.05
 """Metres by which the object has to be in front of a return to replace it."""
 
@@ -241,6 +244,8 @@ def _hits(
         firing = np.rint((rays.azimuth[window] - raster.first[which]) / rays.step).astype(np.intp) % count
         at = np.stack([which, firing], 1)
         rho = hits.rho[which, firing]
+        points = rays.points(window, np.where(np.isfinite(rho), rho, 0.0))
+        rho[~Boxes(placed.box, ("Misc",)).enlarged(BESIDE).contain(points)[0]] = np.inf
     return rho, hits, at
 
 
