@@ -21,11 +21,12 @@ from test_generator import SENSOR, write
 from typer.testing import CliRunner
 
 import lidar_synth.bake.shard as shard_module
-from lidar_synth.bake import ENGINES, BakeJob, BakePlan, Resources, Share, bake
+from lidar_synth.bake import ENGINES, BakeJob, BakePlan, Resources, Share, bake, make_plan
 from lidar_synth.bake.folder import SETTINGS, finish, prepare, write_bank_files
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import regenerate
 from lidar_synth.bank import INDEX, Bank, Encoding, Entry, Index
+from lidar_synth.bank.card import CARD, CROISSANT
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.files.disk import sha256
@@ -236,6 +237,23 @@ def test_a_bank_without_bake_settings_is_refused(plan: BakePlan) -> None:
     (plan.out / SETTINGS).unlink()
     with pytest.raises(ConfigError, match="holds a bank that was not made by a bake"):
         bake(plan, progress=False)
+
+
+@pytest.mark.parametrize("name", [CARD, CROISSANT])
+def test_a_file_of_the_user_is_not_replaced(plan: BakePlan, name: str) -> None:
+    plan.out.mkdir()
+    (plan.out / name).write_text("mine")
+    with pytest.raises(ConfigError, match=f"holds a {name}, which the bank's own would replace"):
+        bake(plan, progress=False)
+    assert [path.name for path in plan.out.iterdir()] == [name]
+    assert (plan.out / name).read_text() == "mine"
+
+
+@pytest.mark.parametrize(("count", "size"), [(10, 64), (1000, 125), (20_000, 1024)])
+def test_shards_of_small_banks_are_small(model: Path, tmp_path: Path, count: int, size: int) -> None:
+    """An interrupted bake keeps whole shards."""
+    plan = make_plan(tmp_path, BakeJob(model=str(model), count=count))
+    assert plan.job.shard_size == size
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path, sixty: d
     wait_for_shards(process, out, 5)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate()
-    assert process.returncode == 1
+    assert process.returncode == 130
     assert f"stopped; finished shards are kept in {out}, the same command resumes" in errors
     assert "Traceback" not in errors
     bake(plan_in(out, model, count=60, shard_size=5), progress=False)
@@ -135,7 +135,7 @@ def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate()
-    assert process.returncode == 1
+    assert process.returncode == 130
     assert "stopped; finished shards are kept" in errors and "Traceback" not in errors
 
 

@@ -114,8 +114,18 @@ def test_processes_give_the_results_of_one_process(tmp_path: Path) -> None:
 
 
 def test_a_time_that_is_over_starts_no_training(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="minutes, in which 0 of at least 2 places"):
-        prove(drives(), tmp_path, replace(SMALL, iterations=10**6), minutes=1, jobs=1, progress=False)
+    with pytest.raises(ConfigError, match="minutes, in which 2 places cannot be tested"):
+        prove(drives(), tmp_path, SMALL, minutes=1e-6, jobs=1, progress=False)
+
+
+def test_a_short_time_has_fewer_iterations_which_a_resumed_comparison_keeps(tmp_path: Path) -> None:
+    """Iteration times are measured again by each call, so that the same minutes could give another number."""
+    source = drives(2, 3)
+    asked = replace(SMALL, iterations=10**5)
+    first = prove(source, tmp_path, asked, minutes=0.3, jobs=1, progress=False)
+    assert 10 <= first.values["iterations"] < 10**5
+    again = prove(source, tmp_path, asked, minutes=0.2, jobs=1, progress=False)
+    assert again.values["iterations"] == first.values["iterations"]
 
 
 def perfect(job: Job) -> np.ndarray:

@@ -21,7 +21,7 @@ from pathlib import Path
 from lidar_synth.bake.job import BakePlan, settings_of
 from lidar_synth.bake.lock import alone, shared
 from lidar_synth.bank import INDEX, Entry, Index
-from lidar_synth.bank.card import card_files
+from lidar_synth.bank.card import CARD, CROISSANT, card_files
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import read_file, sha256, write_file
 from lidar_synth.formats.writer import NOTES, claim
@@ -37,13 +37,30 @@ def prepare(plan: BakePlan) -> None:
     """Claim the folder for the plan's settings, and remove temporary files of killed runs.
 
     Raises:
-        ConfigError: if it holds a bank with other settings; the message shows the difference.
+        ConfigError: if it holds a bank with other settings, and the message shows the difference; or files that the
+            bake would replace.
         FileError: if it cannot be written.
     """
-    if (plan.out / INDEX).exists() and not (plan.out / SETTINGS).exists():
-        raise ConfigError(f"{plan.out} holds a bank that was not made by a bake", "an empty folder")
+    if not (plan.out / SETTINGS).exists():
+        _refuse_others(plan.out)
     claim(plan.out / SETTINGS, plan.settings)
     _clear_up(plan.out, finished=False)
+
+
+def _refuse_others(root: Path) -> None:
+    """Refuse a folder with files of the names that a bake writes at its end.
+
+    Raises:
+        ConfigError: naming the file.
+    """
+    if (root / INDEX).exists():
+        raise ConfigError(f"{root} holds a bank that was not made by a bake", "an empty folder")
+    for name in (CARD, CROISSANT):
+        if (root / name).exists():
+            raise ConfigError(
+                f"{root} holds a {name}, which the bank's own would replace",
+                "a new or an empty folder",
+            )
 
 
 @contextmanager

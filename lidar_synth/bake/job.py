@@ -36,7 +36,8 @@ class BakePlan:
 
     Args:
         out: the bank's folder.
-        job: the settings, with ``batch`` and ``fields`` resolved and the path of a checkpoint file made absolute.
+        job: the settings, with ``batch``, ``fields`` and ``shard_size`` resolved and the path of a checkpoint file made
+            absolute.
         facts: the facts of the bank.
     """
 
@@ -48,6 +49,7 @@ class BakePlan:
     def shards(self) -> tuple[Entry, ...]:
         """The shards to write, in order; their sizes and hashes are not known yet."""
         job = self.job
+        assert job.shard_size is not None
         starts = range(0, job.count, job.shard_size)
         digits = max(5, len(str(len(starts) - 1)))
         return tuple(
@@ -99,6 +101,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
             "model": str(model.resolve()) if model.suffix == ".safetensors" else job.model,
             "fields": fields,
             "batch": job.batch or BATCH[job.device],
+            "shard_size": job.shard_size or min(1024, max(64, job.count // 8)),
         }
     )
     # Banks of earlier versions do not name the columns.

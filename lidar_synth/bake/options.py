@@ -15,8 +15,6 @@ class BakeJob(BaseModel):
 
     Example:
         >>> job = BakeJob(count=20_000, seed=1)
-        >>> job.shard_size
-        1024
         >>> BakeJob.model_fields["first"].description
         'index of the first scan'
     """
@@ -27,7 +25,9 @@ class BakeJob(BaseModel):
     count: Count = Field(1000, description="number of scans")
     seed: int = Field(0, ge=0, lt=2**64, description="scan i is a function of the model, the seed and i")
     first: int = Field(0, ge=0, lt=2**62, description="index of the first scan")
-    shard_size: Count = Field(1024, description="scans per file; a worker builds a file in memory")
+    shard_size: Count | None = Field(
+        None, description="scans per file, which an interrupted bake keeps [an eighth of all, 64 to 1024]"
+    )
     steps: Count | None = Field(None, description="number of steps [the model's own]")
     solver: str = Field("euler", description="ODE solver: euler | heun")
     condition: str | None = Field(

@@ -1,7 +1,7 @@
 """The command line ``lidar-synth``: one file per command; this module converts errors to exit statuses.
 
-Exit status 0 = success, 1 = the run failed, 2 = wrong options or arguments, 130 = interrupted by Ctrl-C (1 from
-``bake``, which says that it may be resumed); a failure prints one message.
+Exit status 0 = success, 1 = the run failed, 2 = wrong options or arguments, 130 = interrupted by Ctrl-C; a failure
+prints one message.
 """
 
 import sys

@@ -65,7 +65,7 @@ def bake(
         index = run(plan, engine, _resources(plan, workers, address, slurm), share, progress=not quiet)
     except KeyboardInterrupt:
         typer.echo(f"stopped; finished shards are kept in {out}, the same command resumes", err=True)
-        raise typer.Exit(1) from None
+        raise typer.Exit(130) from None
     if index is None:
         typer.echo(f"{out}: this share is finished; the last of all {len(plan.shards)} shards completes the bank")
     else:

@@ -14,7 +14,7 @@ def prove(
     arm: Annotated[list[str] | None, typer.Option(help="a training to compare, repeatable [exchange, pretrain]")]
     = None,
     ratio: Annotated[list[float] | None, typer.Option(help="share of synthetic scans, repeatable [0.5]")] = None,
-    iterations: Annotated[int, typer.Option(min=10, help="of each training")] = 1000,
+    iterations: Annotated[int, typer.Option(min=10, help="of each training; fewer if --minutes is short")] = 1000,
     batch: Annotated[int, typer.Option(min=1, help="scans of an iteration")] = 4,
     seeds: Annotated[int, typer.Option(min=1, help="repetitions of each training")] = 2,
     places: Annotated[str, typer.Option(help="how places are told apart: auto | drive | pose | stretch")] = "auto",

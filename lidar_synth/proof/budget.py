@@ -40,22 +40,39 @@ def expected_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
     return seconds / 60 / plan.jobs
 
 
-def within(plan: ProofPlan, minutes: float | None) -> ProofPlan:
-    """The plan with as many pairs as fit into the time."""
+def within(plan: ProofPlan, minutes: float | None, resumed: bool = False) -> ProofPlan:
+    """The plan with as many pairs as fit into the time, or with two pairs of fewer iterations.
+
+    Args:
+        plan: of all pairs.
+        minutes: limit of the time; None for all pairs.
+        resumed: whether trainings with these iterations exist, so that they cannot be fewer.
+
+    Raises:
+        ConfigError: if two pairs do not fit even with ten iterations.
+    """
     count = len(plan.pairs)
     if minutes is not None:
         while count > 0 and expected_minutes(plan, plan.pairs[:count]) > minutes:
             count -= 1
-        if count < (least := min(2, len(plan.pairs))):
-            few = _most_iterations(plan, plan.pairs[:least], minutes)
-            raise ConfigError(
-                f"{minutes:g} minutes, in which {count} of at least {least} places can be tested",
-                f"about {expected_minutes(plan, plan.pairs[:least]):.0f} or more",
-                "Give more --minutes, fewer arms (--arm)" + (f", or --iterations {few}." if few else "."),
-            )
+        least = min(2, len(plan.pairs))
+        if count < least and not resumed:
+            plan = _with_fewer_iterations(plan, least, minutes)
+        count = max(count, least)
     pairs = plan.pairs[:count]
     labelled = {pair: plan.labelled[pair] for pair in pairs}
     return replace(plan, pairs=pairs, labelled=labelled, minutes=expected_minutes(plan, pairs))
+
+
+def _with_fewer_iterations(plan: ProofPlan, least: int, minutes: float) -> ProofPlan:
+    few = _most_iterations(plan, plan.pairs[:least], minutes)
+    if not few:
+        raise ConfigError(
+            f"{minutes:g} minutes, in which {least} places cannot be tested",
+            f"about {expected_minutes(plan, plan.pairs[:least]):.0f} or more",
+            "Give more --minutes or fewer arms (--arm).",
+        )
+    return replace(plan, settings=replace(plan.settings, iterations=few))
 
 
 def _most_iterations(plan: ProofPlan, pairs: Sequence[Pair], minutes: float) -> int:

@@ -1,7 +1,8 @@
 """Making the plan of a comparison: scans are read and checked, the labelled ones chosen, the time measured."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,11 @@ from lidar_synth.proof.settings import MOST_LABELLED, ProofSettings
 
 
 def make_plan(
-    source: Source, settings: ProofSettings, minutes: float | None, jobs: int, half: bool | None = None
+    source: Source,
+    settings: ProofSettings,
+    minutes: float | None,
+    jobs: int,
+    earlier: Mapping[str, Any] | None = None,
 ) -> tuple[ProofPlan, dict[int, Scan]]:
     """Plan a comparison.
 
@@ -34,7 +39,8 @@ def make_plan(
         settings: what is asked for.
         minutes: limit of the time; None for all places and seeds.
         jobs: processes.
-        half: whether to compute in bfloat16; by default what is faster on this machine.
+        earlier: ``ProofPlan.identity`` of the comparison that is resumed. It computed in bfloat16 or not, as the
+            machine was faster then, and had fewer iterations if the time was short.
 
     Returns:
         The plan, and {index: scan on the grid} of all labelled and tested scans.
@@ -57,13 +63,15 @@ def make_plan(
     scans = {i: _read(source, i, grid) for i in needed}
     absent = require_labels(_counts(scans), groups, settings.only)
     batch = [scans[i] for i in needed[: settings.batch]]
-    half, step = measured_step(batch, settings, half)
+    half, step = measured_step(batch, settings, earlier.get("half") if earlier else None)
+    if earlier and minutes is not None:
+        settings = replace(settings, iterations=min(settings.iterations, earlier["iterations"]))
     names = tuple(names_of(source))
     plan = ProofPlan(
         settings, places, names, sensor, grid, arms, groups, absent, pairs, len(pairs), labelled, tested,
         recordings_of_scans(source, [names[i] for part in tested.values() for i in part]), half, step, 0.0, jobs,
     )  # fmt: skip
-    return within(plan, minutes), scans
+    return within(plan, minutes, resumed=bool(earlier)), scans
 
 
 def recordings_of_scans(source: Source, names: Sequence[str]) -> Recordings:

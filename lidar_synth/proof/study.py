@@ -154,7 +154,8 @@ def prove(
         scans: labelled scans: what ``open_scans`` opens, or a source.
         out: folder to write to.
         settings: of the comparison.
-        minutes: limit of the time; places and seeds are chosen so that it is kept.
+        minutes: limit of the time; places and seeds are chosen so that it is kept, and if not even two fit,
+            the iterations of a training.
         jobs: processes of one thread each; by default one for each core.
         trainer: your own in the place of the small network: a function that can be pickled, or a ``CommandTrainer``.
         pools: folder of the synthetic scans, which several comparisons may share; by default in ``out``.
@@ -180,7 +181,7 @@ def prove(
     out = Path(out)
     source = open_scans(scans) if isinstance(scans, str | Path) else scans
     jobs = jobs or os.cpu_count() or 1
-    plan, loaded = make_plan(source, settings or ProofSettings(), minutes, jobs, _precision(out))
+    plan, loaded = make_plan(source, settings or ProofSettings(), minutes, jobs, _earlier(out))
     seen = ""
     if any("generator" in row.arm.pools() for row in plan.rows):
         generator = refuse_leaks(plan.settings.model, plan.recordings, _nameless(source, plan))
@@ -248,13 +249,14 @@ def from_values(text: str, path: Path) -> Outcome:
         raise DataError(f"{path} is damaged ({error!r})", "the outcome of a training", "Remove it.") from error
 
 
-def _precision(out: Path) -> bool | None:
-    """The precision of a comparison that is resumed."""
+def _earlier(out: Path) -> dict[str, Any] | None:
+    """The identity of the comparison that is resumed; None where there is none."""
     path = out / STUDY
     if not path.is_file():
         return None
     values = parse_json(read_text(path), str(path))
-    return values.get("half") if isinstance(values, dict) else None
+    valid = isinstance(values, dict) and isinstance(values.get("iterations"), int)
+    return values if valid else None
 
 
 def _make_pools(work: Trainings, source: Source, progress: bool) -> None:

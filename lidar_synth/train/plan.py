@@ -147,6 +147,7 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
         raise ConfigError(f"teacher {config.teacher}, an autoencoder", "a model that generates")
     if teacher.header.networks[VELOCITY].arguments.get("ends"):
         raise ConfigError(f"teacher {config.teacher}, a student of several numbers of steps", "its teacher")
+    _check_scans(config, teacher.header)
     if CODEC in teacher.networks and config.recipe.weights:
         raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
     flow, made = target_flow(config, teacher, accelerator.device)
@@ -163,6 +164,22 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
     if config.also:
         return _student_of_several_steps(config, plan, flow, header)
     return replace(plan, task=student_task(config.strategy, flow, header.time_grid, config.steps), header=header)
+
+
+def _check_scans(config: DistillConfig, teacher: Header) -> None:
+    """Refuse the town's scans, which shipped recipes name, for a teacher of other scans.
+
+    Raises:
+        ConfigError: naming the scans that the teacher learnt from.
+    """
+    learnt_from = teacher.provenance.get("data")
+    if config.data.town is None or not isinstance(learnt_from, dict) or not learnt_from.get("path"):
+        return
+    raise ConfigError(
+        f"data.town={config.data.town} for teacher {config.teacher}, which learnt from {learnt_from['path']}",
+        "the teacher's scans",
+        f"data.town=null data.path={learnt_from['path']} data.licence=LICENCE",
+    )
 
 
 def _student_of_several_steps(config: DistillConfig, plan: TrainingPlan, flow: Any, header: Header) -> TrainingPlan:

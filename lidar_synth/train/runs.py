@@ -90,6 +90,19 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
         return _train(config, plan, training, accelerator, minutes)
 
 
+def require_accelerate() -> None:
+    """Check for the library that trainings need.
+
+    Raises:
+        LibraryError: if it is not installed.
+    """
+    try:
+        import accelerate  # noqa: F401
+    except ImportError as error:
+        hint = "pip install 'lidar_synth[train]'"
+        raise LibraryError("Accelerate is not installed", "the extra 'train'", hint) from error
+
+
 @contextmanager
 def _accelerator(config: Run) -> Iterator["Accelerator"]:
     """Accelerate's handle for one run.
@@ -97,12 +110,9 @@ def _accelerator(config: Run) -> Iterator["Accelerator"]:
     Accelerate keeps the first precision of a process. It is cleared after the run, so that the next one can have
     another, unless the caller had set up Accelerate before.
     """
-    try:
-        from accelerate import Accelerator
-        from accelerate.state import AcceleratorState, is_initialized
-    except ImportError as error:
-        hint = "pip install 'lidar_synth[train]'"
-        raise LibraryError("Accelerate is not installed", "the extra 'train'", hint) from error
+    require_accelerate()
+    from accelerate import Accelerator
+    from accelerate.state import AcceleratorState, is_initialized
 
     by_caller, precision = is_initialized(), computed(config.precision)
     if by_caller and AcceleratorState().mixed_precision not in (config.precision, precision):

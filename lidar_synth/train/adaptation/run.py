@@ -17,6 +17,7 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.train.adaptation.card import figures, provenance_of, write_card
 from lidar_synth.train.adaptation.scans import Split, label, prepare, split
 from lidar_synth.train.adaptation.stages import Stage, Work, shares, stages_for
+from lidar_synth.train.runs import require_accelerate
 from lidar_synth.train.staged import StagedRuns
 
 MINUTES = 120.0
@@ -98,7 +99,7 @@ def plan_adaptation(
     check_movable(start.header)
     layout = layout_of(root)
     source = open_scans(root, sensor=sensor, layout=layout)
-    parts, first = split(len(source)), source[0]
+    parts, first = split(source.ids), source[0]
     labelled = first.label is not None
     header = start.header
     if not labelled and "label" in header.channels and (CODEC not in header.networks or not town):
@@ -152,6 +153,7 @@ def adapt(
             sensor has rows that its networks cannot have.
         DataError: on fewer than 12 scans, scans of several sensors, some scans without labels, or labels of another
             table.
+        LibraryError: if Accelerate is not installed.
 
     Example:
         >>> from lidar_synth import adapt
@@ -162,6 +164,7 @@ def adapt(
         3 scans
     """
     plan = plan_adaptation(model, scans, out, minutes, sensor, town)
+    require_accelerate()
     claim(plan.work / SETTINGS, _settings(plan))
     prepared = prepare(plan.source, plan.layout, plan.root, plan.sensor, plan.work / "scans", progress)
     if prepared.labelled != plan.labelled:

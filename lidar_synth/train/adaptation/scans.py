@@ -1,7 +1,7 @@
 """A user's scans as an adaptation trains on them: checked, split by time, and kept as range images.
 
-The last fifth of the scans is held out. The scans before it are left out, so that no neighbouring frames lie on both
-sides. Scans of several drives follow each other drive by drive.
+The last drives are held out, about a fifth of the scans. Of a single drive, or where the last one is too long, the last
+fifth of the scans is held out, and the scans before it are left out, so that no neighbouring frames lie on both sides.
 """
 
 import json
@@ -47,17 +47,27 @@ class Split:
     held_out: tuple[int, ...]
 
 
-def split(count: int) -> Split:
-    """Split scans by time.
+def split(names: Sequence[str]) -> Split:
+    """Split scans by drives, or by time where the last drive is too long or too short to be held out.
+
+    Args:
+        names: of the scans in order, "drive/frame".
 
     Raises:
         DataError: on fewer than ``FEWEST`` scans.
     """
+    count = len(names)
     if count < FEWEST:
         raise DataError(f"{count} scans", f"at least {FEWEST} to adapt a model, better 20 to 200")
     picked = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int)).tolist()
-    held, gap = round(HELD_OUT * len(picked)), max(1, round(GAP * len(picked)))
-    first = len(picked) - held
+    first = len(picked) - round(HELD_OUT * len(picked))
+    gap = max(1, round(GAP * len(picked)))
+    drives = [names[i].rpartition("/")[0] for i in picked]
+    begins = [n for n in range(1, len(picked)) if drives[n] != drives[n - 1]]
+    near = [n for n in begins if HELD_OUT / 2 <= 1 - n / len(picked) <= 2 * HELD_OUT]
+    if near:
+        first = min(near, key=lambda n: abs(n - first))
+        gap = 0
     return Split(tuple(picked[: first - gap]), tuple(picked[first - gap : first]), tuple(picked[first:]))
 
 
@@ -107,7 +117,7 @@ def prepare(
     note = folder / NOTE
     if note.is_file():
         return _read(folder, parse_json(read_text(note), str(note)))
-    parts = split(len(source))
+    parts = split(source.ids)
     usual = agreement(source[0].points, source.sensor).outside
     kinds: set[bool] = set()
     hashes: dict[str, list[str]] = {}
