@@ -7,6 +7,9 @@ Every message states what was given, what was expected and what to type, in that
                     "copy the file again, or skip it with on_bad='skip'")
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 
 class LidarSynthError(Exception):
     """Base class of the exceptions that the package raises on purpose.
@@ -33,6 +36,22 @@ class LidarSynthError(Exception):
 def shorten(text: str, most: int) -> str:
     """The first ``most`` characters of a text, with "..." if it is longer."""
     return text if len(text) <= most else f"{text[:most]} ..."
+
+
+def suggest(name: object, known: Iterable[str], most: int = 3) -> str:
+    """A hint for a misspelt name: "Did you mean 'kitti'?", or "" if no known name is near.
+
+    Args:
+        name: what was given.
+        known: the names that exist.
+        most: number of names in the hint.
+
+    Example:
+        >>> suggest("kiti", ["kitti", "pcd"])
+        "Did you mean 'kitti'?"
+    """
+    near = get_close_matches(str(name), list(known), most)
+    return f"Did you mean {' or '.join(map(repr, near))}?" if near else ""
 
 
 class DataError(LidarSynthError, ValueError):

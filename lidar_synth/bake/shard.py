@@ -1,5 +1,6 @@
 """Writes one shard of a plan; every engine runs this."""
 
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -145,7 +146,7 @@ def _check_space(plan: BakePlan, entry: Entry) -> None:
     free = shutil.disk_usage(plan.out).free
     if free < need:
         raise FileError(
-            f"{plan.out} has {free / 1e6:.0f} MB free",
-            f"about {need / 1e6:.0f} MB for the next shard",
+            f"{plan.out} has {free / 1e6:.1f} MB free",
+            f"{math.ceil(need / 1e5) / 10:.1f} MB for the next shard",
             "Free some space and run the same command again: finished shards are kept.",
         )

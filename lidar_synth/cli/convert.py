@@ -95,7 +95,7 @@ def convert(
     from lidar_synth.formats.convert import convert as run
     from lidar_synth.formats.source import choose
 
-    writer = choose("format", to, WRITERS)(out)
+    writer = choose("--to", to, WRITERS)(out)
     given = {"layout": layout, "split": split, "fields": fields, "reflectance_max": reflectance_max}
     scans = open_scans(source, sensor=sensor, on_bad=on_bad, **given)  # type: ignore[arg-type]
     change = _change(scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach)

@@ -135,7 +135,7 @@ def _writer(out: Path, to: str) -> Any:
     from lidar_synth.formats import WRITERS
     from lidar_synth.formats.source import choose
 
-    return choose("format", to, WRITERS)(out)
+    return choose("--to", to, WRITERS)(out)
 
 
 def _number(scan: int, count: int) -> int:

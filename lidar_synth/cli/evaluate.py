@@ -56,6 +56,7 @@ def evaluate(
       lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
       lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
     """
+    from lidar_synth.errors import suggest
     from lidar_synth.evaluate import PROTOCOLS
     from lidar_synth.evaluate import evaluate as compare
     from lidar_synth.evaluate.comparison import check_counts
@@ -70,7 +71,8 @@ def evaluate(
     if (protocol is None) == (judge is None):
         raise typer.BadParameter("give --protocol or --judge, one of them", param_hint="--protocol")
     if judge is None and protocol not in PROTOCOLS:
-        raise typer.BadParameter(f"{protocol!r} is none of {', '.join(PROTOCOLS)}", param_hint="--protocol")
+        known = f"{protocol!r} is none of {', '.join(PROTOCOLS)}. {suggest(protocol, PROTOCOLS)}"
+        raise typer.BadParameter(known, param_hint="--protocol")
     sources = open_scans(real, sensor=sensor, split=split), open_scans(fake, sensor=sensor)
     if not training_data and (seen := seen_by_model_of(fake, sources[1])) is not None:
         _refuse_training_data(seen, measured(sources[0], layout_of(real), real, split, seen), real, fake)

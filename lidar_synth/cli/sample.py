@@ -56,7 +56,7 @@ def sample(
     from lidar_synth.formats.writer import claimed
     from lidar_synth.generate.generator import load_generator
 
-    writer = choose("format", to, WRITERS)(out)
+    writer = choose("--to", to, WRITERS)(out)
     precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
     generator = load_generator(model, device=device, dtype=precision, batch=batch, columns=columns)
     given = conditions_for(generator, condition, condition_layout, condition_split)

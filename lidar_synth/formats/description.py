@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.errors import ConfigError, DataError, shorten
+from lidar_synth.errors import ConfigError, DataError, shorten, suggest
 from lidar_synth.files.disk import read_start, read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
@@ -142,7 +142,12 @@ class Description:
 
 def _sensor(value: Any) -> Sensor:
     """A sensor from its keys, or a preset from its name."""
-    return presets()[value] if isinstance(value, str) and value in presets() else Sensor.from_dict(value)
+    if not isinstance(value, str):
+        return Sensor.from_dict(value)
+    if value not in presets():
+        hint = suggest(value, presets())
+        raise ValueError(f"sensor {value!r} is no preset ({', '.join(presets())}). {hint}".strip())
+    return presets()[value]
 
 
 def check_provenance(values: Any) -> dict[str, Any]:

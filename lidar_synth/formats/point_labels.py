@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, Taxonomy
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import read_values, write_file
 from lidar_synth.geometry.scan import Scan
 
@@ -29,6 +29,12 @@ def read_labels(path: Path, points: Path, count: int, taxonomy: Taxonomy) -> dic
         FileError: if the file cannot be read.
         DataError: if the numbers of labels and points differ; on a class id that the dataset does not define.
     """
+    if not path.is_file():
+        raise FileError(
+            f"{points} has labels in {path.parent} for other scans, but no {path.name}",
+            "a label file for every scan of the folder",
+            "Copy it, or leave the scan out with --on-bad skip (on_bad='skip').",
+        )
     raw = read_values(path, "<u4")
     if len(raw) != count:
         raise mismatch(path, len(raw), points, count)

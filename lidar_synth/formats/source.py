@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, get_args
 
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, suggest
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import FORMAT, NAME, read_description, same_grid
 from lidar_synth.formats.points import bad_points_kept, without_bad_points
@@ -205,5 +205,6 @@ def choose(kind: str, name: str, table: Mapping[str, Choice], hint: str = "") ->
         ConfigError: on a name that is not in the table.
     """
     if name not in table:
+        hint = suggest(name, table) or hint
         raise ConfigError(f"{kind} {name!r}", f"one of {', '.join(map(repr, table))}", hint)
     return table[name]

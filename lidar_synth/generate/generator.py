@@ -17,7 +17,7 @@ from torch.utils.data import get_worker_info
 from typing_extensions import Unpack
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.flow.path import Velocity, guided
 from lidar_synth.flow.solvers import solve, towards
 from lidar_synth.generate import boxed
@@ -333,7 +333,8 @@ def find_model(model: str | Path) -> Path:
     path = Path(model)
     if path.suffix != ".safetensors":
         names = ", ".join(shipped) or "none in this installation"
-        raise ConfigError(f"model {str(model)!r}", f"a shipped one ({names}) or a .safetensors file")
+        expected = f"a shipped one ({names}) or a .safetensors file"
+        raise ConfigError(f"model {str(model)!r}", expected, suggest(model, shipped))
     return path
 
 

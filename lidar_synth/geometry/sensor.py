@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, shorten
+from lidar_synth.errors import ConfigError, shorten, suggest
 from lidar_synth.files.parsing import parse_yaml, read_yaml
 from lidar_synth.geometry.ouster import read_metadata
 
@@ -359,7 +359,7 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
         return Sensor.from_dict(read_metadata(path))
     if path.suffix not in (".yaml", ".yml"):
         expected = f"one of {', '.join(presets())}, the metadata .json of an Ouster, or a .yaml file"
-        raise ConfigError(f"sensor {str(sensor)!r}", expected)
+        raise ConfigError(f"sensor {str(sensor)!r}", expected, suggest(sensor, presets()))
     entries = _entries(read_yaml(path, "a file with a sensor, such as sensors.yaml"), str(path))
     if len(entries) != 1:
         raise ConfigError(f"{path} holds {len(entries)} sensors", "exactly one entry: its name, then its values")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.mix import exchange, laser, objects, polar
 from lidar_synth.labels.own import boxes, condition, generated, ignored, unlabelled
@@ -72,7 +72,8 @@ def make_policy(
             raise ConfigError(f"options {sorted(options)} for a policy that is a function", "a policy's name")
         return labels
     if labels not in POLICIES:
-        raise ConfigError(f"labels={labels!r}", f"one of {', '.join(map(repr, POLICIES))}, or a function (scan, rng)")
+        expected = f"one of {', '.join(map(repr, POLICIES))}, or a function (scan, rng)"
+        raise ConfigError(f"labels={labels!r}", expected, suggest(labels, POLICIES))
     return _build(POLICIES[labels], f"labels={labels!r}", real, fields, options)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.policies import LabelPolicy, make_policy
 
@@ -160,7 +160,8 @@ def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
         ConfigError: on an unknown arm, or a share that is not between 0 and 1.
     """
     if unknown := [name for name in names if name not in ARMS]:
-        raise ConfigError(f"arm {', '.join(map(repr, unknown))}", f"some of {', '.join(ARMS)}")
+        given = f"arm {', '.join(map(repr, unknown))}"
+        raise ConfigError(given, f"some of {', '.join(ARMS)}", suggest(unknown[0], ARMS))
     if wrong := [ratio for ratio in ratios if not 0 < ratio < 1]:
         raise ConfigError(f"ratio {wrong[0]}", "shares of synthetic scans between 0 and 1, such as 0.5")
     ordered = [name for name in ARMS if name in {BASE, *names}]

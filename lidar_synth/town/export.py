@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.convert import in_processes
 from lidar_synth.formats.description import TOWN
@@ -76,7 +76,8 @@ def export_town(
         FileError: if the output cannot be written.
     """
     if layout not in LAYOUTS or jobs < 1:
-        raise ConfigError(f"layout {layout!r}, {jobs} jobs", f"one of {', '.join(LAYOUTS)}, and at least 1 job")
+        expected = f"one of {', '.join(LAYOUTS)}, and at least 1 job"
+        raise ConfigError(f"layout {layout!r}, {jobs} jobs", expected, suggest(layout, set(LAYOUTS) - {layout}))
     number = SEQUENCES.get(layout, 0) if sequence is None else sequence
     if not 0 <= number < 100:
         raise ConfigError(f"sequence {number}", "0 to 99")

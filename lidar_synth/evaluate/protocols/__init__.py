@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.evaluate.measures import KINDS
 from lidar_synth.geometry.projection import locate, project, unproject
 from lidar_synth.geometry.scan import Scan
@@ -207,5 +207,6 @@ def find_protocol(protocol: str | Protocol) -> Protocol:
     if isinstance(protocol, Protocol):
         return protocol
     if protocol not in PROTOCOLS:
-        raise ConfigError(f"protocol {protocol!r}", f"one of {', '.join(PROTOCOLS)}")
+        hint = suggest(protocol, PROTOCOLS)
+        raise ConfigError(f"protocol {protocol!r}", f"one of {', '.join(PROTOCOLS)}", hint)
     return PROTOCOLS[protocol]

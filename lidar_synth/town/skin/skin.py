@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.files.disk import read_file, write_file
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.town.skin.features import (
@@ -309,7 +309,8 @@ def load_skin(skin: "str | Path | Skin") -> Skin:
         folder = Path(str(files("lidar_synth.town.skin")))
         names = sorted(p.stem for p in folder.glob(f"*{SUFFIX}"))
         if str(skin) not in names:
-            raise ConfigError(f"skin {str(skin)!r}", f"one of {', '.join(names)}, or a file that ends in {SUFFIX}")
+            expected = f"one of {', '.join(names)}, or a file that ends in {SUFFIX}"
+            raise ConfigError(f"skin {str(skin)!r}", expected, suggest(skin, names))
         path = folder / f"{skin}{SUFFIX}"
     content = read_file(path, f"a file of {FORMAT}", LONGEST)
     try:

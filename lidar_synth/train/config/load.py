@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from lidar_synth.errors import ConfigError, shorten
+from lidar_synth.errors import ConfigError, shorten, suggest
 from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.geometry.sensor import load_sensor
@@ -119,7 +119,9 @@ def _first(kind: type[BaseModel], error: ValidationError) -> str:
     fault = error.errors()[0]
     place = ".".join(map(str, fault["loc"]))
     if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"unknown key {place!r}; known there: {', '.join(_keys(kind, fault['loc'][:-1]))}"
+        known = _keys(kind, fault["loc"][:-1])
+        hint = suggest(fault["loc"][-1], known)
+        return f"unknown key {place!r}; known there: {', '.join(known)}" + (f". {hint}" if hint else "")
     if fault["type"] == "missing":
         return f"{place!r} is missing"
     return f"{place} = {shorten(repr(fault['input']), 400)}: {fault['msg']}"

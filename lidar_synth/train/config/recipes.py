@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.files.parsing import read_yaml
 
 SUFFIXES = (".yaml", ".yml")
@@ -57,8 +57,11 @@ def find_recipe(given: str | Path) -> Path:
         return path
     published = folder() / f"{given}.yaml"
     if path.name != str(given) or not published.is_file():
-        names = ", ".join(p.stem for p in sorted(folder().glob("*.yaml")))
-        raise ConfigError(f"recipe {str(given)!r}", f"a YAML file or one of {names}", "lidar-synth recipes lists them.")
+        names = [p.stem for p in sorted(folder().glob("*.yaml"))]
+        models = [p.stem for p in sorted((folder() / "models").glob("*.yaml"))]
+        hint = suggest(given, names + models) or "lidar-synth recipes lists them."
+        expected = f"a YAML file or one of {', '.join(names)}"
+        raise ConfigError(f"recipe or model {str(given)!r}", expected, hint)
     return published
 
 
