@@ -250,7 +250,7 @@ def test_the_command_prints_skipped_scans_with_reasons(dataset: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        (["--to", "pdc"], "format 'pdc'; expected one of 'kitti'"),
+        (["--to", "pdc"], "--to 'pdc'; expected one of 'kitti'"),
         (["--to", "kitti", "--split", "train"], "KITTI-360 split 'train'"),
         (["--to", "kitti", "--sensor", "hdl64"], "sensor 'hdl64'; expected one of"),
         (["--to", "kitti", "--on-bad", "ignore"], "on_bad='ignore'"),

@@ -314,13 +314,6 @@ def test_a_selection_of_other_settings_is_refused(
     assert (run / "config.yaml").read_bytes() == before
 
 
-def test_a_student_is_not_distilled_on_the_town_in_place_of_the_teachers_scans(teacher: Path, tmp_path: Path) -> None:
-    given = [f"teacher={teacher}", f"output={tmp_path / 'run'}", "weaker=null", "guidance=1"]
-    with pytest.raises(ConfigError, match=r"data.town=3000 for teacher .*, which learnt from .*data.town=null"):
-        call("distill", "town_pixel_student", *given)
-    assert not (tmp_path / "run" / "cache").exists()
-
-
 def test_a_damaged_selection_is_named(scans: Path, teacher: Path, tmp_path: Path) -> None:
     config = distilling(scans, tmp_path, teacher)
     path = tmp_path / "run" / "selection.npz"

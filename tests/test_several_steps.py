@@ -41,3 +41,10 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(scans: Path, teacher
     )
     flow = load_generator(tmp_path / "flow" / "flow.safetensors")  # it is not told where a step ends
     assert not flow.network.ends and flow.header.other_grids == ()
+
+
+def test_a_student_is_not_distilled_on_the_town_in_place_of_the_teachers_scans(teacher: Path, tmp_path: Path) -> None:
+    given = [f"teacher={teacher}", f"output={tmp_path / 'run'}", "weaker=null", "guidance=1"]
+    with pytest.raises(ConfigError, match=r"data.town=3000 for teacher .*, which learnt from .*data.town=null"):
+        call("distill", "town_pixel_student", *given)
+    assert not (tmp_path / "run" / "cache").exists()

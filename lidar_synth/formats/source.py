@@ -205,6 +205,6 @@ def choose(kind: str, name: str, table: Mapping[str, Choice], hint: str = "") ->
         ConfigError: on a name that is not in the table.
     """
     if name not in table:
-        hint = suggest(name, table) or hint
+        hint = f"{hint} {suggest(name, table)}".strip()
         raise ConfigError(f"{kind} {name!r}", f"one of {', '.join(map(repr, table))}", hint)
     return table[name]
