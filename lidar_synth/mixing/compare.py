@@ -22,6 +22,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.mixing.meaning import Contradiction, Table, contradictions, measure_tables
 from lidar_synth.mixing.synthetic import Generated, Synthetic
 from lidar_synth.noise import keyed_rng
 
@@ -42,6 +43,15 @@ SEARCHED = 8
 LABELS = re.compile("label|seg|sem|class|target", re.IGNORECASE)
 """Matches the names of arrays of labels."""
 
+LEAST_POINTS = 500
+"""Minimum number of rows of an array whose distribution is compared."""
+
+MOST_COLUMNS = 16
+"""Maximum number of columns of an array of points, or of channels of an image."""
+
+UNNAMED = re.compile(r"sample(\[\d+\])*")
+"""Matches the places of parts without a name, as in tuples."""
+
 USUAL_IGNORE = (-100, -1, 254, 255, 65535)
 """Labels that mean "ignore" in common trainers, for arrays whose name does not match ``LABELS``."""
 
@@ -49,7 +59,10 @@ USUAL_IGNORE = (-100, -1, 254, 255, 65535)
 def check_alike(
     real: Sequence[Any], synthetic: Sequence[Synthetic], finish: Callable[[int, Scan, np.random.Generator], Any]
 ) -> None:
-    """Compare a trainer's first sample with one synthetic sample of each source.
+    """Compare a trainer's first sample with one synthetic sample of each source, then what several samples mean.
+
+    The meaning (meaning.py) is compared for points and images of ``LEAST_POINTS`` or more with their labels,
+    over up to ``SEARCHED`` samples. What is certainly wrong is refused; what is unusual is logged as a warning.
 
     The state of Python's, numpy's and torch's global random generators is preserved. Banks and existing scans are
     represented by their first scan; a generator or a rolling bank, which would have to start first, by a made-up scan
@@ -61,7 +74,8 @@ def check_alike(
         finish: ``(source, scan, rng) -> sample``, what the mixture does to a scan of a source.
 
     Raises:
-        ConfigError: if keys, types, dtypes, ranks or the value for "ignore" differ.
+        ConfigError: if keys, types, dtypes, ranks or the value for "ignore" differ, or units, axes, the height of the
+            ground, the scale of a column or the numbers of the classes.
     """
     if not real or not synthetic:
         return
@@ -79,6 +93,52 @@ def check_alike(
                     "the same keys, types, dtypes and ranks, and one value for ignored labels",
                     "Change to_sample, or pass compare=False if the collate function expects them to differ.",
                 )
+            if _tables(expected) and not _is_on_demand(source):
+                more = [_try("real", dataset.__getitem__, i) for i in _spread(len(dataset))[1:]]
+                numbers = _spread(source.length or SEARCHED)
+                made = [
+                    _try("synthetic", lambda i, n, s: finish(n, s[i], keyed_rng(i)), i, number, source) for i in numbers
+                ]
+                report(compare_meaning([_tables(s) for s in (expected, *more)], [_tables(s) for s in made]))
+
+
+def report(found: Sequence[Contradiction]) -> None:
+    """Refuse what is certainly wrong, and log the rest.
+
+    Raises:
+        ConfigError: if any contradiction is certain.
+    """
+    if any(each.certain for each in found):
+        texts = [each.text for each in sorted(found, key=lambda each: not each.certain)]
+        raise ConfigError(
+            f"synthetic samples that mean something else than the real ones: {'; '.join(texts[:4])}",
+            "the same units, axes, origin, scales and classes",
+            "Change to_sample (lidar-synth check-mix shows the scans themselves), or pass compare=False.",
+        )
+    for each in found:
+        log.warning("synthetic samples are unlike the real ones: %s", each.text)
+
+
+def compare_meaning(
+    real: Sequence[Mapping[str, Table]], synthetic: Sequence[Mapping[str, Table]]
+) -> list[Contradiction]:
+    """Compare the tables of points of real and synthetic samples.
+
+    Args:
+        real, synthetic: {place: table} of each sample; tables of other places or columns are not compared.
+    """
+    found: dict[Contradiction, None] = {}
+    for place, first in real[0].items():
+        width = first.columns.shape[1]
+        ours, theirs = (
+            [each[place]._replace(spatial=first.spatial) for each in samples if place in each]
+            for samples in (synthetic, real)
+        )
+        ours = [table for table in ours if table.columns.shape[1] == width]
+        if ours:
+            measured = measure_tables(theirs, USUAL_IGNORE), measure_tables(ours, USUAL_IGNORE)
+            found |= dict.fromkeys(contradictions(*measured, place.removeprefix("sample")))
+    return list(found)
 
 
 def differences(real: Any, synthetic: Any, place: str = "sample", depth: int = DEPTH) -> Iterator[str]:
@@ -162,22 +222,65 @@ def _not_classes(place: str, values: set[int], known: set[int]) -> set[int]:
     return {v for v in values - known if v in USUAL_IGNORE or not low <= v <= high}
 
 
-def _labels(value: Any, place: str = "sample", depth: int = DEPTH) -> Iterator[tuple[str, set[int]]]:
+def _labels(sample: Any) -> Iterator[tuple[str, set[int]]]:
     """(place, values) of the integer arrays with few different values, which may be labels."""
+    for place, array in _arrays(sample):
+        if array.dtype.kind in "iu" and 0 < len(values := np.unique(array)) <= FEW:
+            yield place, set(values.tolist())
+
+
+def _tables(sample: Any) -> dict[str, Table]:
+    """{place: points} of the arrays of real numbers that have many rows, with the labels that belong to them."""
+    arrays = dict(_arrays(sample))
+    named = {p: a for p, a in arrays.items() if a.dtype.kind in "iu" and _may_be_labels(p)}
+    found = {}
+    for place, array in arrays.items():
+        rows = _rows(array) if array.dtype.kind == "f" else None
+        if rows is not None:
+            fitting = (a.ravel() for a in named.values() if a.size == len(rows) and len(np.unique(a)) <= FEW)
+            label = next(fitting, None)
+            reach = np.ptp(np.quantile(rows, (0.01, 0.99), axis=0), axis=0)
+            spatial = array.ndim == 2 and len(reach) > 2 and bool((reach[:3] > (5, 5, 0.5)).all())
+            found[place] = Table(rows, None if label is None else label.astype(np.int64), spatial)
+    return found
+
+
+def _may_be_labels(place: str) -> bool:
+    named = LABELS.search(place.removeprefix("sample")) and "inst" not in place.lower()
+    return bool(named or UNNAMED.fullmatch(place))
+
+
+def _rows(array: NDArray[Any]) -> NDArray[np.float64] | None:
+    """(N, C) of points (N, C), features (C, N) or an image (C, H, W); None for any other array."""
+    if array.ndim == 3 and array.shape[0] <= MOST_COLUMNS:
+        array = array.reshape(len(array), -1).T
+    elif array.ndim == 2 and array.shape[0] <= MOST_COLUMNS:
+        array = array.T
+    fits = array.ndim == 2 and 0 < array.shape[1] <= MOST_COLUMNS and len(array) >= LEAST_POINTS
+    return array.astype(np.float64) if fits and np.isfinite(array).all() else None
+
+
+def _spread(length: int) -> list[int]:
+    """Up to ``SEARCHED`` indices from the first to the last of a source."""
+    return np.unique(np.linspace(0, length - 1, SEARCHED).astype(int)).tolist() if length else []
+
+
+def _arrays(value: Any, place: str = "sample", depth: int = DEPTH) -> Iterator[tuple[str, NDArray[Any]]]:
+    """(place, array) of the arrays and tensors with at least one axis in a sample."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray):
-        if value.ndim and value.dtype.kind in "iu" and 0 < len(values := np.unique(value)) <= FEW:
-            yield place, set(values.tolist())
+        if value.ndim:
+            yield place, value
     elif depth and isinstance(value, Mapping):
         for key, part in value.items():
-            yield from _labels(part, f"{place}[{key!r}]", depth - 1)
+            yield from _arrays(part, f"{place}[{key!r}]", depth - 1)
     elif depth and isinstance(value, list | tuple):
         for i, part in enumerate(value[:PARTS]):
-            yield from _labels(part, f"{place}[{i}]", depth - 1)
+            yield from _arrays(part, f"{place}[{i}]", depth - 1)
     elif depth:
         for name, part in _parts(value).items():
-            yield from _labels(part, f"{place}.{name}", depth - 1)
+            yield from _arrays(part, f"{place}.{name}", depth - 1)
 
 
 def _try(kind: str, fetch: Callable[..., Any], *which: Any) -> Any:
@@ -191,9 +294,14 @@ def _try(kind: str, fetch: Callable[..., Any], *which: Any) -> Any:
 
 def _scan_of(source: Synthetic) -> Scan:
     """The first scan of a source, or a made-up one if the source generates scans on demand."""
-    if isinstance(source, Generated) or hasattr(source, "expect"):
+    if _is_on_demand(source):
         return made_up(source.sensor, source.fields)
     return source[0]
+
+
+def _is_on_demand(source: Synthetic) -> bool:
+    """Whether a source would have to start first: a generator or a rolling bank."""
+    return isinstance(source, Generated) or hasattr(source, "expect")
 
 
 def made_up(sensor: Sensor, fields: frozenset[str]) -> Scan:

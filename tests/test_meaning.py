@@ -1,0 +1,155 @@
+"""Samples that mean something else than a trainer's own are named; those of other streets and sensors are accepted."""
+
+import logging
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from lidar_synth import Town
+from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
+from lidar_synth.errors import ConfigError
+from lidar_synth.formats import open_scans
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.mixing import MixedScans
+from lidar_synth.mixing.meaning import contradictions, measure_tables, table_of
+
+Arrays = tuple[np.ndarray, np.ndarray]
+"""(N, 4) float32 x, y, z, reflectance, and (N,) int64 labels."""
+
+
+@cache
+def streets(seed: int) -> list[Scan]:
+    """Four scans of one stretch of a town."""
+    town = Town(seed=seed, sensor="hdl32e", scans=4)
+    return [town[i] for i in range(4)]
+
+
+def arrays_of(scan: Scan) -> Arrays:
+    assert scan.label is not None
+    return np.column_stack([scan.points, scan.reflectance]).astype(np.float32), scan.label.astype(np.int64)
+
+
+def pointcept(points: np.ndarray, label: np.ndarray) -> Any:
+    return {"coord": points[:, :3], "strength": points[:, 3:], "segment": label.astype(np.int32), "name": "x"}
+
+
+def collected(points: np.ndarray, label: np.ndarray) -> Any:
+    """Pointcept's after its transforms: a grid, tensors and joined features."""
+    _, first = np.unique(np.floor(points[:, :3] / 0.3), axis=0, return_index=True)
+    part = torch.from_numpy(points[first])
+    return {"coord": part[:, :3], "feat": part, "segment": torch.from_numpy(label[first]), "offset": len(part)}
+
+
+FORMS: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {
+    "pointcept": pointcept,
+    "pointcept, collected": collected,
+    "open3d-ml": lambda p, s: {"point": p[:, :3], "feat": p[:, 3:], "label": (s + 1).astype(np.int32) % 256},
+    "waffleiron": lambda p, s: (np.vstack([p[:, 3], np.linalg.norm(p[:, :3], axis=1), p.T[:3]]), s, np.arange(len(p))),
+    "cylinder3d": lambda p, s: (p[:, :3], s[:, None].astype(np.uint8), p[:, 3]),
+    "openpcdet": lambda p, s: {"points": p, "gt_boxes": np.zeros((3, 8), np.float32), "frame_id": "0"},
+    "mmdetection3d": lambda p, s: {
+        "inputs": {"points": torch.from_numpy(p)},
+        "data_samples": SimpleNamespace(gt_pts_seg=SimpleNamespace(pts_semantic_mask=torch.from_numpy(s))),
+    },
+    "tuple": lambda p, s: (p, s),
+}  # fmt: skip
+
+
+def wrapped(form: str, wrong: Callable[[np.ndarray, np.ndarray], Arrays], real: list[Scan], synth: list[Scan]) -> Any:
+    """A mixture in a trainer's form whose synthetic samples have a mistake."""
+
+    def to_sample(scan: Scan, rng: np.random.Generator) -> Any:
+        return FORMS[form](*wrong(*arrays_of(scan)))
+
+    theirs = [FORMS[form](*arrays_of(scan)) for scan in real]
+    return MixedScans.wrap(theirs, synth, 0.5, to_sample=to_sample)
+
+
+def unchanged(points: np.ndarray, label: np.ndarray) -> Arrays:
+    return points, label
+
+
+def scaled(*factors: float) -> Callable[[np.ndarray, np.ndarray], Arrays]:
+    return lambda points, label: (points * np.array(factors, np.float32), label)
+
+
+def numbered(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray, np.ndarray], Arrays]:
+    """Other numbers of the classes; "ignore" stays."""
+    return lambda points, label: (points, np.where(label == IGNORE, IGNORE, change(label)))
+
+
+def raw_ids(label: np.ndarray) -> np.ndarray:
+    table = np.zeros(256, np.int64)
+    table[: len(SEMANTIC_KITTI.from_train or ())] = SEMANTIC_KITTI.from_train
+    return table[label]
+
+
+MISTAKES: dict[str, tuple[Callable[[np.ndarray, np.ndarray], Arrays], str]] = {
+    "classes too high": (numbered(lambda k: k + 1), "class 9 looks like your 8.*off by one"),
+    "classes too low": (numbered(lambda k: np.maximum(k - 1, 0)), "class 7 looks like your 8.*off by one"),
+    "raw ids": (numbered(raw_ids), "class 40 looks like your 8.*ids in files"),
+    "reflectance x 255": (scaled(1, 1, 1, 255), "another scale"),
+    "reflectance 0": (scaled(1, 1, 1, 0), "is always 0"),
+    "z + 1.73": (lambda p, s: (p + np.float32([0, 0, 1.73, 0]), s), "the origin is at another height"),
+    "nuScenes' axes": (lambda p, s: (p[:, [1, 0, 2, 3]] * np.float32([-1, 1, 1, 1]), s), "roads run along y"),
+    "z inverted": (scaled(1, 1, -1, 1), "z points down"),
+    "centimetres": (scaled(100, 100, 100, 1), "another (unit|scale)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named(mistake: str) -> None:
+    wrong, message = MISTAKES[mistake]
+    with pytest.raises(ConfigError, match=f"mean something else.*{message}.*compare=False"):
+        wrapped("tuple", wrong, streets(1), streets(2))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_scans_of_another_street_are_accepted_in_every_trainers_form(form: str, caplog: Any) -> None:
+    wrapped(form, unchanged, streets(1), streets(2))
+    assert "unlike" not in caplog.text
+
+
+@pytest.mark.parametrize("form", set(FORMS) - {"openpcdet"})
+def test_mistakes_are_found_in_every_trainers_form(form: str) -> None:
+    for mistake in ("raw ids", "centimetres") if form != "open3d-ml" else ("centimetres",):
+        with pytest.raises(ConfigError, match=MISTAKES[mistake][1]):
+            wrapped(form, MISTAKES[mistake][0], streets(1), streets(2))
+
+
+def test_the_ground_a_little_lower_is_only_reported(caplog: pytest.LogCaptureFixture) -> None:
+    def lower(points: np.ndarray, label: np.ndarray) -> Arrays:
+        return points - np.float32([0, 0, 0.7, 0]), label
+
+    with caplog.at_level(logging.WARNING):
+        wrapped("tuple", lower, streets(1), streets(2))
+    assert "samples are unlike the real ones: [0]: the ground is at z =" in caplog.text
+
+
+def real_sources(real: Path, labelled: Path) -> dict[str, Any]:
+    roots = {name: real / name for name in ("kitti360", "semantic_kitti", "kitti_object", "nuscenes")}
+    roots |= {"raw": real / "kitti_raw" / "2011_09_26", "street": labelled / "semantic_kitti_consecutive"}
+    return {name: open_scans(root) for name, root in roots.items()}
+
+
+def test_no_real_dataset_is_refused_beside_another_or_the_town(real_scans: Path, labelled_scans: Path) -> None:
+    sources = real_sources(real_scans, labelled_scans)
+    scans = {name: [source[i] for i in range(min(len(source), 4))] for name, source in sources.items()}
+    scans["town"] = streets(2)
+    measured = {name: measure_tables([table_of(scan) for scan in some], [IGNORE]) for name, some in scans.items()}
+    for name, ours in measured.items():
+        for other, theirs in measured.items():
+            assert not [each for each in contradictions(ours, theirs) if each.certain], (name, other)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_are_named_beside_real_scans(mistake: str, labelled_scans: Path) -> None:
+    source = open_scans(labelled_scans / "semantic_kitti_consecutive")
+    with pytest.raises(ConfigError, match=MISTAKES[mistake][1]):
+        wrapped("tuple", MISTAKES[mistake][0], [source[i] for i in range(4)], streets(2))
