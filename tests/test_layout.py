@@ -280,7 +280,7 @@ def test_an_unknown_class_is_refused() -> None:
 
 
 def test_the_classes_with_boxes_are_those_of_the_boxes_of_detectors() -> None:
-    assert set(BOXED) == {label for name, label in LABELS.items() if name != "Motorcyclist"}  # to KITTI, "Misc"
+    assert set(BOXED) == set(LABELS.values())
 
 
 def test_touching_boxes_are_accepted_and_stacked_ones_refused() -> None:

@@ -14,7 +14,7 @@ from test_conditions import conditioned_batches
 from torch.utils.data import DataLoader
 from typer.testing import CliRunner
 
-from lidar_synth import Bank, Generator, Layout, MixedScans, load_generator, make_policy
+from lidar_synth import Bank, Generator, Layout, MixedScans, load_generator, load_layout, make_policy
 from lidar_synth.bake import bake
 from lidar_synth.bake.conditions import LayoutFiles
 from lidar_synth.bake.edit import head, merge, split
@@ -23,6 +23,7 @@ from lidar_synth.bake.verify import regenerate, verify
 from lidar_synth.bank import BOXED_FORMAT, FORMAT, Encoding
 from lidar_synth.bank.boxes import SHAPE, check_boxes, decode_boxes, encode_boxes
 from lidar_synth.cli import app
+from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.boxed import with_boxes
 from lidar_synth.generate.conditions import CONDITIONS, batch_of
@@ -81,6 +82,18 @@ def test_the_boxes_of_a_scan_are_those_of_its_layout_that_hold_points(model: Pat
         assert np.array_equal(scan.instance > 0, inside.any(0))
         found += len(scan.boxes)
     assert found >= 2
+
+
+def test_a_crossing_has_no_streaks_of_bicycles(tmp_path: Path) -> None:
+    """All that moves stands in the boxes of a layout, and has their class: also cycles, of which it says nothing."""
+    places = ((8, -3), (8, -1), (8.5, 1), (9, 3), (10, 0), (10, -2))
+    people = "".join(f"  - {{class: Pedestrian, at: [{x}, {y}]}}\n" for x, y in places)
+    (tmp_path / "crossing.yaml").write_text("objects:\n" + people)
+    [scan] = load_generator("town-layout").scans(0, [0], load_layout(tmp_path / "crossing.yaml"))
+    assert scan.boxes is not None and scan.label is not None and len(scan.boxes) == len(places)
+    moving = scan.label <= TRAIN_ID["motorcyclist"]
+    assert moving.sum() > 1000 and (scan.label[moving] == TRAIN_ID["person"]).all()
+    assert scan.boxes.enlarged(0.1).contain(scan.points[moving]).any(0).all()
 
 
 def test_an_image_of_a_layout_tells_no_boxes_and_other_conditions_are_refused(model: Path, folder: Path) -> None:

@@ -30,8 +30,8 @@ TRAIN_ID = {name: i for i, name in enumerate(NAMES)}
 GROUND = np.isin(np.arange(256), [TRAIN_ID[n] for n in ("road", "parking", "sidewalk", "other-ground", "terrain")])
 """(256,) whether a label, uint8, is of the ground."""
 
-BOXED = tuple(TRAIN_ID[name] for name in ("car", "truck", "other-vehicle", "person", "bicyclist"))
-"""Train ids of the objects that detectors' classes have boxes for."""
+BOXED = tuple(TRAIN_ID[name] for name in ("car", "truck", "other-vehicle", "person", "bicyclist", "motorcyclist"))
+"""Train ids of the objects that have boxes, of the classes in ``LABELS``."""
 
 LABELS = {
     "Car": TRAIN_ID["car"], "Van": TRAIN_ID["car"], "Truck": TRAIN_ID["truck"], "Tram": TRAIN_ID["other-vehicle"],

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lidar_synth.datasets.classes import BOXED, IGNORE, LABELS
+from lidar_synth.datasets.classes import IGNORE, LABELS, TRAIN_ID
 from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES
 from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.geometry.normalize import Normalisation
@@ -21,7 +21,7 @@ class Bounds(NamedTuple):
         near, far: (N, P) normalised ranges where the ray of a cell enters and leaves a box; near > far if it meets
             none.
         label: (N, P) int64 class of the object in the box, -1 = unknown.
-        codes: (C,) bool, the classes that stand in boxes only.
+        codes: (C,) bool, the classes that are drawn in boxes only: all that move.
     """
 
     near: Tensor
@@ -52,7 +52,8 @@ def bounds_of(layout: Tensor, columns: int, patch: tuple[int, int], codes: int, 
     near, nearest = near.reshape(shape).min(3)
     labels = labels.reshape(shape).gather(3, nearest[..., None])[..., 0]
     parts = torch.stack([near, far.reshape(shape).amax(3), labels.float()], 1)
-    kinds = torch.isin(torch.arange(codes, device=layout.device), torch.tensor(BOXED, device=layout.device))
+    # Parked bicycles and motorcycles too: a layout does not say where one stands, and drawn anywhere it is a streak.
+    kinds = torch.arange(codes, device=layout.device) <= TRAIN_ID["motorcyclist"]
     near, far, labels = to_patches(parts, patch).unbind(1)
     return Bounds(near, far, labels.long(), kinds)
 
