@@ -1,7 +1,7 @@
 """Shared by the launchers: the script on the command line, and a trial of a trainer on a machine without a GPU.
 
-With ``LIDAR_SYNTH_CPU=1`` what a trainer sends to a GPU stays on the CPU. That shows whether a configuration runs; no
-one trains so.
+Without a GPU, or with ``LIDAR_SYNTH_CPU=1``, what a trainer sends to a GPU stays on the CPU. That shows whether a
+configuration runs; no one trains so.
 """
 
 import logging
@@ -21,7 +21,7 @@ from torch.nn import functional
 from lidar_synth.errors import LidarSynthError
 
 CPU = "LIDAR_SYNTH_CPU"
-"""Environment variable: 1 keeps on the CPU what a trainer sends to a GPU."""
+"""Environment variable: 1 keeps on the CPU what a trainer sends to a GPU, also where there is one; 0 does not."""
 
 
 def prepare_script(usage: str, *names: str) -> str:
@@ -45,7 +45,7 @@ def prepare_script(usage: str, *names: str) -> str:
     sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
     say_epochs()
     provide(*names)
-    if os.environ.get(CPU) == "1":
+    if os.environ.setdefault(CPU, str(int(not torch.cuda.is_available()))) == "1":
         stay_on_cpu()
     return sys.argv[0]
 
@@ -76,7 +76,7 @@ def plain_errors() -> Iterator[None]:
 
 def stay_on_cpu() -> None:
     """Keep on the CPU what is sent to a GPU; class targets become int64, as these trainers make them on a GPU."""
-    print(f"lidar_synth: {CPU}=1, so what this trainer sends to a GPU stays on the CPU", flush=True)
+    print(f"lidar_synth: no GPU, or {CPU}=1: what this trainer sends to a GPU stays on the CPU", flush=True)
     changed: dict[tuple[Any, str], Any] = {
         (torch.cuda, "set_device"): lambda device: None,
         (torch.Tensor, "get_device"): lambda self: self.device,

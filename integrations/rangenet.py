@@ -1,12 +1,13 @@
-"""RangeNet++ (lidar-bonnetal) and SalsaNext: a launcher that runs their own training script on a mixture::
+"""RangeNet++ (lidar-bonnetal), SalsaNext and CENet: a launcher that runs their own training script on a mixture::
 
-    cd train/tasks/semantic
+    cd train/tasks/semantic    # CENet: its root
     LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.rangenet train.py -d DATASET -ac ARCH.yaml ...
 
 The trainer's own parser reads every scan: a synthetic one is passed through a temporary file in memory (``/dev/shm`` on
 Linux). Validation, and scripts other than ``train.py``, see only real scans.
 """
 
+import sys
 import tempfile
 from functools import cache, wraps
 from importlib import import_module
@@ -26,9 +27,12 @@ from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry.scan import Scan
 
 USAGE = (
-    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.rangenet train.py ARGUMENTS, in train/tasks/semantic"
+    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.rangenet train.py ARGUMENTS, in train/tasks/semantic "
+    "or CENet"
 )
-TRAINER = "tasks.semantic.modules.trainer"
+FAMILY = "lidar-bonnetal, SalsaNext or CENet"
+TRAINERS = {"tasks.semantic.modules.trainer": None, "modules.trainer": "dataset.kitti.parser"}
+"""{module of the trainer: module from which it imports its parser, or None where it loads the parser by its path}."""
 STRIPES = 0.25
 """Largest difference of ``gaps`` between real and synthetic images; below, the eye sees images of one density."""
 
@@ -153,7 +157,7 @@ def make_parser(stock: Any, settings: Any = None) -> Any:
     """
     missing = [name for name in ("Parser", "SemanticKitti", "LaserScan") if not hasattr(stock, name)]
     if missing:
-        raise LibraryError(f"a parser.py without {missing}", "the parser of lidar-bonnetal or SalsaNext")
+        raise LibraryError(f"a parser.py without {missing}", f"the parser of {FAMILY}")
     settings = read_settings(settings)
 
     class Parser(stock.Parser):  # type: ignore[misc]
@@ -176,39 +180,58 @@ def make_parser(stock: Any, settings: Any = None) -> Any:
             self.trainloader = DataLoader(
                 self.train_dataset, batch_size=self.batch_size, shuffle=self.shuffle_train, num_workers=self.workers,
                 pin_memory=loader.pin_memory, drop_last=True, collate_fn=loader.collate_fn,
+                worker_init_fn=loader.worker_init_fn, generator=loader.generator,
             )  # fmt: skip
 
     return Parser
 
 
 def register() -> None:
-    """Make the trainer load a mixed parser and set the epoch of its training set, also when it resumes.
+    """Make the trainer use a mixed parser and set the epoch of its training set, also when it resumes.
 
     Raises:
-        LibraryError: if the trainer's code cannot be imported, or is not that of RangeNet++ or SalsaNext.
+        LibraryError: if the trainer's code cannot be imported, or is not of this family.
     """
-    try:
-        module = import_module(TRAINER)
-    except ImportError as error:
-        raise LibraryError(
-            f"{TRAINER} cannot be imported ({error})", "a trainer with all that it imports", "cd train/tasks/semantic"
-        ) from error
-    if not (hasattr(module, "imp") and hasattr(module.Trainer, "train_epoch")):
-        raise LibraryError(f"{module.__file__} without imp or Trainer.train_epoch", "lidar-bonnetal or SalsaNext")
-    load, train = module.imp.load_source, module.Trainer.train_epoch
-
-    def load_source(name: str, path: str) -> Any:
-        loaded = load(name, path)
-        return SimpleNamespace(Parser=make_parser(loaded)) if name == "parserModule" else loaded
+    module, parser = _trainer()
+    if not ((parser or hasattr(module, "imp")) and hasattr(module.Trainer, "train_epoch")):
+        raise LibraryError(f"{module.__file__} without imp or Trainer.train_epoch", FAMILY)
+    train = module.Trainer.train_epoch
 
     @wraps(train)
     def train_epoch(self: Any, train_loader: Any, *args: Any, epoch: int, **options: Any) -> Any:
         train_loader.dataset.set_epoch(epoch)
         return train(self, train_loader, *args, epoch=epoch, **options)
 
-    module.imp = SimpleNamespace(load_source=load_source)  # type: ignore[attr-defined]
+    if parser:
+        # A class of this name beside the trainer's own would end up in its super(Parser, self).
+        sys.modules[parser.__name__] = SimpleNamespace(Parser=make_parser(parser))  # type: ignore[assignment]
+    else:
+        module.imp = _loader(module.imp.load_source)
     module.Trainer.train_epoch = train_epoch
     _plain_state(module.warmupLR)
+
+
+def _trainer() -> tuple[Any, Any]:
+    """The module of the trainer, and that of its parser where the trainer imports it."""
+    for name, parser in TRAINERS.items():
+        try:
+            return import_module(name), parser and import_module(parser)
+        except ImportError as error:
+            if error.name != "tasks":  # it is this trainer, without something that it imports
+                raise LibraryError(
+                    f"{name} cannot be imported ({error})", f"{FAMILY} with all that it imports", f"Start: {USAGE}"
+                ) from error
+    raise AssertionError("the last trainer is not in a package of this name")
+
+
+def _loader(load: Any) -> SimpleNamespace:
+    """``imp`` for a trainer that loads its parser by path."""
+
+    def load_source(name: str, path: str) -> Any:
+        loaded = load(name, path)
+        return SimpleNamespace(Parser=make_parser(loaded)) if name == "parserModule" else loaded
+
+    return SimpleNamespace(load_source=load_source)
 
 
 def _plain_state(scheduler: Any) -> None:
@@ -229,7 +252,8 @@ def _plain_state(scheduler: Any) -> None:
 def main() -> None:
     """Run one of the trainer's scripts; ``train.py`` trains on the mixture."""
     script = prepare_script(USAGE, "numpy.float", "imp", "tensorflow.summary", "torchvision", "torch.load")
-    import_module("__init__")  # the trainer's own, which its scripts import first: it puts ../.. on the path
+    if Path(script).with_name("__init__.py").is_file():
+        import_module("__init__")  # the trainer's own, which its scripts import first: it puts ../.. on the path
     register()
     run(script)
 

@@ -1,4 +1,4 @@
-"""Trainers' own scripts, run by our launchers as a user types it, with LIDAR_SYNTH_CPU=1 where there is no GPU."""
+"""Trainers' own scripts, run by our launchers as a user types it."""
 
 import os
 import re
@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-from lidar_synth.integrations.launcher import CPU
 from lidar_synth.integrations.mixture import VARIABLE
 
 
@@ -15,7 +14,7 @@ def launched(trainer: str, *arguments: str | Path, cwd: Path, mixture: Path, sta
     """What ``python -m lidar_synth.integrations.<trainer> <arguments>`` says; another exit status fails the test."""
     command = [sys.executable, "-m", f"lidar_synth.integrations.{trainer}", *map(str, arguments)]
     done = subprocess.run(
-        command, cwd=cwd, env=os.environ | {VARIABLE: str(mixture), CPU: "1"}, stdin=subprocess.DEVNULL,
+        command, cwd=cwd, env=os.environ | {VARIABLE: str(mixture)}, stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
     )  # fmt: skip
     print(done.stdout)

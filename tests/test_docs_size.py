@@ -16,7 +16,7 @@ LIMITS = {
     "docs/how-to/trainers/mmdetection3d.md": 230,
     "docs/how-to/trainers/openpcdet.md": 160,
     "docs/how-to/trainers/pointcept.md": 110,
-    "docs/how-to/trainers/range-view.md": 110,
+    "docs/how-to/trainers/range-view.md": 140,
     "docs/how-to/trainers/cylinder3d.md": 80,
     "docs/how-to/trainers/open3d-ml.md": 110,
     "docs/how-to/trainers/waffleiron.md": 70,

@@ -1,5 +1,5 @@
 # ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
-"""RangeNet++'s or SalsaNext's own parser and script on mixed scans: RANGENET_ROOT is a checkout of either."""
+"""RangeNet++'s, SalsaNext's or CENet's own parser and script on mixed scans; RANGENET_ROOT is a checkout of one."""
 
 import os
 import random
@@ -7,6 +7,7 @@ import re
 import sys
 from collections import Counter
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,12 +21,12 @@ from launched import clone, epochs, launched
 from lidar_synth.integrations.removed import provide
 from streets import SENSOR, semantic_kitti, synthetic
 
-ROOT = checkout("RANGENET_ROOT", "lidar-bonnetal or SalsaNext")
-sys.path.append(str(ROOT / "train"))
+ROOT = checkout("RANGENET_ROOT", "lidar-bonnetal, SalsaNext or CENet")
+CENET = (ROOT / "modules/trainer.py").is_file()
+sys.path.append(str(ROOT if CENET else ROOT / "train"))
 provide("numpy.float", "imp", "tensorflow.summary", "torchvision")  # as the launcher does
 
 from lidar_synth.integrations.rangenet import filled, gaps, make_parser
-from tasks.semantic.dataset.kitti import parser as stock
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.formats import open_scans
@@ -33,7 +34,9 @@ from lidar_synth.generate.generator import load_generator
 from lidar_synth.mixing import Generated
 
 REAL, EXTRA, BATCH = 6, 4, 2
-SALSA = hasattr(stock, "my_collate")
+stock = import_module("dataset.kitti.parser" if CENET else "tasks.semantic.dataset.kitti.parser")
+SALSA = hasattr(stock, "my_collate") and not CENET
+ARCH = "senet-1024p.yml" if CENET else "salsanext.yml" if SALSA else "config/arch/squeezeseg.yaml"
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +80,7 @@ def parser(made: Path, **others: Any) -> Any:
 def both(made: Path) -> tuple[Any, Any]:
     """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
     keys = ("labels", "color_map", "learning_map", "learning_map_inv", "sensor", "max_points", "gt")
-    options = {key: arguments(made)[key] for key in keys} | ({"transform": True} if SALSA else {})
+    options = {key: arguments(made)[key] for key in keys} | ({"transform": True} if SALSA or CENET else {})
     return stock.SemanticKitti(str(made / "sk"), [0], **options), parser(made).train_dataset
 
 
@@ -219,24 +222,26 @@ def test_density_of_the_shipped_model_and_of_real_scans(made: Path, labelled_sca
 
 def configure(made: Path, out: Path, epochs: int, **sensor: int) -> list[str | Path]:
     """Arguments of ``train.py``: the stock configuration with a small image, and few iterations."""
-    source = next(ROOT.rglob("salsanext.yml" if SALSA else "config/arch/squeezeseg.yaml"))
+    source = next(ROOT.rglob(ARCH))
     arch, labels = yaml.safe_load(source.read_text()), data()
     arch["train"] |= {"max_epochs": epochs, "batch_size": BATCH, "workers": 0, "report_batch": 1}
     arch["dataset"]["sensor"]["img_prop"] = {"width": SENSOR.columns // 4, "height": SENSOR.rows} | sensor
     labels["split"] = {"train": [0], "valid": [0], "test": []}
     for name, content in {"arch": arch, "labels": labels}.items():
         (out / f"{name}.yaml").write_text(yaml.safe_dump(content))
-    return ["train.py", "-d", made / "sk", "-ac", out / "arch.yaml", "-dc", out / "labels.yaml", "-l", out / "log"]
+    files = ["-ac", out / "arch.yaml", "-dc", out / "labels.yaml", "-l", out / "log"]
+    own = ["-n", "mixed"] if CENET else ["-p", ""] if SALSA else []
+    return ["train.py", "-d", made / "sk", *files, *own]
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> None:
     """``train.py`` as a user types it, with validation; SalsaNext resumes, and sees the samples of its epoch."""
-    cwd = clone(ROOT, tmp_path / "clone") / "train/tasks/semantic"
+    cwd = clone(ROOT, tmp_path / "clone") / ("" if CENET else "train/tasks/semantic")
     first = 1 if SALSA else 2
     arguments = configure(made, tmp_path, first)
-    said = launched("rangenet", *arguments, *(["-p", ""] if SALSA else []), cwd=cwd, mixture=made / "mix.yaml")
+    said = launched("rangenet", *arguments, cwd=cwd, mixture=made / "mix.yaml")
     if SALSA:
         (log,) = (tmp_path / "log/logs").iterdir()
         said += launched("rangenet", *configure(made, tmp_path, 2), "-p", log, cwd=cwd, mixture=made / "mix.yaml")
@@ -251,7 +256,7 @@ def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_the_launcher_refuses_before_training(dense: Path, tmp_path: Path) -> None:
-    cwd = clone(ROOT, tmp_path / "clone") / "train/tasks/semantic"
+    cwd = clone(ROOT, tmp_path / "clone") / ("" if CENET else "train/tasks/semantic")
     arguments = configure(dense, tmp_path, 1, width=2 * SENSOR.columns)
     said = launched("rangenet", *arguments, cwd=cwd, mixture=dense / "mix.yaml", status=1)
     assert "lidar_synth: synthetic scans in images of 32 x 512" in said and "Traceback" not in said
