@@ -81,6 +81,7 @@ def stay_on_cpu() -> None:
         (torch.cuda, "set_device"): lambda device: None,
         (torch.Tensor, "get_device"): lambda self: self.device,
         (torch, "load"): _mapped(torch.load),
+        (torch, "eye"): _made(torch.eye),
         (functional, "nll_loss"): _int64(functional.nll_loss),
     }
     for kind in (torch.Tensor, torch.nn.Module):
@@ -125,6 +126,14 @@ def _kept(move: Any) -> Any:
         return move(self, *left, **named) if left or set(named) - {"non_blocking"} else self
 
     return moved
+
+
+def _made(make: Any) -> Any:
+    @wraps(make)
+    def made(*args: Any, **options: Any) -> Any:
+        return make(*args, **{key: value for key, value in options.items() if not _on_gpu(value)})
+
+    return made
 
 
 def _mapped(load: Any) -> Any:

@@ -10,6 +10,7 @@ needs ``SynthKittiDataset`` or ``SynthNuScenesDataset``, whose synthetic entries
 ``mmdet3d_infos.write_infos`` writes the list, ``tools/install_mmdet3d.sh`` installs the trainer.
 """
 
+import math
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -144,7 +145,8 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
     Args:
         dataset: holds a mixed list.
         seed: not used: the runner draws another one if a run is resumed.
-        options: ``shuffle`` and ``round_up`` of ``DefaultSampler``.
+        options: ``shuffle`` and ``round_up`` of ``DefaultSampler``. Where an epoch has other entries than all of the
+            list (a schedule, ``epoch_size``), they come in the plan's order.
 
     Attributes:
         start: number of samples that the next pass leaves out.
@@ -159,12 +161,29 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
         super().__init__(dataset, seed=int(folders[0].settings["seed"]), **options)
         dataset.__getitems__ = Fetch(dataset, [folder.path for folder in folders])
         self.start = 0
+        self.planned = next((folder for folder in folders if not folder.whole), None)
+        if self.planned is None:
+            return
+        listed = self.planned.real + self.planned.slots
+        if len(folders) > 1 or len(dataset) != listed:
+            raise ConfigError(
+                f"a dataset of {len(dataset)} samples around a mixed list of {listed} with a schedule or epoch_size",
+                "the list's own dataset, not repeated or joined with others",
+            )
+        length = len(self.planned.mixed)
+        self.num_samples = math.ceil((length - (0 if self.round_up else self.rank)) / self.world_size)
+        self.total_size = self.num_samples * self.world_size if self.round_up else length
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         """The (epoch, index) of each sample."""
         start, self.start = self.start, 0
         epoch = self.epoch
-        return ((epoch, index) for index in islice(super().__iter__(), start, None))
+        order = super().__iter__() if self.planned is None else self._planned(self.planned.entries(epoch).tolist())
+        return ((epoch, index) for index in islice(order, start, None))
+
+    def _planned(self, entries: list[int]) -> Iterator[int]:
+        """This process's entries; the first ones once more where all processes need as many."""
+        return iter((entries + entries)[self.rank : self.total_size : self.world_size])
 
 
 class Fetch:

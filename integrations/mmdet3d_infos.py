@@ -52,7 +52,9 @@ def write_infos(
     Args:
         out: output folder.
         real: the trainer's own list (``.pkl`` or ``.json``), as written by its ``create_data.py``.
-        settings: settings of the mixture, see ``mixture.OPTIONS``; one ratio for all epochs.
+        settings: settings of the mixture, see ``mixture.OPTIONS``. With a schedule, or another ``epoch_size`` than
+            ``"add"``, the list has as many slots as the epoch with most synthetic samples, and ``SynthSampler`` takes
+            an epoch's entries from it.
         data_root: the folder to which the paths in ``real`` are relative.
         points: the folder of the points under ``data_root`` (the configuration's ``data_prefix['pts']``).
         sweeps: the folder of the sweeps between nuScenes' key frames (``data_prefix['sweeps']``).
@@ -67,7 +69,7 @@ def write_infos(
         The mixed list, for ``ann_file``.
 
     Raises:
-        ConfigError: on a mixture that a list cannot hold: a schedule, ``epoch_size``, labels that make a loss NaN; on
+        ConfigError: on labels that make a loss NaN, or a ratio that is no number, list or {epoch: ratio}; on
             ``view=True`` without a camera.
         DataError: on a list without entries, or of another format; for detection, on synthetic scans without boxes.
         FileError: if the scan of the first entry does not exist.
@@ -112,6 +114,8 @@ def _read(real: str | Path) -> Any:
 def _complete(settings: dict[str, Any]) -> dict[str, Any]:
     """The settings with defaults, and with absolute paths to the synthetic scans and a sensor."""
     settings = {"synthetic": settings.get("synthetic"), "ratio": 0.25, "labels": "generated", "seed": 0} | settings
+    if not isinstance(settings["ratio"], int | float | list | dict):
+        raise ConfigError(f"ratio={settings['ratio']!r} for a list", "a number, a list or {epoch: ratio}")
     for name in ("synthetic", "as_sensor"):
         if isinstance(where := settings.get(name), str | Path) and Path(where).exists():
             settings[name] = str(Path(where).resolve())

@@ -70,22 +70,18 @@ class Folder:
 
     Attributes:
         mixed: the mixture; its real samples are the numbers of the list's real entries.
-        slots: number of synthetic samples in the first epoch; a later epoch may have one fewer, and then repeats one
-            of its scans.
+        slots: the largest number of synthetic samples in an epoch.
+        real: number of real entries in the list.
         layout: the form of points and boxes.
     """
 
     def __init__(self, path: Path, facts: dict[str, Any]) -> None:
-        self.path, self.settings = path, facts["settings"]
+        self.path, self.settings, self.real = path, facts["settings"], int(facts["real"])
+        if isinstance(ratio := self.settings["ratio"], dict):  # JSON knows names only
+            self.settings = self.settings | {"ratio": {int(epoch): share for epoch, share in ratio.items()}}
         self.layout = LAYOUTS[facts.get("layout", "kitti")]
-        self.mixed = mix(facts["real"], self.settings, lambda scan, rng: scan)
-        mixture = self.mixed.mixture
-        if mixture.epoch_size != "add" or settled(mixture.ratio) != 0:
-            raise ConfigError(
-                f"ratio={self.settings['ratio']}, epoch_size={mixture.epoch_size!r} for MMDetection3D",
-                "one ratio for all epochs, and epoch_size='add': a list is read once",
-            )
-        self.slots = len(self.mixed) - facts["real"]
+        self.mixed = mix(self.real, self.settings, lambda scan, rng: scan)
+        self.slots = self.mixed.mixture.laps[0]
         self._view = None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
         self._cached: OrderedDict[tuple[int, int], Scan] = OrderedDict()
         self._positions: tuple[int, NDArray[np.int64]] | None = None
@@ -130,6 +126,18 @@ class Folder:
     @epoch.setter
     def epoch(self, epoch: int) -> None:
         self._epoch = epoch
+
+    @property
+    def whole(self) -> bool:
+        """Whether every epoch has each entry of the list once: one ratio, and all real scans."""
+        return self.mixed.mixture.epoch_size == "add" and settled(self.mixed.mixture.ratio) == 0
+
+    def entries(self, epoch: int) -> NDArray[np.int64]:
+        """(N,) the list's entries that an epoch has, in the order of its plan."""
+        plan = self.mixed.plan(epoch)
+        entries = plan.index.copy()
+        entries[plan.domain] = self.real + np.arange(plan.synthetics)
+        return entries
 
     def scan(self, slot: int) -> Scan:
         """The scan of a slot in the current epoch, in the form of the dataset, with its labels and boxes.

@@ -42,9 +42,8 @@ class LaserScan:
         pass
 
 class SemanticKitti:
-    def __init__(self, root, sequences, labels, color_map, learning_map, learning_map_inv, sensor, max_points=9**6, gt=True):
-        self.learning_map, self.learning_map_inv, self.gt, self.max_points = learning_map, learning_map_inv, gt, max_points
-        self.labels = self.color_map = self.sensor = None
+    def __init__(self, root, sequences, **options):
+        self.__dict__ |= options
         self.sensor_img_H, self.sensor_img_W, self.sensor_fov_up, self.sensor_fov_down = 4, 8, 3, -25
         self.scan_files = sorted(map(str, Path(root).glob("sequences/*/velodyne/*.bin")))
         self.label_files = [path.replace("velodyne", "labels").replace(".bin", ".label") for path in self.scan_files]
@@ -60,8 +59,10 @@ class Parser:
         super(Parser, self).__init__()
         raw = SEMANTIC_KITTI.from_train
         self.root, self.train_sequences, self.batch_size, self.workers, self.shuffle_train = "sk", [0], 2, 0, True
-        maps = {k: i + 1 for i, k in enumerate(raw)} | {0: 0}, {i + 1: k for i, k in enumerate(raw)} | {0: 0}
-        self.train_dataset = SemanticKitti(self.root, [0], {}, {}, *maps, None)
+        options = {"labels": {}, "color_map": {}, "sensor": None, "max_points": 9**6, "gt": True}
+        options["learning_map"] = {k: i + 1 for i, k in enumerate(raw)} | {0: 0}
+        options["learning_map_inv"] = {i + 1: k for i, k in enumerate(raw)} | {0: 0}
+        self.train_dataset = SemanticKitti(self.root, [0], **options)
         self.trainloader = torch.utils.data.DataLoader(self.train_dataset, batch_size=2)
         self.trainiter = iter(self.trainloader)
 

@@ -295,8 +295,6 @@ def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_pat
     unlabelled = synthetic(tmp_path / "unlabelled", 2, labels=False)
     with pytest.raises(ConfigError, match="a model or bank with labels"):
         write_infos(tmp_path / "b", listed, MIX | {"synthetic": unlabelled}, **root)
-    with pytest.raises(ConfigError, match="a list is read once"):
-        write_infos(tmp_path / "c", listed, MIX | {"synthetic": made / "synthetic", "ratio": [0.1, 0.5]}, **root)
     with pytest.raises(ConfigError, match="settings .'rate'."):
         write_infos(tmp_path / "d", listed, MIX | {"synthetic": made / "synthetic", "rate": 1}, **root)
     (tmp_path / "old.json").write_text("[]")

@@ -163,6 +163,34 @@ def test_two_runs_that_share_a_list_have_their_own_epochs(scans: Path, tmp_path:
     assert {path: path.read_bytes() for path in (tmp_path / "m").iterdir()} == before
 
 
+@pytest.mark.parametrize(
+    ("settings", "shares"),
+    [
+        ({"ratio": {0: 0.75, 2: 0.25}}, [(4, 12), (4, 12), (12, 4)]),
+        ({"ratio": 1, "epoch_size": 6}, [(0, 6), (0, 6)]),
+        ({"ratio": 0.5, "epoch_size": "replace"}, [(2, 2), (2, 2)]),
+    ],
+    ids=["schedule", "ratio 1", "replace"],
+)
+def test_a_list_holds_schedules_and_lengths(
+    scans: Path, tmp_path: Path, settings: dict[str, Any], shares: list[tuple[int, int]]
+) -> None:
+    """An epoch's entries are those of its plan, and each slot has a scan of its own."""
+    real = semantic_kitti_list(semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json")
+    path = write_infos(tmp_path / "m", real, MIX | {"synthetic": scans} | settings, data_root=tmp_path / "sk")
+    folder = Folder.open(tmp_path / "m")
+    assert len(json.loads(path.read_text())["data_list"]) == REAL + folder.slots and not folder.whole
+    for epoch, (reals, slots) in enumerate(shares):
+        entries = folder.entries(epoch)
+        assert ((entries < REAL).sum(), (entries >= REAL).sum()) == (reals, slots)
+        assert sorted(entries[entries >= REAL] - REAL) == list(range(slots)) and slots <= folder.slots
+        folder.epoch, plan = epoch, folder.mixed.plan(epoch)
+        slot = int(entries[plan.domain][-1]) - REAL
+        assert folder.scan(slot).id == folder.mixed.sample(epoch, int(np.flatnonzero(plan.domain)[-1])).id
+    with pytest.raises(ConfigError, match="a number, a list or .epoch: ratio."):
+        write_infos(tmp_path / "x", real, MIX | {"synthetic": scans, "ratio": min}, data_root=tmp_path / "sk")
+
+
 def test_lists_of_the_first_format_stay_readable(scans: Path, tmp_path: Path) -> None:
     real = semantic_kitti_list(semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json")
     write_infos(tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk")

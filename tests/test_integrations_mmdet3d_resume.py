@@ -5,6 +5,7 @@ The network is one number, so that these tests are about data alone; the trainer
 ``test_integrations_mmdet3d_train.py``.
 """
 
+import json
 import pickle
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import torch
 from lidar_synth.integrations import mmdet3d as _  # noqa: F401 - registers its parts
 from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import semantic_kitti_list
+from lidar_synth.integrations.mmdet3d_slots import open_folder
 from mmdet3d.registry import MODELS
 from mmdet3d_parts import CONFIGS
 from mmengine.config import Config
@@ -125,6 +127,26 @@ def test_a_resumed_run_sees_the_samples_of_an_uninterrupted_one(
         listed, tmp_path / name, LOOPS[name], {"interval": 100}, resume=True, load_from=str(saved / f"iter_{done}.pth")
     )
     assert rest.steps == {i: samples for i, samples in whole.steps.items() if i >= done}
+
+
+def test_a_schedule_trains_and_resumes_the_planned_samples(listed: Path, tmp_path: Path) -> None:
+    """Seven samples in each epoch: five of them synthetic, then one."""
+    made = json.loads((listed.parent / "mixture.json").read_text())["settings"]
+    settings = made | {"ratio": {0: 0.75, 1: 0.1}, "epoch_size": 7}
+    root = listed.parents[1]
+    path = write_infos(tmp_path / "mixed", root / "train.pkl", settings, data_root=root / "sk")
+    loop = {"type": "EpochBasedTrainLoop", "max_epochs": 2}
+    whole = run(path, tmp_path / "whole", loop, {"interval": 1, "by_epoch": False}).steps
+    epochs = [[sample for i in range(4 * e, 4 * e + 4) for sample in whole[i]] for e in (0, 1)]
+    folder = open_folder(path.parent)
+    for epoch, samples in enumerate(epochs):
+        assert len(samples) == 7
+        numbers = [int(name.removesuffix(".bin")) for name, mean in samples]
+        wanted = folder.entries(epoch)
+        assert numbers == [n if n < folder.real else n - folder.real for n in wanted.tolist()]
+    saved = str(tmp_path / "whole" / "iter_6.pth")
+    rest = run(path, tmp_path / "rest", loop, {"interval": 9}, resume=True, load_from=saved)
+    assert rest.steps == {i: samples for i, samples in whole.items() if i >= 6}
 
 
 def test_a_run_resumed_from_an_epochs_checkpoint(listed: Path, uninterrupted: Any, tmp_path: Path) -> None:

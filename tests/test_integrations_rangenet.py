@@ -251,7 +251,8 @@ def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> 
     losses = [float(value) for value in re.findall(r"Epoch: \[\d+\]\[\d+/5\].*?Loss (\S+)", said)]
     assert len(losses) == 10 and np.isfinite(losses).all()
     assert said.count("Validation set:") == 2 and "IoU class 1 [car]" in said
-    assert [*tmp_path.rglob("SalsaNext" if SALSA else "segmentation_head*")] and [*tmp_path.rglob("events.out*")]
+    weights = "SENet*" if CENET else "SalsaNext" if SALSA else "segmentation_head*"
+    assert [*tmp_path.rglob(weights)] and [*tmp_path.rglob("events.out*")]
 
 
 @pytest.mark.slow
