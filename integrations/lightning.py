@@ -3,8 +3,8 @@
     data = MixedData(train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8, num_workers=4)
     trainer.fit(model, data)
 
-Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among ranks itself. A
-checkpoint within an epoch resumes after its last batch.
+Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among ranks itself. Training
+begins in the epoch that is set on the mixture. A checkpoint within an epoch resumes after its last batch.
 """
 
 from collections.abc import Iterator, Mapping
@@ -112,10 +112,13 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         self.train, self.val, self.test = train, val, test
         self.batch_size, self.num_workers, self.on_device = batch_size, num_workers, on_device
         self._resume: dict[str, Any] | None = None
+        self._first = 0  # the epoch of the mixture in Lightning's epoch 0
         self._batches: _Epochs | None = None
 
     def train_dataloader(self) -> Any:
         """Batches in the order of the plan, divided among ranks; resumes if a checkpoint was loaded."""
+        if self.trainer is not None and self.trainer.current_epoch == 0:
+            self._first = self.train.epoch
         self._batches = _Epochs(self, MixedBatches(self.train, self.batch_size))
         if self._resume is not None:
             self._batches.load_state_dict(self._resume)
@@ -123,6 +126,11 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         dataset: Any = OnDevice(self.train) if self.on_device else self.train
         collate = Unfinished if self.on_device else self.train.collate
         return _Loader(dataset, batch_sampler=self._batches, collate_fn=collate, **self._workers())
+
+    def teardown(self, stage: str) -> None:
+        """Set the mixture back to its first epoch, in which another training begins."""
+        if stage == "fit":
+            self.train.set_epoch(self._first)
 
     def val_dataloader(self) -> Any:
         """Batches of real scans."""
@@ -188,7 +196,7 @@ class _Epochs:
     def __init__(self, data: MixedData, batches: MixedBatches) -> None:
         self._data, self._batches = data, batches
         self._epoch = batches.dataset.epoch  # the epoch that began last
-        self._first = 0  # the epoch of the loaded state; Lightning's count is one behind after the end of an epoch
+        self._least = 0  # the epoch of the loaded state; Lightning's count is one behind after the end of an epoch
 
     def __len__(self) -> int:
         """Number of batches in the complete epoch; Lightning adds the batches before a checkpoint to its count."""
@@ -205,7 +213,7 @@ class _Epochs:
         done = trainer.fit_loop.epoch_loop.batch_progress.current.processed if trainer else 0
         mixture = self._batches.dataset.mixture
         place = (self._epoch, steps[done].start) if done < len(steps) else after_epoch(mixture, self._epoch)
-        return make_state(mixture, *place) | {"step": steps.size}
+        return make_state(mixture, *place) | {"step": steps.size, "first": self._data._first}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume from a state.
@@ -221,11 +229,15 @@ class _Epochs:
                 "A checkpoint from the end of an epoch fits any.",
             )
         self._batches.load_state_dict(state)
-        self._epoch = self._first = self._batches.dataset.epoch
+        self._data._first = state.get("first", 0)
+        self._epoch = self._least = self._batches.dataset.epoch
 
     def _current(self) -> int:
         trainer = self._data.trainer
-        return self._batches.dataset.epoch if trainer is None else max(self._first, trainer.current_epoch)
+        if trainer is None:
+            return self._batches.dataset.epoch
+        passes: int = trainer.current_epoch
+        return max(self._least, self._data._first + passes)
 
     def _steps(self) -> CutSteps:
         batches = self._batches

@@ -231,21 +231,6 @@ def test_resuming_in_an_epoch_is_no_repetition(caught: list[warnings.WarningMess
         caught.clear()
 
 
-@pytest.mark.parametrize("shuffle", [False, True])
-def test_a_distributed_sampler_sees_every_sample(shuffle: bool) -> None:
-    """Made once, in the first epoch."""
-    train = mixed(10)
-    ranks = [DistributedSampler(train, 2, rank, shuffle=shuffle) for rank in range(2)]
-    for epoch in range(4):
-        train.set_epoch(epoch)
-        seen = []
-        for sampler in ranks:
-            sampler.set_epoch(epoch)
-            seen += samples(DataLoader(train, 4, sampler=sampler, num_workers=1, collate_fn=list))
-        assert set(seen) == set(planned(train, epoch))
-        assert len(seen) == len(train)
-
-
 def test_a_long_plan_starts_at_once() -> None:
     """No list of all positions, steps or scans is made on the way to the first batch."""
     train = MixedScans.wrap(range(75_000_000), Endless(), 0.25, to_sample=name, compare=False)

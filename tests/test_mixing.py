@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.mixing import MixedScans, Sources
 from lidar_synth.mixing.state import make_state
 from lidar_synth.noise import keyed_rng
@@ -178,6 +178,24 @@ def test_balanced_batches() -> None:
     for rank in range(2):
         for batch in train.batches(4, rank=rank, world_size=2):
             assert sum(train.domain(i) for i in batch) == 1
+
+
+@pytest.mark.parametrize("by", ["to_sample", "augment", "labels"])
+def test_a_sample_that_is_changed_in_place_changes_no_scan(by: str) -> None:
+    """Of sources that keep their scans in memory."""
+    real, kept = Scans("r", 4), Scans("s", 4, domain=SYNTHETIC)
+    before = [(scan.points.tobytes(), scan.label.tobytes()) for scan in (*real, *kept)]  # type: ignore[union-attr]
+
+    def flip(scan: Scan, rng: np.random.Generator) -> Scan:
+        scan.points[:, 1] *= -1
+        scan.label[:] = IGNORE  # type: ignore[index]
+        return scan
+
+    train = MixedScans(real, kept, 0.5, augment_real=True, **{by: flip})
+    for i in range(len(train)):
+        train[i]
+    after = [(scan.points.tobytes(), scan.label.tobytes()) for scan in (*real, *kept)]  # type: ignore[union-attr]
+    assert before == after
 
 
 def test_wrap_returns_samples_of_the_wrapped_dataset_unchanged() -> None:

@@ -1,5 +1,6 @@
 """The plain PyTorch item, the default form of a sample."""
 
+from dataclasses import replace
 from typing import Any, TypedDict
 
 import numpy as np
@@ -31,6 +32,13 @@ class Item(TypedDict):
     names: tuple[str, ...]
     domain: int
     id: str
+
+
+def copy_scan(scan: Scan) -> Scan:
+    """A scan with points, fields and boxes of its own, which may be changed in place."""
+    own: dict[str, Any] = {name: values.copy() for name, values in scan.fields().items()}
+    boxes = None if scan.boxes is None else replace(scan.boxes, values=scan.boxes.values.copy())
+    return replace(scan, points=scan.points.copy(), boxes=boxes, **own)
 
 
 def to_item(scan: Scan, rng: np.random.Generator) -> Item:

@@ -19,7 +19,7 @@ from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
 from lidar_synth.mixing.epochs import CurrentEpoch, Position
-from lidar_synth.mixing.items import to_item
+from lidar_synth.mixing.items import copy_scan, to_item
 from lidar_synth.mixing.notices import Notices
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
@@ -61,7 +61,8 @@ class MixedScans(Dataset[Any]):
             exact share (up to one sample if that is not a whole number).
         augment: ``(scan, rng) -> scan`` for synthetic scans, after the label policy.
         augment_real: whether to apply ``augment`` to real scans too; otherwise they stay unchanged, bit for bit.
-        to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py).
+        to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py). The scan is a copy,
+            which it and the trainer may change in place.
         collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"`` (collate.py), or
             your own function.
         unlabelled: ``"error"`` refuses a batch without any valid label; ``"allow"`` returns it, which is always the
@@ -314,6 +315,7 @@ class MixedScans(Dataset[Any]):
         if real.domain != REAL:  # scans of the town, for instance, count as real here
             real = replace(real, domain=REAL)
         self._notices.real(real)
+        real = copy_scan(real)  # a source may keep its scans in memory
         rng = keyed_rng(self.seed, epoch, position)
         if self._augment is not None and self._augment_real:
             real = self._augment(real, rng)
@@ -329,8 +331,7 @@ class MixedScans(Dataset[Any]):
         return self._finish(plan[position][0] - plan.reals, scan, rng)
 
     def _finish(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
-        if self._transfer is not None:
-            scan = self._transfer(scan, rng)
+        scan = copy_scan(scan) if self._transfer is None else self._transfer(scan, rng)
         given = scan
         if scan.boxes is not None:  # before labels of low confidence are ignored
             scan = self._without_unboxed(scan)
