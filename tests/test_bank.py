@@ -118,14 +118,44 @@ def test_a_bank_returns_the_scans_that_were_written(root: Path) -> None:
     assert np.array_equal(bank.image(-1).range, bank.image(4).range) and bank.ids[-1] == bank.ids[4]
 
 
-def test_few_shards_are_open_at_a_time(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_files_are_open_and_each_shard_is_parsed_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "_OPEN", 1)
     bank = Bank(root)
-    for i in (0, 4, 1, 3):
+    first = bank.shard(0)
+    for i in (0, 4, 1, 3, 2):
         assert bank[i].id == f"small/5/{i}"
-        assert len(bank._shards) == 1
+        assert sum(shard._file._descriptor >= 0 for shard in bank._shards.values()) == 1  # type: ignore[attr-defined]
+    assert bank.shard(0) is first
     bank.close()
     assert bank[2].id == "small/5/2"
+
+
+def test_memory_for_the_places_of_scans_is_bounded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "_OPEN", 1)
+    monkeypatch.setattr(reader, "_KNOWN", 2 * reader._LEAST)
+    bank = Bank(root)
+    assert [bank[i].id for i in (0, 2, 4, 0)] == [f"small/5/{i}" for i in (0, 2, 4, 0)]
+    assert list(bank._shards) == [2, 0]
+
+
+@pytest.mark.parametrize("change", ["other scans", "damage", "shorter", "gone"])
+def test_a_shard_that_changed_while_it_was_closed_is_checked_again(root: Path, change: str) -> None:
+    bank = Bank(root)
+    content, path = bank[0].points, root / bank.index.shards[0].file
+    bank.close()
+    if change == "other scans":  # in other places of the file
+        path.unlink()
+        write_bank(root, [some_image(i) for i in (1, 0)])
+        assert not np.array_equal(bank[0].points, content) and np.array_equal(bank[1].points, content)
+        return
+    if change == "damage":
+        path.write_bytes(path.read_bytes().replace(b"generated", b"Generated", 1))
+    elif change == "shorter":
+        path.write_bytes(path.read_bytes()[:-100])
+    else:
+        path.unlink()
+    with pytest.raises(FileError if change == "gone" else DataError, match="shard-00000.h5"):
+        bank[0]
 
 
 def points(bank: Bank, queue: Any) -> None:

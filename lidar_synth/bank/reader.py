@@ -16,8 +16,9 @@ from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, made_by_model
 from lidar_synth.geometry.sensor import Sensor
 
-_OPEN = 64  # shards kept open at a time
-_REMOTE = 256  # the same for a bank at a URL: no open files, but about 70 kB of cached metadata each
+_OPEN = 64  # files kept open at a time
+_KNOWN = 1 << 20  # scans whose places are kept in memory, about 60 bytes each
+_LEAST = 128  # a shard takes as much memory as one of so many scans at least
 
 
 class Bank:
@@ -53,7 +54,10 @@ class Bank:
         self.index = Index.from_json(_read_index(self.root), f"{self.root}/{INDEX}")
         if isinstance(self.root, Path):
             self._check_files(self.root)
+        largest = max((entry.scans for entry in self.index.shards), default=0)
+        self._most = max(_OPEN, _KNOWN // max(largest, _LEAST))
         self._shards: OrderedDict[int, ShardReader] = OrderedDict()
+        self._open: OrderedDict[int, ShardReader] = OrderedDict()
         self._process = os.getpid()
 
     @property
@@ -120,24 +124,27 @@ class Bank:
         """An open shard; raises as ``__getitem__``."""
         if self._process != os.getpid():
             # After a fork: the parent's handles share its file positions and locks, so they are left to the parent.
-            self._shards, self._process = OrderedDict(), os.getpid()
-        if number not in self._shards:
-            entry = self.index.shards[number]
-            where, facts = f"{self.root}/{entry.file}", self.index.sources[entry.source]
-            file = open_storage(self.root, entry.file, entry.bytes)
-            self._shards[number] = ShardReader(file, where, facts, entry)
-            if len(self._shards) > (_REMOTE if is_url(self.root) else _OPEN):
-                self._shards.popitem(last=False)[1].close()
-        self._shards.move_to_end(number)
-        return self._shards[number]
+            self._shards, self._open, self._process = OrderedDict(), OrderedDict(), os.getpid()
+        shard = self._shards.get(number)
+        if shard is None or not shard.reopen():
+            shard = self._shards[number] = self._new_reader(number)
+        _touch(self._shards, number, self._most)
+        self._open[number] = shard
+        _touch(self._open, number, _OPEN)
+        return shard
 
     def close(self) -> None:
         """Close the open shards; reading opens them again."""
-        while self._shards and self._process == os.getpid():
-            self._shards.popitem()[1].close()
+        while self._open and self._process == os.getpid():
+            self._open.popitem()[1].close()
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_shards": OrderedDict()}
+        return self.__dict__ | {"_shards": OrderedDict(), "_open": OrderedDict()}
+
+    def _new_reader(self, number: int) -> ShardReader:
+        entry = self.index.shards[number]
+        file = open_storage(self.root, entry.file, entry.bytes)
+        return ShardReader(file, f"{self.root}/{entry.file}", self.index.sources[entry.source], entry)
 
     def _check_files(self, root: Path) -> None:
         for entry in self.index.shards:
@@ -149,6 +156,13 @@ class Bank:
                 ) from error
             if size != entry.bytes:
                 raise DataError(f"{root / entry.file} is {size} bytes long", f"{entry.bytes}, by the index", REPAIR)
+
+
+def _touch(shards: OrderedDict[int, ShardReader], number: int, most: int) -> None:
+    """Make a shard the latest, and close the oldest one if there are more than ``most``."""
+    shards.move_to_end(number)
+    if len(shards) > most:
+        shards.popitem(last=False)[1].close()
 
 
 def is_bank(path: str | Path) -> bool:

@@ -97,8 +97,16 @@ class ShardReader:
         return self._read(position)[1], int(self._layout.numbers["crc"][position])
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; ``reopen`` opens it again."""
         self._file.close()
+
+    def reopen(self) -> bool:
+        """Open the file again if it was closed; False if it has changed since, so that it needs a new reader.
+
+        Raises:
+            FileError: if it cannot be opened.
+        """
+        return self._file.reopen()
 
     def __enter__(self) -> "ShardReader":
         return self
@@ -115,6 +123,7 @@ class ShardReader:
                 numbers = [int(attributes.pop(key, np.uint64(0))) for key in ("seed", "first", "scans")]
             found = Facts.from_attributes(attributes, self.name)
             self._check_facts(found, facts)
+            found = facts or found  # one object for all shards of a bank
             actual = self._checked_entry(numbers, entry)
             filters(found.compression)
             with self._reading("its datasets"):

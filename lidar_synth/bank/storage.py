@@ -31,6 +31,14 @@ class Storage(Protocol):
 
     def close(self) -> None: ...
 
+    def reopen(self) -> bool:
+        """Make a closed file readable again; False if it has changed since it was opened.
+
+        Raises:
+            FileError: if it cannot be opened.
+        """
+        ...
+
 
 class LocalFile:
     """A file on this machine; see ``Storage``.
@@ -43,11 +51,16 @@ class LocalFile:
 
     def __init__(self, path: Path) -> None:
         self._path, self._descriptor = path, -1
-        try:
-            self._descriptor = os.open(path, os.O_RDONLY)
-            self.size = os.fstat(self._descriptor).st_size
-        except OSError as error:
-            raise self._unreadable(error) from error
+        self._state = self._open()
+        self.size = self._state[0]
+
+    def reopen(self) -> bool:
+        """Open it again if it was closed. False if it is not the file that it was: what was read of it may be wrong.
+
+        Raises:
+            FileError: if it cannot be opened.
+        """
+        return self._descriptor >= 0 or self._open() == self._state
 
     def read(self, offset: int, size: int) -> bytes:
         if offset + size > self.size:
@@ -67,6 +80,15 @@ class LocalFile:
         self._descriptor = -1
 
     __del__ = close
+
+    def _open(self) -> tuple[int, int, int]:
+        """Size, time of change and number of the file, which is open then."""
+        try:
+            self._descriptor = os.open(self._path, os.O_RDONLY)
+            found = os.fstat(self._descriptor)
+        except OSError as error:
+            raise self._unreadable(error) from error
+        return found.st_size, found.st_mtime_ns, found.st_ino
 
     def _unreadable(self, error: OSError) -> FileError:
         return FileError(f"{self._path} cannot be read ({error.strerror or error})", "a file of a bank")
@@ -123,6 +145,9 @@ class RemoteFile:
 
     def close(self) -> None:
         pass
+
+    def reopen(self) -> bool:
+        return True
 
     def _fetch(self, **span: int) -> bytes:
         try:

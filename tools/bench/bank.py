@@ -1,15 +1,18 @@
 """How large a bank of town scans is, and how fast it is written and read, on one core.
 
-    python tools/bench/bank.py [SCAN.bin] [--scans N] [--model NAME|FILE] [--generated N]
+    python tools/bench/bank.py [SCAN.bin] [--scans N] [--model NAME|FILE] [--generated N] [--tree SHARDS]
 
 Reading is compared with SCAN.bin, a KITTI-360 scan, or by default with a random scan of 120,000 points. The figures are
 processor time, so that they hardly change on a busy machine. Scans of the town have no confidence; they get an
 artificial one, which is high except where labels change. The size of a real confidence is measured on scans of the
-model.
+model. The last table is of random reads from a tree of files of so many shards, each with 1,024 small scans, as a
+bank of a million scans has them; only a read's overhead depends on their number.
 """
 
 import argparse
 import os
+import resource
+import shutil
 import tempfile
 import time
 import zlib
@@ -34,10 +37,11 @@ from lidar_synth.formats.points import read_points
 from lidar_synth.generate.generator import load_generator
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.town import Town
 
-SHARD = 64
+SHARD, LARGE = 64, 1024
+"""Scans of a shard: of banks of the town, and of the tree of files."""
 FIELDS = ("reflectance", "label", "confidence")
 
 
@@ -172,6 +176,64 @@ def stages(image: RangeImage) -> None:
     print_table("Stages of a scan with confidence", time_in_turns(calls, 200, time.process_time), pack)
 
 
+def tree(root: Path, shards: int) -> Bank:
+    """A bank of shards with ``LARGE`` scans each, all alike, of a small sensor: copies with other numbers."""
+    sensor = Sensor("small", 8, 1.0, 80.0, rows=4, fov_up=3.0, fov_down=-25.0)
+    facts = Facts(sensor, FIELDS[:2], "small", "", {}, "generated", "MIT", "MIT")
+    rng = np.random.default_rng(0)
+    values = rng.random(sensor.shape, np.float32)
+    label = rng.integers(0, 19, sensor.shape, np.uint8)
+    image = RangeImage(1 + 70 * values, sensor, {"reflectance": values, "label": label})
+    arrays = facts.encoding.encode(image)
+    root.mkdir()
+    first = root / "shard-00000.h5"
+    with ShardWriter(first, facts, Entry(first.name, 0, 0, LARGE)) as writer:
+        for _ in range(LARGE):
+            writer.append(image)
+    entries = []
+    for number in tqdm(range(shards), "shards", leave=False):
+        path = root / f"shard-{number:05d}.h5"
+        indices = np.arange(number * LARGE, (number + 1) * LARGE, dtype=np.uint64)
+        if number:
+            shutil.copyfile(first, path)
+            with h5py.File(path, "r+", libver="latest") as file:
+                file.attrs.modify("first", indices[0])
+                file["index"][:] = indices
+                file["crc"][:] = [checksum(0, int(index), arrays) for index in indices]
+        entries.append(Entry(path.name, 0, int(indices[0]), LARGE, 0, path.stat().st_size, sha256(path)))
+    write_bank_files(root, Index((facts,), tuple(entries)))
+    return Bank(root)
+
+
+def random_reads(root: Path, shards: int, reads: int = 20_000) -> None:
+    """Prints processor time and memory of random reads by the number of shards that they are from."""
+    tree(root, shards)
+    print(f"\n### Random reads from shards of {LARGE:,} scans\n\n{machine()}\n")
+    print("| shards | scans | first read of a shard, ms | later reads, ms | overhead, ms | memory, MB |")
+    print("|---:|---:|---:|---:|---:|---:|")
+    base = 0.0
+    for count in sorted({min(count, shards) for count in (1, 64, 128, 512, shards)}):
+        bank, before = Bank(root), peak_memory()
+        opened = seconds(partial(read_all, bank, [number * LARGE for number in range(count)])) / count
+        order = np.random.default_rng(0).integers(0, count * LARGE, reads).tolist()
+        later = seconds(partial(read_all, bank, order)) / reads
+        base = base or later
+        memory = peak_memory() - before
+        values = f"{1e3 * opened:.2f} | {1e3 * later:.3f} | {1e3 * (later - base):.3f} | {memory:.0f}"
+        print(f"| {count:,} | {count * LARGE:,} | {values} |", flush=True)
+
+
+def read_all(bank: Bank, order: list[int]) -> None:
+    """Reads scans in this order, as images."""
+    for number in order:
+        bank.image(number)
+
+
+def peak_memory() -> float:
+    """Peak memory of this process, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
 def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -179,6 +241,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=192, help="scans of the town")
     parser.add_argument("--model", default="town", help="a shipped model or a checkpoint")
     parser.add_argument("--generated", type=int, default=40, help="scans of the model; 0 omits that table")
+    parser.add_argument("--tree", type=int, default=1000, help="shards of the tree of files; 0 omits that table")
     options = parser.parse_args()
     torch.set_num_threads(1)
     images = town_images(options.scans)
@@ -190,6 +253,8 @@ def main() -> None:
             random_points(plain.sensor).tofile(path)
         reading(path, plain)
         stages(images[0])
+        if options.tree:
+            random_reads(root / "tree", options.tree)
         if options.generated:
             generator = load_generator(options.model)
             print(f"\n### Size of {options.generated} scans of {generator.name}\n\n| what | |\n|---|---:|")

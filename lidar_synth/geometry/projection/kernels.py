@@ -259,3 +259,122 @@ def pick_returns(image, values, out):  # type: ignore[no-untyped-def]
     for c in range(len(image)):
         out[n] = values[c]
         n += image[c] > 0
+
+
+@numba.njit(error_model="numpy", cache=True)
+def put_in_rows(cell, rows, columns):  # type: ignore[no-untyped-def]
+    """Move each point with a cell (N,) to the row (N,) of its laser, in place."""
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            cell[i] = rows[i] * columns + cell[i] % columns
+
+
+@numba.njit(error_model="numpy", cache=True)
+def turns_of(points, azimuth, flat):  # type: ignore[no-untyped-def]
+    """Fill ``azimuth`` (N,) with radians counter-clockwise from straight ahead, in [0, 2 pi], and ``flat`` (N,) with
+    the horizontal distance."""
+    x, y = points[:, 0].copy(), points[:, 1].copy()
+    for i in range(len(x)):
+        angle = atan2(y[i], x[i])
+        azimuth[i] = angle if angle >= _ZERO else angle + _TWO * PI
+        flat[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
+
+
+@numba.njit(error_model="numpy", cache=True)
+def elevations_from(points, height, elevation):  # type: ignore[no-untyped-def]
+    """Fill ``elevation`` (N,) with radians above the horizon, seen from ``height`` metres above the origin."""
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    for i in range(len(x)):
+        elevation[i] = atan2(z[i] - height, np.sqrt(x[i] * x[i] + y[i] * y[i]))
+
+
+@numba.njit(error_model="numpy", cache=True)
+def count_sectors(azimuth, counts):  # type: ignore[no-untyped-def]
+    """Count the points of each of K equal sectors of azimuth, from [0, 2 pi] on, in ``counts`` (K,)."""
+    sectors = len(counts)
+    for i in range(len(azimuth)):
+        counts[min(int(azimuth[i] / (_TWO * PI) * _f(sectors)), sectors - 1)] += 1
+
+
+@numba.njit(error_model="numpy", cache=True)
+def _median(values, start, end, few):  # type: ignore[no-untyped-def]
+    """The median of a few values; ``few`` is a buffer for them."""
+    n = end - start
+    for i in range(n):
+        value, j = values[start + i], i
+        while j > 0 and few[j - 1] > value:
+            few[j] = few[j - 1]
+            j -= 1
+        few[j] = value
+    return (few[(n - 1) // 2] + few[n // 2]) * _HALF
+
+
+@numba.njit(error_model="numpy", cache=True)
+def steps_at(values, places, width, steps):  # type: ignore[no-untyped-def]
+    """Fill ``steps`` (K,) with the median of ``width`` values (N,) before each place less that of those from it on."""
+    few = np.empty(width, values.dtype)
+    for k in range(len(places)):
+        i = places[k]
+        before = _median(values, max(i - width, 0), i, few)
+        steps[k] = before - _median(values, i, min(i + width, len(values)), few)
+
+
+@numba.njit(error_model="numpy", cache=True)
+def decreases(azimuth, flat, least, motion, places, limits):  # type: ignore[no-untyped-def]
+    """Find the points whose azimuth (N,) decreases by more than ``least`` and a shift of ``motion`` metres of both.
+
+    Fills ``places`` (N,) with their indices and ``limits`` (N,) with the decrease that each has to exceed, and returns
+    their number.
+    """
+    found = 0
+    for i in range(1, len(azimuth)):
+        drop = azimuth[i - 1] - azimuth[i]
+        if drop > least:
+            near, before = _ONE / max(flat[i], _f(0.1)), _ONE / max(flat[i - 1], _f(0.1))
+            limit = least + motion * (near + before)
+            if drop > limit:
+                places[found], limits[found] = i, limit
+                found += 1
+    return found
+
+
+@numba.njit(error_model="numpy", cache=True)
+def sines_of(points, sine):  # type: ignore[no-untyped-def]
+    """Fill ``sine`` (N,) with the sine of each point's elevation; 0 at the origin."""
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    for i in range(len(x)):
+        distance = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+        sine[i] = z[i] / (distance if distance > _ZERO else _ONE)
+
+
+@numba.njit(error_model="numpy", cache=True)
+def medians(values, bounds, middle):  # type: ignore[no-untyped-def]
+    """Fill ``middle`` (K,) with the median of each part of ``values`` (N,) between K + 1 bounds."""
+    for k in range(len(middle)):
+        middle[k] = np.median(values[bounds[k] : bounds[k + 1]])
+
+
+@numba.njit(error_model="numpy", cache=True)
+def distances_from(values, bounds, middle, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (N,) with the distance of each of ``values`` (N,) from the middle (K,) of its part."""
+    for k in range(len(middle)):
+        at = _f(middle[k])
+        for i in range(bounds[k], bounds[k + 1]):
+            out[i] = abs(values[i] - at)
+
+
+@numba.njit(error_model="numpy", cache=True)
+def heights_of(points, ring, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (N,) with the heights of the lasers by pairs of near and distant neighbours of a ring, and return
+    their number."""
+    found, last_inverse, last_sine = 0, _ZERO, _ZERO
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        distance = max(np.sqrt(x * x + y * y + z * z), _f(0.1))
+        inverse, sine = _ONE / distance, z / distance
+        step = inverse - last_inverse
+        if i > 0 and ring[i] == ring[i - 1] and abs(step) > _f(0.02):
+            out[found] = (sine - last_sine) / step
+            found += 1
+        last_inverse, last_sine = inverse, sine
+    return found

@@ -9,6 +9,16 @@ the azimuth of near points more than that of distant ones.
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry.projection.kernels import (
+    count_sectors,
+    decreases,
+    distances_from,
+    elevations_from,
+    heights_of,
+    medians,
+    steps_at,
+    turns_of,
+)
 from lidar_synth.geometry.sensor import Sensor
 
 MIN_DECREASE = np.radians(2.0)
@@ -37,8 +47,8 @@ def ring_numbers(points: NDArray[np.float32]) -> NDArray[np.int16]:
     starts = np.zeros(len(points), bool)
     groups = _start_candidates(points)
     if groups:
-        elevation = _elevations(points)
-        starts[_without_fragments(np.array([_best_candidate(group, elevation) for group in groups]), elevation)] = True
+        found = np.array([_best_candidate(group, points) for group in groups])
+        starts[_without_fragments(found, points)] = True
     return np.cumsum(starts, dtype=np.int16)
 
 
@@ -55,84 +65,92 @@ def fault_of(points: NDArray[np.float32], ring: NDArray[np.int16], lasers: Senso
     count = int(ring[-1]) + 1
     if count > lasers.shape[0]:
         return f"{count} rings found for the {lasers.shape[0]} lasers of {lasers.name!r}"
-    azimuth = _azimuths(points)
-    width = float(np.ptp(np.percentile(azimuth, (1, 99))))
-    near = float(np.percentile(np.hypot(points[:, 0], points[:, 1]), 5))
-    if count > 1 and width < 3 * (MIN_DECREASE + 2 * MOTION / max(near, 0.1)):
-        return f"points over {np.degrees(width):.0f} degrees of azimuth, too few to separate {count} rings"
+    azimuth, flat = turns(points)
+    everywhere = _all_around(azimuth)
+    if count > 1 and not everywhere:
+        width = float(np.ptp(np.percentile(azimuth, (1, 99))))
+        near = float(np.percentile(flat, 5))
+        if width < 3 * (MIN_DECREASE + 2 * MOTION / max(near, 0.1)):
+            return f"points over {np.degrees(width):.0f} degrees of azimuth, too few to separate {count} rings"
     beams = lasers.laser_elevations.astype(np.float64)
     gap, extent = float(np.median(-np.diff(beams))), float(beams[0] - beams[-1])
-    elevation = _elevations(points, _height(points, ring))
-    bounds = np.flatnonzero(np.diff(ring)) + 1
-    parts = np.split(elevation, bounds)
-    middle = np.array([np.median(part) for part in parts])
-    spread = np.array([np.median(np.abs(part - m)) for part, m in zip(parts, middle, strict=True)])
+    elevation = np.empty(len(points), np.float32)
+    elevations_from(points, np.float32(_height(points, ring)), elevation)
+    inner = np.flatnonzero(np.diff(ring)) + 1
+    bounds = np.concatenate([[0], inner, [len(points)]])
+    middle, spread = np.empty(count), np.empty(count)
+    medians(elevation, bounds, middle)
+    distances_from(elevation, bounds, middle, flat)
+    medians(flat, bounds, spread)
     # The limits are loose: motion compensation bends rings near the sensor as much as merged rings would spread.
     if np.median(spread) > gap or spread.max() > min(3 * gap, extent / 6):
-        spreads = f"{np.degrees(np.median(spread)):.2f} degrees (median) and {np.degrees(spread.max()):.2f} (largest)"
-        return f"{count} rings found, whose elevations spread by {spreads}; the lasers are {np.degrees(gap):.2f} apart"
+        found = f"{np.degrees(np.median(spread)):.2f} degrees (median) and {np.degrees(spread.max()):.2f} (largest)"
+        return f"{count} rings found, whose elevations spread by {found}; the lasers are {np.degrees(gap):.2f} apart"
     downward = -np.diff(middle)
-    if _all_around(azimuth):
-        sides = [(elevation[max(i - STRAYS, 0) : i], elevation[i : i + STRAYS]) for i in bounds]
-        downward = np.array([np.median(before) - np.median(after) for before, after in sides])
+    if everywhere:
+        steps_at(elevation, inner, STRAYS, downward)
     if count > 2 and np.median(downward) < gap / 4:
         return f"{count} rings found that do not descend from one to the next, each starting straight ahead"
     return ""
 
 
-def _azimuths(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N,) radians counter-clockwise from straight ahead, in [0, 2 pi)."""
-    return np.arctan2(points[:, 1], points[:, 0], dtype=np.float32) % np.float32(2 * np.pi)
+def turns(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(N,) radians counter-clockwise from straight ahead, in [0, 2 pi], and (N,) horizontal distance, metres."""
+    azimuth, flat = np.empty(len(points), np.float32), np.empty(len(points), np.float32)
+    turns_of(points, azimuth, flat)
+    return azimuth, flat
 
 
 def _all_around(azimuth: NDArray[np.float32]) -> bool:
     """Whether each of eight sectors of azimuth contains more than 1 % of the points."""
-    return bool(np.histogram(azimuth, 8, (0, 2 * np.pi))[0].min() > 0.01 * len(azimuth))
+    counts = np.zeros(8, np.int64)
+    count_sectors(azimuth, counts)
+    return bool(counts.min() > 0.01 * len(azimuth))
 
 
-def _elevations(points: NDArray[np.float32], height: float = 0.0) -> NDArray[np.float64]:
-    """(N,) radians above the horizon of points (N, 3), seen from ``height`` metres above the origin."""
-    elevation: NDArray[np.float64] = np.arctan2(points[:, 2] - np.float64(height), np.hypot(points[:, 0], points[:, 1]))
+def _elevations(points: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(N,) radians above the horizon of points (N, 3)."""
+    elevation: NDArray[np.float64] = np.arctan2(points[:, 2].astype(np.float64), np.hypot(points[:, 0], points[:, 1]))
     return elevation
 
 
 def _start_candidates(points: NDArray[np.float32]) -> list[NDArray[np.intp]]:
     """Candidates for the starts of rings, grouped: candidates at most ``STRAYS`` points apart are one start."""
-    azimuth = _azimuths(points)
-    near = 1 / np.maximum(np.hypot(points[:, 0], points[:, 1]), 0.1)
-    threshold = MIN_DECREASE + MOTION * (near[1:] + near[:-1])
+    azimuth, flat = turns(points)
+    places, limits = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+    count = decreases(azimuth, flat, np.float32(MIN_DECREASE), np.float32(MOTION), places, limits)
+    places, limits = places[:count], limits[:count]
     if _all_around(azimuth):
-        threshold = np.maximum(threshold, MIN_DECREASE_ALL_AROUND)
-    candidates = [
-        i
-        for i in (np.flatnonzero(azimuth[:-1] - azimuth[1:] > threshold) + 1).tolist()
-        if np.median(azimuth[max(i - STRAYS, 0) : i]) - np.median(azimuth[i : i + STRAYS]) > threshold[i - 1]
-    ]
-    if not candidates:
+        limits = np.maximum(limits, np.float32(MIN_DECREASE_ALL_AROUND))
+    steps = np.empty(count, np.float32)
+    steps_at(azimuth, places, STRAYS, steps)
+    candidates = places[(steps > limits) & (azimuth[places - 1] - azimuth[places] > limits)]
+    if not len(candidates):
         return []
-    return np.split(np.array(candidates, np.intp), np.flatnonzero(np.diff(candidates) > STRAYS) + 1)
+    return np.split(candidates, np.flatnonzero(np.diff(candidates) > STRAYS) + 1)
 
 
-def _best_candidate(group: NDArray[np.intp], elevation: NDArray[np.float64]) -> int:
+def _best_candidate(group: NDArray[np.intp], points: NDArray[np.float32]) -> int:
     """The candidate of a group that minimises the spread of the elevations on its two sides."""
     if len(group) == 1:
         return int(group[0])
     low, high = max(int(group[0]) - STRAYS, 0), int(group[-1]) + STRAYS
+    elevation = _elevations(points[low:high])
 
     def spread(start: int) -> float:
-        sides = elevation[low:start], elevation[start:high]
+        sides = elevation[: start - low], elevation[start - low :]
         return float(sum(np.abs(side - np.median(side)).sum() for side in sides))
 
     return int(min(group.tolist(), key=spread))
 
 
-def _without_fragments(starts: NDArray[np.intp], elevation: NDArray[np.float64]) -> NDArray[np.intp]:
+def _without_fragments(starts: NDArray[np.intp], points: NDArray[np.float32]) -> NDArray[np.intp]:
     """The starts of rings without those that only cut a fragment off a ring."""
-    length = np.diff(np.concatenate([[0], starts, [len(elevation)]]))
+    length = np.diff(np.concatenate([[0], starts, [len(points)]]))
     short = np.flatnonzero(length < FRAGMENT * np.median(length))
     if not len(short):
         return starts
-    middle = np.array([np.median(part) for part in np.split(elevation, starts)])
+    middle = np.array([np.median(part) for part in np.split(_elevations(points), starts)])
     gap = float(np.median(np.abs(np.diff(middle))))
     removed = set()
     for i in short.tolist():
@@ -148,9 +166,6 @@ def _height(points: NDArray[np.float32], ring: NDArray[np.int16]) -> float:
 
     A laser at height h with elevation e measures z = h + r sin(e), so h is the change of z / r per change of 1 / r.
     """
-    distance = np.maximum(np.linalg.norm(points, axis=1), 0.1)
-    inverse, sine = 1 / distance, points[:, 2] / distance
-    steps = np.flatnonzero((np.abs(np.diff(inverse)) > 0.02) & (np.diff(ring) == 0))
-    if not len(steps):
-        return 0.0
-    return float(np.clip(np.median(np.diff(sine)[steps] / np.diff(inverse)[steps]), -1, 1))
+    heights = np.empty(len(points), np.float32)
+    count = heights_of(points, ring, heights)
+    return float(np.clip(np.median(heights[:count]), -1, 1)) if count else 0.0

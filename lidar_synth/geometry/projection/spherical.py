@@ -62,10 +62,16 @@ def locate(points: NDArray[np.float32], sensor: Sensor) -> Cells:
         >>> int(cells.point.flat[19966])
         1
     """
+    cell, distance = cells_of(points, sensor)
+    return Cells(cell, distance, nearest_in(cell, distance, sensor)[1])
+
+
+def cells_of(points: NDArray[np.float32], sensor: Sensor) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Cell (N,) and range (N,) of each point; see ``locate``."""
     points = _checked(points)
     cell, distance = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
     locate_points(points, grid_of(sensor), cell, distance)
-    return Cells(cell, distance, nearest_in(cell, distance, sensor)[1])
+    return cell, distance
 
 
 def nearest_in(

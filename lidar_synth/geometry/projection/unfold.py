@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.projection.kernels import medians, put_in_rows, sines_of
 from lidar_synth.geometry.projection.rings import fault_of, ring_numbers
-from lidar_synth.geometry.projection.spherical import carry, locate, nearest_in
+from lidar_synth.geometry.projection.spherical import carry, cells_of, nearest_in
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -59,9 +60,8 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         ((64, 1024), 'town/beams')
     """
     lasers = (sensor or scan.sensor).by_beams()
-    cell, distance, _ = locate(scan.points, lasers)
-    width = lasers.shape[1]
-    cell = np.where(cell < 0, -1, laser_rows(scan, lasers, anchor) * width + cell % width).astype(np.int32)
+    cell, distance = cells_of(scan.points, lasers)
+    put_in_rows(cell, laser_rows(scan, lasers, anchor), lasers.shape[1])
     image, index = nearest_in(cell, distance, lasers)
     return RangeImage(image, lasers, carry(scan, index))
 
@@ -99,11 +99,11 @@ def _not_in_rings(scan: Scan, reason: str) -> DataError:
 
 def _rows_of_rings(scan: Scan, ring: NDArray[np.int16], lasers: Sensor, anchor: Anchor) -> NDArray[np.int64]:
     """(R,) the row of each ring."""
-    bounds = np.flatnonzero(np.diff(ring)) + 1
-    count = len(bounds) + 1
+    bounds = np.concatenate([[0], np.flatnonzero(np.diff(ring)) + 1, [len(ring)]])
+    count = len(bounds) - 1
     if anchor == "last":
         return np.arange(count) + lasers.shape[0] - count
-    distance = np.linalg.norm(scan.points, axis=1)
-    sine = scan.points[:, 2] / np.where(distance > 0, distance, 1)
-    medians = np.arcsin([np.median(s) for s in np.split(sine, bounds)])
-    return _rows_by_elevation(medians, lasers.laser_elevations)
+    sine, middle = np.empty(len(ring), np.float32), np.empty(count)
+    sines_of(scan.points, sine)
+    medians(sine, bounds, middle)
+    return _rows_by_elevation(np.arcsin(middle), lasers.laser_elevations)

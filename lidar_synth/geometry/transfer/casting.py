@@ -8,7 +8,13 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.geometry.scan import POINT_FIELDS, Scan
-from lidar_synth.geometry.transfer.kernels import hit_footprints, hit_triangles, rows_above
+from lidar_synth.geometry.transfer.kernels import (
+    hit_footprints,
+    hit_triangles,
+    put_in_front,
+    rows_above,
+    shape_footprints,
+)
 from lidar_synth.geometry.transfer.rays import Rays
 from lidar_synth.geometry.transfer.surfaces import Surfaces
 
@@ -71,26 +77,20 @@ def first_hits(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upri
     mean, facing = np.zeros(shape), np.ones(shape)
     hit_triangles(points, azimuth, rho, rows, value, triangles, *lasers, rays.directions, solid, vertex, mean, facing)
     patch, of = np.full(shape, np.inf), np.zeros(shape, np.int32)
-    rim = surfaces.rim & there & (rho > 0.05)
-    recorded = np.linalg.norm(scan.points[rim], axis=1)
-    half = np.minimum(surfaces.step / 2 * recorded / rho[rim], 0.2)
-    up, down = np.tan(surfaces.up[rim]) * recorded, np.tan(surfaces.down[rim]) * recorded
-    normal = points[rim] - np.outer(points[rim] @ upright, upright)  # vertical patches face the sensor
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    normal[surfaces.level[rim]] = upright
-    reach = _reach(scan, rim)
-    hit_footprints(points[rim], azimuth[rim], rho[rim], normal, half, up, down, reach, *lasers, patch, of)
-    front = patch * (1 + FRONT[1]) + FRONT[0] < solid
-    front |= np.isinf(solid) & np.isfinite(patch)
-    vertex[front] = np.flatnonzero(rim)[of[front]]
-    solid[front], mean[front], facing[front] = patch[front], value[vertex[front]], 1.0
+    rim = np.flatnonzero(surfaces.rim & there & (rho > 0.05))
+    half, up, down = np.empty((3, len(rim)))
+    normal = np.empty((len(rim), 3))
+    opening = surfaces.step, surfaces.up, surfaces.down
+    shape_footprints(scan.points, points, rho, rim, surfaces.level, *opening, upright, half, up, down, normal)
+    hit_footprints(points[rim], azimuth[rim], rho[rim], normal, half, up, down, _reach(scan, rim), *lasers, patch, of)
+    put_in_front(patch, of, rim, value, *FRONT, solid, vertex, mean, facing)
     names = [n for n in POINT_FIELDS if n not in ("reflectance", "ring") and getattr(scan, n) is not None]
-    return Hits(solid, mean, facing, {n: getattr(scan, n)[vertex] for n in names})
+    return Hits(solid, mean, facing, {n: getattr(scan, n).take(vertex) for n in names})
 
 
-def _reach(scan: Scan, which: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _reach(scan: Scan, which: NDArray[np.intp]) -> NDArray[np.float64]:
     """(n,) metres by which the patches of some returns reach along a ray; without limit on ground and unlabelled."""
     if scan.label is None:
-        return np.full(int(which.sum()), np.inf)
+        return np.full(len(which), np.inf)
     label = scan.label[which]
     return np.where(GROUND[label] | (label == IGNORE), np.inf, REACH)

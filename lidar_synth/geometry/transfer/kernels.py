@@ -20,6 +20,8 @@ NOISE = 0.06
 WIDEST = 1.6
 """The widest gap between neighbours of one ring, in firings; a wider one is a ray without a return."""
 
+_UNKNOWN = -1
+
 NEAREST, FARTHEST = 0.6, 1.6
 """How far a footprint extends along grazing rays, as a factor of the distance of its return."""
 
@@ -62,19 +64,19 @@ def find_level(points, below, level):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _joined(points, key, ground, level, i, j, across):  # type: ignore[no-untyped-def]
-    """Whether two neighbouring returns are of one surface."""
+def _joined(points, distance, key, ground, level, i, j, across):  # type: ignore[no-untyped-def]
+    """1 if two neighbouring returns are of one surface, else 0."""
+    if abs(distance[i] - distance[j]) < NOISE:
+        return 1
     xi, yi, zi, xj, yj, zj = points[i, 0], points[i, 1], points[i, 2], points[j, 0], points[j, 1], points[j, 2]
     ri, rj = xi * xi + yi * yi + zi * zi, xj * xj + yj * yj + zj * zj
     far = max(ri, rj)
     same = key[i] == key[j]
-    if abs(np.sqrt(ri) - np.sqrt(rj)) < NOISE:
-        return True
     if across and (same or (ground[i] and ground[j])) and level[i] and level[j]:
-        return abs(zi - zj) < 0.1 + 0.03 * np.hypot(xi - xj, yi - yj)
+        return int(abs(zi - zj) < 0.1 + 0.03 * np.hypot(xi - xj, yi - yj))
     cx, cy, cz = yi * zj - zi * yj, zi * xj - xi * zj, xi * yj - yi * xj
     least = OTHER_OBJECT if not same else SAME_OBJECT if across else SAME_RING
-    return np.sqrt(cx * cx + cy * cy + cz * cz) >= least * (far - (xi * xj + yi * yj + zi * zj))
+    return int(np.sqrt(cx * cx + cy * cy + cz * cz) >= least * (far - (xi * xj + yi * yj + zi * zj)))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -107,6 +109,9 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
     count, limit = len(azimuth), WIDEST * step
     triangles = np.empty((4 * count if bridge else 2 * count, 3), np.int32)
     found, farthest = 0, 2 if bridge else 1
+    distance = np.empty(count)
+    for i in range(count):
+        distance[i] = np.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1] + points[i, 2] * points[i, 2])
     rim = np.zeros(count, np.bool_)
     rim[: starts[1]] = True
     rim[starts[len(rings) - 1] :] = True
@@ -121,32 +126,40 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
                 rim[b0 : b0 + m] = True
                 continue
             i = j = 0
+            a, at_a = a0, azimuth[a0]
+            b, at_b = b0, azimuth[b0]
+            next_a, to_a = _around(azimuth, a0, 1, n)
+            next_b, to_b = _around(azimuth, b0, 1, m)
+            joined = _UNKNOWN
             while i < n or j < m:
-                a, at_a = _around(azimuth, a0, i, n)
-                b, at_b = _around(azimuth, b0, j, m)
-                next_a, to_a = _around(azimuth, a0, i + 1, n)
-                next_b, to_b = _around(azimuth, b0, j + 1, m)
+                from_a, from_b, between, apart = a, b, joined, at_a - at_b
                 upper = i < n and (j == m or to_a <= to_b)  # the next return of the upper ring comes first
                 if upper:
-                    c, before, other, gap, across = next_a, a, b, to_a - at_a, to_a - at_b
+                    c, before, gap = next_a, a, to_a - at_a
                     i += 1
+                    a, at_a = next_a, to_a
+                    next_a, to_a = _around(azimuth, a0, i + 1, n)
                 else:
-                    c, before, other, gap, across = next_b, b, a, to_b - at_b, to_b - at_a
+                    c, before, gap = next_b, b, to_b - at_b
                     j += 1
-                if further == 2 and (0 <= below[a] < b0 or (upper and 0 <= below[c] < b0)):
+                    b, at_b = next_b, to_b
+                    next_b, to_b = _around(azimuth, b0, j + 1, m)
+                joined = _UNKNOWN
+                if further == 2 and (0 <= below[from_a] < b0 or (upper and 0 <= below[c] < b0)):
                     continue  # the ring between has a return
-                if (
-                    gap <= limit
-                    and abs(at_a - at_b) <= limit
-                    and abs(across) <= limit
-                    and _joined(points, key, ground, level, a, b, True)
-                    and _joined(points, key, ground, level, c, other, True)
-                    and _joined(points, key, ground, level, before, c, False)
-                ):
-                    triangles[found, 0], triangles[found, 1], triangles[found, 2] = a, b, c
+                whole = False
+                if gap <= limit and abs(apart) <= limit and abs(at_a - at_b) <= limit:
+                    if between == _UNKNOWN:
+                        between = _joined(points, distance, key, ground, level, from_a, from_b, True)
+                    if between:
+                        joined = _joined(points, distance, key, ground, level, a, b, True)
+                    if between and joined:
+                        whole = _joined(points, distance, key, ground, level, before, c, False) == 1
+                if whole:
+                    triangles[found, 0], triangles[found, 1], triangles[found, 2] = from_a, from_b, c
                     found += 1
                 else:
-                    rim[a] = rim[b] = rim[c] = True
+                    rim[from_a] = rim[from_b] = rim[c] = True
     return triangles[:found], rim
 
 
@@ -170,9 +183,9 @@ def _above(rho, z, slope, height):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def hit_triangles(
+def hit_triangles(  # type: ignore[no-untyped-def]
     points, azimuth, rho, rows, value, triangles, slope, height, first, step, table, out, vertex, mean, facing
-):  # type: ignore[no-untyped-def]
+):
     """Find the first triangle that each ray hits.
 
     Args:
@@ -285,3 +298,49 @@ def hit_footprints(points, azimuth, rho, normal, half, up, down, reach, slope, h
                     out[r, column] = along
                     vertex[r, column] = i
                 f += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def shape_footprints(recorded, points, rho, rim, level, step, rise, fall, upright, half, up, down, normal):  # type: ignore[no-untyped-def]
+    """Fill half, up, down and normal of the footprints of R returns, see ``hit_footprints``.
+
+    Args:
+        recorded: (N, 3) float32, the returns in the frame of the sensor that recorded them.
+        points, rho: (N, ...) in the target's frame.
+        rim: (R,) indices of the returns.
+        level: (N,) returns of level surfaces; the footprints of others are vertical and face the target.
+        step: radians between the recording sensor's firings.
+        rise, fall: (N,) radians, half the angle to its neighbouring rings.
+        upright: (3,) the upward direction in the target's frame.
+    """
+    ux, uy, uz = upright[0], upright[1], upright[2]
+    for k in range(len(rim)):
+        i = rim[k]
+        x, y, z = recorded[i, 0], recorded[i, 1], recorded[i, 2]
+        distance = np.sqrt(x * x + y * y + z * z)
+        half[k] = min(np.float32(np.float32(step / 2) * distance) / rho[i], 0.2)
+        up[k], down[k] = np.tan(rise[i]) * distance, np.tan(fall[i]) * distance
+        nx, ny, nz = ux, uy, uz
+        if not level[i]:
+            above = points[i, 0] * ux + points[i, 1] * uy + points[i, 2] * uz
+            nx, ny, nz = points[i, 0] - above * ux, points[i, 1] - above * uy, points[i, 2] - above * uz
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            nx, ny, nz = nx / length, ny / length, nz / length
+        normal[k, 0], normal[k, 1], normal[k, 2] = nx, ny, nz
+
+
+@numba.njit(cache=True, nogil=True)
+def put_in_front(patch, of, rim, value, least, share, out, vertex, mean, facing):  # type: ignore[no-untyped-def]
+    """Let footprints hide the triangles that they lie in front of.
+
+    Args:
+        patch, of: (H, F) out and vertex of ``hit_footprints``.
+        rim, value: (R,) returns of the footprints; (N,) value of each return.
+        least, share: metres, and share of its distance, by which a footprint has to lie in front.
+        out, vertex, mean, facing: (H, F) of ``hit_triangles``.
+    """
+    for r in range(out.shape[0]):
+        for f in range(out.shape[1]):
+            if patch[r, f] * (1 + share) + least < out[r, f]:
+                i = rim[of[r, f]]
+                out[r, f], vertex[r, f], mean[r, f], facing[r, f] = patch[r, f], i, value[i], 1.0

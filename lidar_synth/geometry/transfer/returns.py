@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,3 +78,47 @@ class Measurement:
         if levels is not None:
             reflectance = np.minimum(np.round(reflectance * levels), levels - 1) / levels
         return np.clip(reflectance, 0, 1).astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True)
+def gather_hits(rho, slope, row, firing, distance):  # type: ignore[no-untyped-def]
+    """Find the rays that hit something, row by row.
+
+    Args:
+        rho: (H, F) metres; inf = none.
+        slope: (H,) of ``Rays``.
+        row, firing: (H * F,) of each of N hits, in the first N places.
+        distance: (H * F,) metres from the laser, in the first N places.
+
+    Returns:
+        N.
+    """
+    found = 0
+    for r in range(rho.shape[0]):
+        secant = np.sqrt(1 + slope[r] * slope[r])
+        for f in range(rho.shape[1]):
+            if rho[r, f] < np.inf:
+                row[found], firing[found], distance[found] = r, f, rho[r, f] * secant
+                found += 1
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def place_returns(row, firing, distance, slope, height, directions, low, high, points, inside):  # type: ignore[no-untyped-def]
+    """Fill ``points`` (N, 3) float32 with the returns of rays, and ``inside`` (N,) with whether they are in range.
+
+    Args:
+        row, firing: (N,) of each return.
+        distance: (N,) measured from the laser, metres.
+        slope, height, directions: of ``Rays``.
+        low, high: limits of the range from the sensor's origin, metres.
+    """
+    for i in range(len(row)):
+        r, f = row[i], firing[i]
+        rho = distance[i] / np.sqrt(1 + slope[r] * slope[r])
+        x = np.float32(rho * directions[r, f, 0])
+        y = np.float32(rho * directions[r, f, 1])
+        z = np.float32(height[r] + rho * slope[r])
+        points[i, 0], points[i, 1], points[i, 2] = x, y, z
+        away = np.sqrt(x * x + y * y + z * z)
+        inside[i] = rho > 0 and low <= away <= high

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import locate, ring_numbers
-from lidar_synth.geometry.projection.rings import fault_of
+from lidar_synth.geometry.projection.kernels import medians, sines_of
+from lidar_synth.geometry.projection.rings import fault_of, turns
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer.kernels import find_level, neighbours_below, triangulate
 
@@ -27,6 +28,7 @@ class Surfaces:
 
     Args:
         scan: the scan with its N returns ordered by ring and azimuth.
+        azimuth: (N,) radians, clockwise.
         triangles: (T, 3) int32 indices of returns.
         rim: (N,) bool, returns that some side has no triangle.
         level: (N,) bool, returns of nearly level surfaces.
@@ -36,6 +38,7 @@ class Surfaces:
     """
 
     scan: Scan
+    azimuth: NDArray[np.float64]
     triangles: NDArray[np.int32]
     rim: NDArray[np.bool_]
     level: NDArray[np.bool_]
@@ -60,13 +63,15 @@ def estimate(scan: Scan) -> Surfaces:
     azimuth = -np.arctan2(scan.points[:, 1], scan.points[:, 0]).astype(np.float64)
     order = np.argsort(ring * 8.0 + azimuth)
     scan, ring, azimuth = scan[order], ring[order], azimuth[order]
-    present, starts = np.unique(ring, return_index=True)
+    starts = np.flatnonzero(np.append(True, ring[1:] != ring[:-1]))
+    present = ring[starts]
     if len(present) < 2:
         raise DataError(f"scan {scan.id!r} with returns of one beam only", "at least two beams, to find surfaces")
     starts = np.append(starts, len(scan)).astype(np.int64)
     points = scan.points.astype(np.float64)
     elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
-    middle = np.array([np.median(part) for part in np.split(elevation, starts[1:-1])])
+    middle = np.empty(len(present))
+    medians(elevation, starts, middle)
     _check_rings(scan, elevation, starts, middle)
     step = _step(azimuth, starts, scan)
     below, level = np.empty(len(scan), np.int64), np.empty(len(scan), bool)
@@ -78,7 +83,7 @@ def estimate(scan: Scan) -> Surfaces:
     up, down = np.concatenate([half[:1], half]), np.concatenate([half, half[-1:]])
     counts = np.diff(starts)
     bounds = float(middle.min() - down[-1]), float(middle.max() + up[0])
-    return Surfaces(scan, triangles, rim, level, step, np.repeat(up, counts), np.repeat(down, counts), bounds)
+    return Surfaces(scan, azimuth, triangles, rim, level, step, np.repeat(up, counts), np.repeat(down, counts), bounds)
 
 
 def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
@@ -89,14 +94,15 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
     if scan.ring is not None:
         return scan.ring.astype(np.int64), False
     lasers = scan.sensor.by_beams()
-    turn = np.abs(np.diff(np.arctan2(scan.points[:, 1], scan.points[:, 0])))
+    turn = np.abs(np.diff(turns(scan.points)[0]))
     if len(turn) and np.median(turn) < ORDERED:
         ring = ring_numbers(scan.points)
         if ring[-1] > 0 and not fault_of(scan.points, ring, lasers):
             return ring.astype(np.int64), False
     if len(scan.sensor.starts):
         return _rows_of(scan), True
-    sine = scan.points[:, 2] / np.maximum(np.linalg.norm(scan.points, axis=1), 1e-6)
+    sine = np.empty(len(scan), np.float32)
+    sines_of(scan.points, sine)
     elevation = np.arcsin(np.clip(sine, -1, 1))
     rows = [np.searchsorted(-s.edges[1:-1], -elevation) for s in (scan.sensor, lasers)]
     centres = [scan.sensor.row_elevations(), lasers.laser_elevations]

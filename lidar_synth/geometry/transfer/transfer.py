@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.mount import Mount
 from lidar_synth.geometry.transfer.rays import Rays, rays_of
-from lidar_synth.geometry.transfer.returns import Measurement
+from lidar_synth.geometry.transfer.returns import Measurement, gather_hits, place_returns
 from lidar_synth.geometry.transfer.surfaces import Surfaces, estimate
 from lidar_synth.geometry.transfer.sweeps import moved
 from lidar_synth.noise import keyed_rng
@@ -89,7 +90,7 @@ class Transfer:
         """
         rays, rng = rays_of(self.target), rng or keyed_rng(0)
         surfaces = estimate(self._without_vehicle(scan))
-        seen = float(_seen(surfaces, rays, self.mount).mean())
+        seen = _seen(surfaces, self.target, self.mount)
         upright = self.mount.matrix[2, :3]
         hits = first_hits(surfaces, self.mount.points(surfaces.scan.points), rays, upright)
         others = [estimate(self._without_vehicle(sweep)) for sweep in sweeps]
@@ -123,22 +124,23 @@ class Transfer:
 
     def _returns(self, hits: Hits, rays: Rays, rng: np.random.Generator) -> Scan:
         """The returns of the rays that hit something, row by row."""
-        row, firing = np.nonzero(np.isfinite(hits.rho))
-        secant = np.sqrt(1 + rays.slope[row] ** 2)
-        distance = hits.rho[row, firing] * secant
-        kept = self.measurement.returned(distance, hits.reflectance[row, firing], hits.facing[row, firing], rng)
-        row, firing, secant = row[kept], firing[kept], secant[kept]
-        rho = self.measurement.ranges(distance[kept], self.target, rng) / secant
-        azimuth = rays.first[row] + firing * rays.step
-        points = np.stack(
-            [rho * np.cos(azimuth), -rho * np.sin(azimuth), rays.height[row] + rho * rays.slope[row]], 1
-        ).astype(np.float32)
-        distance = np.linalg.norm(points, axis=1)
-        inside = (rho > 0) & (distance >= self.target.range_min) & (distance <= self.target.range_max)
-        row, firing = row[inside], firing[inside]
-        carried: dict[str, Any] = {name: values[row, firing] for name, values in hits.carried.items()}
-        reflectance = self.measurement.reflectances(hits.reflectance[row, firing], self.target)
-        return Scan(points[inside], reflectance, self.target, ring=row.astype(np.int16), **carried)
+        size = hits.rho.size
+        row, firing, distance = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size)
+        count = gather_hits(hits.rho, rays.slope, row, firing, distance)
+        row, firing, distance = row[:count], firing[:count], distance[:count]
+        at = row * rays.firings + firing
+        kept = self.measurement.returned(distance, hits.reflectance.take(at), hits.facing.take(at), rng)
+        if not kept.all():
+            row, firing, distance, at = row[kept], firing[kept], distance[kept], at[kept]
+        distance = self.measurement.ranges(distance, self.target, rng)
+        points, inside = np.empty((len(row), 3), np.float32), np.empty(len(row), bool)
+        limits = np.float32(self.target.range_min), np.float32(self.target.range_max)
+        place_returns(row, firing, distance, rays.slope, rays.height, rays.directions, *limits, points, inside)
+        if not inside.all():
+            points, row, at = points[inside], row[inside], at[inside]
+        carried: dict[str, Any] = {name: values.take(at) for name, values in hits.carried.items()}
+        reflectance = self.measurement.reflectances(hits.reflectance.take(at), self.target)
+        return Scan(points, reflectance, self.target, ring=row.astype(np.int16), **carried)
 
     @property
     def identity(self) -> str:
@@ -181,20 +183,26 @@ class SeenAs:
         return self.transfer(self.source[index], keyed_rng(self.seed, index % len(self)))
 
 
-def _seen(surfaces: Surfaces, rays: Rays, mount: Mount) -> NDArray[np.bool_]:
-    """(H, F) which rays lie within the field of view of the sensor that recorded the surfaces."""
-    azimuth = rays.first[:, None] + np.arange(rays.firings) * rays.step
-    slope = np.broadcast_to(rays.slope[:, None], azimuth.shape)
-    directions = np.stack([np.cos(azimuth), -np.sin(azimuth), slope], -1) @ mount.matrix[:3, :3].T
-    elevation = np.arctan2(directions[..., 2], np.hypot(directions[..., 0], directions[..., 1]))
-    points = surfaces.scan.points
-    looked = np.bincount(_sector(points[:, 0], points[:, 1]), minlength=SECTORS) > 0
+def _seen(surfaces: Surfaces, target: Sensor, mount: Mount) -> float:
+    """The share of the target's rays that lie in the field of view of the sensor that recorded the surfaces."""
+    elevation, sector = _views(target, mount)
+    looked = np.bincount(_sector(-surfaces.azimuth.astype(np.float32)), minlength=SECTORS) > 0
     inside = (elevation >= surfaces.bounds[0]) & (elevation <= surfaces.bounds[1])
-    return np.asarray(inside & looked[_sector(directions[..., 0], directions[..., 1])])
+    return float((inside & looked.take(sector)).mean())
 
 
-def _sector(x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.int64]:
-    return np.asarray(np.floor(np.arctan2(y, x) / (2 * np.pi) * SECTORS), np.int64) % SECTORS
+@lru_cache(maxsize=16)
+def _views(target: Sensor, mount: Mount) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """(H, F) elevation, radians, and sector of each ray in the frame of the recording sensor."""
+    rays = rays_of(target)
+    slope = np.broadcast_to(rays.slope[:, None, None], (*rays.directions.shape[:2], 1))
+    x, y, z = np.moveaxis(np.concatenate([rays.directions, slope], -1) @ mount.matrix[:3, :3].T, -1, 0)
+    return np.arctan2(z, np.hypot(x, y)), _sector(np.arctan2(y, x))
+
+
+def _sector(angle: NDArray[np.floating]) -> NDArray[np.int64]:
+    """The sector of an angle in [-pi, pi], radians."""
+    return np.asarray(np.floor(angle / (2 * np.pi) * SECTORS), np.int64) % SECTORS
 
 
 def _nearest(several: list[Hits], like: Hits) -> Hits:
