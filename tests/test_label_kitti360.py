@@ -17,12 +17,11 @@ from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthErro
 from lidar_synth.formats import kitti360_labels
 from lidar_synth.formats.kitti360 import boxes_path, confidence_path, label_file, labels_folder, scans_folder
 from lidar_synth.formats.kitti360_accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
-from lidar_synth.formats.kitti360_boxes import WorldBoxes, read_boxes
+from lidar_synth.formats.kitti360_boxes import read_boxes
 from lidar_synth.formats.kitti360_labels import label_scans, plan_labels
-from lidar_synth.formats.kitti360_movers import Movers
 from lidar_synth.formats.kitti360_poses import (
     ego_motion,
-    fill_poses,
+    imu_from_sensor,
     read_calibration,
     read_poses,
     undo_ego_motion,
@@ -121,6 +120,12 @@ def test_a_rerun_repeats_only_what_is_missing_or_changed(copy: Path, tmp_path: P
     assert len(list(out.rglob("*.label"))) <= SCANS // 4  # no labels of the run before
 
 
+def _shorten(copy: Path) -> None:
+    """Keep the first four scans."""
+    for path in sorted(scans_folder(copy, DRIVE).iterdir())[4:]:
+        path.unlink()
+
+
 def _turned(copy: Path) -> None:
     _change_poses(
         copy, lambda frame, pose: pose @ np.array([(0.9, -0.43589, 0, 0), (0.43589, 0.9, 0, 0), *np.eye(4)[2:]])
@@ -156,6 +161,34 @@ def test_wrong_poses_are_an_error_and_write_no_labels(
     with pytest.raises(DataError, match="do not lie on its accumulated clouds|spread over"):
         label_scans(copy, tmp_path / "labels", progress=False)
     assert len(list((tmp_path / "labels").rglob("*.label"))) <= SCANS // 4
+
+
+WRONG = {
+    "0.4 m high": (0, 0, 0.4, 0),
+    "1 m along": (1, 0, 0, 0),
+    "0.3 m aside": (0, 0.3, 0, 0),
+    "2 degrees": (0, 0, 0, 2),
+}
+"""Errors of all poses of a drive in the sensor's frame: metres, and degrees of yaw."""
+
+
+@pytest.mark.parametrize("error", WRONG)
+def test_scans_off_the_clouds_are_laid_onto_them(
+    copy: Path, root: Path, labelled: tuple[Path, LabelReport], tmp_path: Path, error: str
+) -> None:
+    _shorten(copy)
+    x, y, z, yaw = WRONG[error]
+    c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+    wrong = np.array([(c, -s, 0, x), (s, c, 0, y), (0, 0, 1, z), (0, 0, 0, 1)])
+    mount = imu_from_sensor(read_calibration(root))
+    _change_poses(copy, lambda frame, pose: pose @ mount @ wrong @ np.linalg.inv(mount))
+    report = label_scans(copy, tmp_path / "labels", against=root, progress=False)
+    assert report.labelled == {DRIVE: 4} and report.misfits == {DRIVE: []}
+    assert len(report.moved[DRIVE]) == 4 and np.allclose(report.moved[DRIVE], np.hypot(x, y) + z, atol=0.15)
+    assert labelled[1].moved == {DRIVE: []}
+    before = [labelled[1].compared[name] for name in report.compared]
+    known, covered, right = np.sum(list(report.compared.values()), axis=0)[:3]
+    assert np.allclose((covered / known, right / known), np.sum(before, axis=0)[1:3] / known, atol=0.005)
 
 
 def test_frames_without_window_or_pose_are_counted(copy: Path, tmp_path: Path) -> None:
@@ -211,62 +244,6 @@ def test_scans_measured_while_driving_are_recognised_and_labelled(root: Path, co
     for part in range(STEP):
         covered, right, *_ = shares(report, part)
         assert covered > 0.9 and right > 0.97
-
-
-def test_undoing_the_motion_of_the_sensor_is_exact_at_the_pose_and_half_a_turn_away() -> None:
-    angle = np.radians(4)
-    motion = np.eye(4)
-    motion[:2, :2] = [(np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))]
-    motion[:3, 3] = -1, 0.1, 0
-    ahead, behind = np.array([(10.0, 0, 1)]), np.array([(-10.0, 1e-9, 1)])
-    assert np.allclose(undo_ego_motion(ahead, motion), ahead)
-    half = np.array([(np.cos(angle / 2), -np.sin(angle / 2), 0), (np.sin(angle / 2), np.cos(angle / 2), 0), (0, 0, 1)])
-    assert np.allclose(undo_ego_motion(behind, motion), behind @ half.T + motion[:3, 3] / 2)
-    assert np.array_equal(undo_ego_motion(behind, np.eye(4)), behind)
-
-
-def test_poses_are_filled_only_where_the_car_stood() -> None:
-    poses = {f: np.eye(4) for f in (0, 10, 20)}
-    poses[10][0, 3], poses[20][0, 3] = 0.4, 12.0
-    filled = fill_poses(poses, range(-1, 22))
-    assert set(filled) == {*range(11), 20}
-    assert filled[5][0, 3] == pytest.approx(0.2)
-
-
-def _moving_box(frames: range, speed: float, instance: int = 26001, start: float = 0.0) -> WorldBoxes:
-    transforms = np.tile(np.diag([4.0, 2.0, 1.5, 1.0]), (len(frames), 1, 1))
-    transforms[:, 0, 3] = start + speed * np.array(frames)
-    windows = np.repeat(np.array(frames)[:, None], 2, axis=1)
-    return WorldBoxes(transforms, np.array(["Car"] * len(frames)), np.full(len(frames), instance, np.int32), windows)
-
-
-def _dynamic(points: list[tuple[float, float, float, int]], path: Path) -> NDArray[np.void]:
-    x, y, z, frame = np.array(points).T
-    values = {"x": x, "y": y, "z": z, "timestamp": frame, "semantic": np.full(len(x), 26)}
-    write_cloud(path, values | {"instance": np.full(len(x), 26001), "confidence": np.ones(len(x))})
-    return read_cloud(path)
-
-
-def test_points_of_a_moving_object_follow_its_box(tmp_path: Path) -> None:
-    cloud = _dynamic([(0.5, 0, 0, 0), (4.5, 0.9, 0, 2), (50, 0, 0, 3)], tmp_path / "dynamic" / "a.ply")
-    movers = Movers([cloud], _moving_box(range(5), 2.0), range(5))
-    points, values = movers.at(1)  # no point was measured in this frame
-    assert np.allclose(sorted(points.tolist()), [(2.5, 0, 0), (2.5, 0.9, 0)], atol=1e-5)
-    assert set(values.tolist()) == {26 | 26001 << 16}
-    assert len(movers.at(3)[0]) == 3 and len(movers.at(9)[0]) == 0  # the point in no box, only in its own frame
-
-
-def test_a_box_that_stands_still_is_no_moving_object_unless_it_has_moving_points(tmp_path: Path) -> None:
-    still = _moving_box(range(5), 0.0)
-    assert not Movers([], still, range(5)).tracks
-    cloud = _dynamic([(0.5, 0, 0, 0)], tmp_path / "dynamic" / "a.ply")
-    assert len(Movers([cloud], still, range(5)).tracks) == 1
-
-
-def test_an_instance_number_that_is_used_again_is_another_object() -> None:
-    one, other = _moving_box(range(5), 2.0), _moving_box(range(5, 9), 2.0, start=1000.0)
-    both = WorldBoxes(*(np.concatenate([getattr(one, n), getattr(other, n)]) for n in vars(one)))
-    assert len(Movers([], both, range(9)).tracks) == 2
 
 
 def _truncated(path: Path) -> None:
@@ -329,6 +306,7 @@ def test_a_missing_part_of_the_dataset_is_named(copy: Path, tmp_path: Path, miss
 def test_a_run_that_ended_before_its_first_record_is_resumed(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    _shorten(copy)
     write, written = kitti360_labels.write_labels, []
 
     def full(path: Path, values: NDArray[np.uint32]) -> None:
@@ -343,7 +321,7 @@ def test_a_run_that_ended_before_its_first_record_is_resumed(
     monkeypatch.undo()
     assert len(list((tmp_path / "labels").rglob("*.label"))) == 2
     assert not list((tmp_path / "labels").rglob("*.json"))
-    assert label_scans(copy, tmp_path / "labels", progress=False).labelled == {DRIVE: SCANS}
+    assert label_scans(copy, tmp_path / "labels", progress=False).labelled == {DRIVE: 4}
 
 
 def test_a_file_in_place_of_the_output_is_named(root: Path, tmp_path: Path) -> None:

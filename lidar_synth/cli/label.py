@@ -57,6 +57,10 @@ def _print(report: "LabelReport", out: Path) -> None:
     for drive, frames in report.misfits.items():
         if frames:
             print(f"  {drive}: {len(frames)} scans do not lie on the clouds and got no labels", file=sys.stderr)
+    for drive, metres in report.moved.items():
+        if metres:
+            far = f"lay up to {max(metres):.2f} m off the clouds and were laid onto them: check its poses"
+            print(f"  {drive}: {len(metres)} scans {far}", file=sys.stderr)
     print("\n" + "  ".join(f"{name} {share:.1%}" for name, share in report.totals().items()) + "\n")
     names = ("points", "confidence", "covered", "right")
     rows = report.classes()

@@ -9,7 +9,7 @@ Output, which ``KITTI360(root, labels=out)`` reads::
 
 The unit of work is a window. A rerun repeats windows without a record, and those whose clouds, poses or boxes changed.
 A frame gets labels if a window covers it, it has a pose (or the car hardly moved between two poses), and its scan lies
-on the clouds; frames without labels have no file.
+on the clouds, or could be laid onto them; frames without labels have no file.
 """
 
 import json
@@ -45,7 +45,7 @@ from lidar_synth.formats.label_report import Counts, LabelReport
 from lidar_synth.formats.point_labels import write_labels
 from lidar_synth.formats.points import read_points
 
-VERSION = 1
+VERSION = 2
 """Raised when the rules change, so that a rerun replaces labels of older versions."""
 
 _SAMPLES = 8  # scans of a window on which it is tested whether they are motion-compensated
@@ -210,7 +210,7 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
     recovery.choose_motion({f: points(f)[:, :3] for f in job.frames[:: -(-len(job.frames) // _SAMPLES)]})
     for frame in job.frames:  # labels of an earlier run with other clouds or poses
         (folder / f"{frame:010d}.label").unlink(missing_ok=True)
-    counts, fitting, misfits = Counts(), [], []
+    counts, fitting, misfits, moved = Counts(), [], [], {}
     for frame in job.frames:
         scan = points(frame)[:, :3]
         found = recovery.label(scan, frame)
@@ -218,6 +218,8 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
             misfits.append(frame)
             continue
         fitting.append(frame)
+        if found.moved:
+            moved[frame] = round(found.moved, 3)
         name = f"{frame:010d}"
         write_file(confidence_path(out, job.drive, name), np.rint(found.confidence * 255).astype(np.uint8).tobytes())
         write_labels(folder / f"{name}.label", found.values)
@@ -229,7 +231,7 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
             if truth is not None:
                 counts.compare(frame, train, truth, _moving(recovery, scan, frame, truth))
     record = {"inputs": made_of, "turns": recovery.turns, "fitting": fitting, "misfits": misfits}
-    record |= {"counts": counts.to_dict()}
+    record |= {"moved": moved, "counts": counts.to_dict()}
     write_file(path, json.dumps(record).encode())
     return record
 

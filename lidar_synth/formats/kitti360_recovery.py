@@ -1,9 +1,10 @@
 """Labels of KITTI-360's scans, recovered from the accumulated clouds of one window.
 
 A point of a scan takes the label on which its nearest neighbours agree: in the static clouds of the window and of the
-ones before and after it, or among the moving objects of that very frame, whichever is nearer. Clouds of other windows
-are left out, because cars that are parked now may be gone when the drive comes by again. A point keeps no label (0)
-where no neighbour lies within ``RADIUS``, or where less than ``AGREEMENT`` of their weight agrees.
+ones before and after it, or among the moving objects of that very frame, whichever is nearer. A scan that lies up to
+``FARTHEST`` off the clouds, because its pose is wrong, is laid onto them first (kitti360_registration.py). Clouds of
+other windows are left out, because cars that are parked now may be gone when the drive comes by again. A point keeps
+no label (0) where no neighbour lies within ``RADIUS``, or where less than ``AGREEMENT`` of their weight agrees.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +18,7 @@ from lidar_synth.formats.kitti360_accumulated import Window, cloud_values, read_
 from lidar_synth.formats.kitti360_boxes import WorldBoxes
 from lidar_synth.formats.kitti360_movers import FLOOR, MARGIN, Movers, inside
 from lidar_synth.formats.kitti360_poses import ego_motion, undo_ego_motion
+from lidar_synth.formats.kitti360_registration import apply, find_surfaces, register
 from lidar_synth.labels.nearest import Chunk, index_cloud
 
 RADIUS = 0.3
@@ -31,8 +33,13 @@ VIEW = 100.0
 FIT = 0.6
 """Minimum share of a scan's upright points that lie on the clouds; below it, pose and clouds do not fit.
 
-In the town it is 0.97 to 0.99; with poses 0.5 m off 0.3 to 0.43, turned by 1 degree 0.77 to 0.91, by 3 degrees 0.4 to
-0.59.
+In the town it is 0.97 to 0.99; with poses 0.5 m off, without registration, 0.3 to 0.43.
+"""
+
+NEAREST, FARTHEST = (0.15, np.radians(0.4)), (1.4, np.radians(4))
+"""Metres and radians by which a scan may lie off the clouds as it is, and up to which it is corrected.
+
+Scans of the town whose poses are 2.1 m off were moved by 1.5 to 1.9 m, to wrong places.
 """
 
 ON_SURFACE = 0.1
@@ -61,6 +68,7 @@ class Recovered:
         far: number of points without a neighbour.
         disputed: number of points whose neighbours disagree.
         moving: number of points of moving objects.
+        moved: metres by which the scan was laid onto the clouds; 0 if it lay there.
         fit: share of the scan's upright points that lie on the clouds.
         fits: whether that is enough; if not, the labels are worthless.
     """
@@ -70,6 +78,7 @@ class Recovered:
     far: int
     disputed: int
     moving: int
+    moved: float
     fit: float
     fits: bool
 
@@ -109,6 +118,8 @@ class Recovery:
         span = range(min(w.first for w in windows), max(w.last for w in windows) + 100)
         self.movers = Movers(dynamic, boxes, span)
         self.turns = True
+        self._surfaces = find_surfaces(self._static)
+        self._moves: dict[int, NDArray[np.float64]] = {}
 
     def choose_motion(self, scans: Mapping[int, NDArray[np.float32]]) -> None:
         """Find out whether scans were measured while the car moved, or are compensated, by what fits the clouds.
@@ -119,6 +130,8 @@ class Recovery:
         fits = []
         for turns in (True, False):
             self.turns = turns
+            for frame, points in scans.items():
+                self._lay(points, frame)
             fits.append(sum(self._on_clouds(self.place(points, f), points)[0] for f, points in scans.items()))
         self.turns = fits[0] >= fits[1]
 
@@ -126,10 +139,27 @@ class Recovery:
         """(N, 3) the points of a scan in the world."""
         pose = self._poses[frame]
         local = undo_ego_motion(points, ego_motion(self._poses, frame)) if self.turns else points
-        return np.asarray(local @ pose[:3, :3].T + pose[:3, 3])
+        placed = np.asarray(local @ pose[:3, :3].T + pose[:3, 3])
+        return apply(self._moves[frame], placed) if frame in self._moves else placed
+
+    def _lay(self, points: NDArray[np.float32], frame: int) -> float:
+        """Lay a scan onto the clouds, if it lies off; metres by which it was moved, infinite if it would be too far."""
+        self._moves.pop(frame, None)
+        probes = points[_probes(points)]
+        if not len(probes):
+            return 0.0
+        move = register(self.place(probes, frame), self._surfaces)
+        local = np.linalg.inv(self._poses[frame]) @ move @ self._poses[frame]
+        metres = float(np.linalg.norm(local[:3, 3]))
+        angle = float(np.arccos(np.clip((np.trace(local[:3, :3]) - 1) / 2, -1, 1)))
+        if metres <= NEAREST[0] and angle <= NEAREST[1]:
+            return 0.0
+        self._moves[frame] = move
+        return metres if metres <= FARTHEST[0] and angle <= FARTHEST[1] else np.inf
 
     def label(self, points: NDArray[np.float32], frame: int) -> Recovered:
         """The labels of a scan: (N, 3) points in the sensor's frame, as measured."""
+        moved = self._lay(points, frame)
         placed = self.place(points, frame)
         vote = self._static.vote(placed, RADIUS)
         values, share, trust, distance = vote
@@ -142,9 +172,15 @@ class Recovery:
         close, about = self._on_clouds(placed, points)
         fits = close >= FIT * about if about >= _FEW else bool((~far).mean() >= _COVERED)
         return Recovered(
-            values, confidence, int((far & ~boxed).sum()), int((disputed & ~far & ~boxed).sum()),
-            int((moving | boxed).sum()), close / max(about, 1), fits,
-        )  # fmt: skip
+            values,
+            confidence,
+            far=int((far & ~boxed).sum()),
+            disputed=int((disputed & ~far & ~boxed).sum()),
+            moving=int((moving | boxed).sum()),
+            moved=moved,
+            fit=close / max(about, 1),
+            fits=fits and np.isfinite(moved),
+        )
 
     def _vote_of_movers(
         self,
@@ -196,6 +232,14 @@ class Recovery:
         probes = placed[upright[:: max(1, len(upright) // _PROBES)]]
         nearest = self._static.vote(probes, _ABOUT).distance
         return int((nearest < _CLOSE).sum()), int(np.isfinite(nearest).sum())
+
+
+def _probes(points: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Some points that show how a scan lies: upright ones and ones on the road."""
+    distance = np.linalg.norm(points, axis=1)
+    near, upright = (distance > _PROBED[0]) & (distance < _PROBED[1]), points[:, 2] > _UPRIGHT
+    parts = (np.flatnonzero(near & upright), np.flatnonzero(near & ~upright))
+    return np.concatenate([part[:: max(1, len(part) // _PROBES)] for part in parts])
 
 
 def _chunks(windows: Sequence[Window]) -> Iterator[Chunk]:

@@ -111,6 +111,7 @@ class LabelReport:
         without_clouds: drives without windows.
         labelled: {drive: number of frames with labels}.
         misfits: {drive: frames whose scans do not lie on the clouds}.
+        moved: {drive: metres by which scans were laid onto the clouds, of those that lay off}.
         kept: number of windows that were complete before this run.
         counts: of all labelled frames.
         compared: {drive/frame: see ``Counts``}.
@@ -121,6 +122,7 @@ class LabelReport:
     without_clouds: tuple[str, ...]
     labelled: dict[str, int] = field(default_factory=dict)
     misfits: dict[str, list[int]] = field(default_factory=dict)
+    moved: dict[str, list[float]] = field(default_factory=dict)
     kept: int = 0
     counts: Counts = field(default_factory=Counts)
     compared: dict[str, list[int]] = field(default_factory=dict)
@@ -132,6 +134,7 @@ class LabelReport:
         self.compared |= {f"{drive}/{frame:010d}": counts for frame, counts in own.compared.items()}
         self.labelled[drive] = self.labelled.get(drive, 0) + len(record["fitting"])
         self.misfits.setdefault(drive, []).extend(record["misfits"])
+        self.moved.setdefault(drive, []).extend(record["moved"].values())
         self.kept += bool(record.get("kept"))
 
     def check(self) -> None:
@@ -183,6 +186,7 @@ class LabelReport:
                 "without_pose": self.without_pose,
                 "outside_windows": self.outside,
                 "not_on_the_clouds": self.misfits,
+                "laid_onto_the_clouds": {drive: len(metres) for drive, metres in self.moved.items()},
                 "drives_without_clouds": list(self.without_clouds),
             },
             "points": self.counts.points,

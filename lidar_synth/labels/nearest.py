@@ -73,19 +73,28 @@ class NearestLabels:
             points: (N, 3) metres, in the frame of the cloud.
             radius: maximum distance of a neighbour, metres.
         """
+        found, squared = self.nearest(points, radius)
+        count = len(points)
+        share, trust = np.zeros((2, count), np.float32)
+        vote = Vote(np.zeros(count, np.uint32), share, trust, np.full(count, np.inf, np.float32))
+        _count_votes(found, squared, self.values, self.confidence, *vote)
+        return vote
+
+    def nearest(self, points: NDArray[np.float64], radius: float) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """(N, 3) positions in the index of the three nearest points, -1 = none, and (N, 3) squared distances.
+
+        Args:
+            points, radius: as for ``vote``.
+        """
         reach = int(np.ceil(radius / _COLUMN))
         steps = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
         bounds = ((np.maximum(np.abs(steps) - 1, 0) * _COLUMN) ** 2).sum(axis=1).astype(np.float32)
         order = np.lexsort([np.abs(steps).sum(axis=1), bounds])  # nearest columns first
         local = (points - self.low).astype(np.float32)
-        count = len(local)
-        share, trust = np.zeros((2, count), np.float32)
-        vote = Vote(np.zeros(count, np.uint32), share, trust, np.full(count, np.inf, np.float32))
-        found, squared = np.empty((count, 3), np.int64), np.empty((count, 3), np.float32)
+        found, squared = np.empty((len(local), 3), np.int64), np.empty((len(local), 3), np.float32)
         cloud = (self.points, self.starts, self.columns)
         _three_nearest(local, *cloud, steps[order], bounds[order], np.float32(radius), found, squared)
-        _count_votes(found, squared, self.values, self.confidence, *vote)
-        return vote
+        return found, squared
 
 
 Chunk = tuple[NDArray[np.floating], NDArray[np.uint32], NDArray[np.float32]]
