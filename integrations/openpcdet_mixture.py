@@ -21,9 +21,6 @@ class Mixed:
 
     OpenPCDet replaces a scan without boxes after augmentation by another random scan. To keep the ratio, a real scan is
     replaced by a real one here, and a synthetic one raises an error: ``labels: mix`` gives synthetic scans boxes.
-
-    OpenPCDet counts the iterations of an epoch once. All epochs therefore have the length of the first one, and one
-    with a synthetic scan fewer repeats a sample.
     """
 
     _current: int | None = None  # the position whose sample is being made
@@ -35,15 +32,7 @@ class Mixed:
     def _start(self, known: Collection[str]) -> None:
         """Make the mixture and check its first synthetic scans; ``known`` are the class names that a box may have."""
         settings = read_settings(self.dataset_cfg.get("LIDAR_SYNTH", None))
-        ratio = settings.get("ratio", 0.25)
-        if not isinstance(ratio, int | float) and settings.get("epoch_size", "add") == "add":
-            raise ConfigError(
-                f"ratio {ratio} with epochs of different lengths",
-                "one ratio, or epoch_size: replace",
-                "OpenPCDet counts the iterations of an epoch once.",
-            )
         self.mixed = mix(super().__len__(), settings, lambda scan, rng: scan)  # type: ignore[misc]
-        self._length = len(self.mixed)
         self._check_boxes({*self.class_names, *known})
 
     def merge_all_iters_to_one_epoch(self, merge: bool = True, epochs: int | None = None) -> None:
@@ -69,7 +58,7 @@ class Mixed:
         # While OpenPCDet's own code works, it counts real scans.
         if self.mixed is None or self._current is not None:
             return int(super().__len__())  # type: ignore[misc]
-        return int(self._length)
+        return len(self.mixed)
 
     def __getitem__(self, index: int) -> Any:
         if self.mixed is None:

@@ -247,6 +247,10 @@ def test_other_versions_are_refused(version: str, monkeypatch: pytest.MonkeyPatc
         importlib.import_module(adapter.__name__)
 
 
+def test_a_schedule_keeps_the_length_of_epochs(made: Path) -> None:
+    assert len(build(made, RATIO=[0.2, 0.4])) == REAL + EXTRA
+
+
 def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(made: Path, tmp_path: Path) -> None:
     scans = [street(i) for i in range(4)]
     write_all("npz", tmp_path / "without", [replace(scan, boxes=None) for scan in scans])
@@ -264,8 +268,6 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(made: Path
         build(made, tmp_path / "some")
     with pytest.raises(DataError, match="no box of .'Car'., and there is no gt_sampling"):
         build(made, "bare", sampling=False)
-    with pytest.raises(ConfigError, match="epoch_size: replace"):
-        build(made, RATIO=[0.2, 0.4])
     calib = made / "kitti" / "training" / "calib" / "000002.txt"
     calib.rename(calib.with_suffix(".gone"))
     with pytest.raises(ConfigError, match="calib without 1 scans .000002"):
