@@ -16,6 +16,9 @@ if sys.platform == "win32":
     def _lock(file: BinaryIO, alone: bool) -> bool:
         return True
 
+    def _take(file: BinaryIO) -> bool:
+        return True
+
 else:
     import fcntl
 
@@ -25,6 +28,27 @@ else:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB if alone else fcntl.LOCK_SH)
             return True
         return False
+
+    def _take(file: BinaryIO) -> bool:
+        """Take the lock; False only if another process holds it, not where the file system has no locks."""
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+        return True
+
+
+@contextmanager
+def one_writer(path: Path) -> Iterator[bool]:
+    """Make a file and lock it until the block ends; yields False if another process holds the lock.
+
+    Raises:
+        OSError: if the file cannot be made.
+    """
+    with path.open("ab") as file:
+        yield _take(file)
 
 
 @contextmanager

@@ -4,13 +4,14 @@ A hostile file may declare huge sizes, depths or nested aliases. What it declare
 with a limit before memory is allocated, and every fault becomes an error of this package.
 """
 
+import hashlib
 import json
 import re
 import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from io import BytesIO
 from math import prod
 from pathlib import Path
@@ -86,6 +87,29 @@ def read_facts(path: Path, expected: str) -> dict[str, Any]:
     if not isinstance(facts, dict):
         raise DataError(f"{path} is damaged (it holds {type(facts).__name__})", expected)
     return facts
+
+
+def seal(values: Mapping[str, Any]) -> bytes:
+    """Values as JSON with a checksum; the inverse of ``read_sealed``."""
+    return json.dumps({**values, "checksum": _checksum(values)}).encode()
+
+
+def read_sealed(path: Path, expected: str) -> dict[str, Any]:
+    """Read the values that ``seal`` wrote.
+
+    Raises:
+        FileError: if the file cannot be read.
+        DataError: if it is damaged, or its checksum differs.
+    """
+    values = read_facts(path, expected)
+    if values.pop("checksum", None) != _checksum(values):
+        raise DataError(f"{path} is damaged (its checksum differs)", expected)
+    return values
+
+
+def _checksum(values: Mapping[str, Any]) -> str:
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()
 
 
 def read_yaml(path: Path, expected: str) -> Any:

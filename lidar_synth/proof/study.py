@@ -3,7 +3,8 @@
 import json
 import os
 import time
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -18,7 +19,7 @@ from lidar_synth.datasets.recordings import PLACES
 from lidar_synth.errors import DataError
 from lidar_synth.evaluate.leakage import seen_by
 from lidar_synth.files.disk import read_text, write_file
-from lidar_synth.files.parsing import parse_json
+from lidar_synth.files.parsing import parse_json, read_sealed, seal
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.formats.convert import in_processes
 from lidar_synth.formats.writer import claim
@@ -88,7 +89,7 @@ class Trainings:
             return False
         with _one_thread():
             outcome = run_trainer(self.trainer, self._job(row, pair))
-        write_file(self.path(row, pair), json.dumps(to_values(outcome)).encode())
+        write_file(self.path(row, pair), seal(to_values(outcome)))
         return True
 
     def _job(self, row: Row, pair: Pair) -> Job:
@@ -192,7 +193,9 @@ def prove(
     deadline = None if minutes is None else start + 60 * minutes
     work = Trainings(plan, loaded, out, Path(pools or out / POOLS), trainer, deadline)
     _make_pools(work, source, progress)
-    tasks = [(row, pair) for pair in plan.pairs for row in plan.rows if not work.path(row, pair).is_file()]
+    tasks = [
+        (row, pair) for pair in plan.pairs for row in plan.rows if not _is_there(work.path(row, pair), read_outcome)
+    ]
     _pretrain(work, tasks, progress)
     with in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
         for _ in tqdm(done, total=len(tasks), desc="trainings", disable=not progress):
@@ -216,7 +219,7 @@ def report(work: Trainings, trainer: str, seen: str = "") -> Proof:
     for pair in plan.pairs:
         paths = {row: work.path(row, pair) for row in plan.rows}
         if all(path.is_file() for path in paths.values()):
-            found[pair] = {row: from_values(read_text(path), path) for row, path in paths.items()}
+            found[pair] = {row: read_outcome(path) for row, path in paths.items()}
     if not found:
         raise DataError("no place with trainings of all arms", "at least one", "Give more --minutes.")
     costs = {row.key: _preparation(work, row) for row in plan.rows}
@@ -234,19 +237,33 @@ def to_values(outcome: Outcome) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def from_values(text: str, path: Path) -> Outcome:
-    """The inverse of ``to_values``.
+def read_outcome(path: Path) -> Outcome:
+    """The inverse of ``to_values``, from a sealed file.
 
     Raises:
+        FileError: if it cannot be read.
         DataError: on a damaged file.
     """
-    values = parse_json(text, str(path))
+    values = read_sealed(path, "the outcome of a training")
     try:
         table = np.array(values["table"], np.int64)
         curve = [(int(step), np.array(part, np.int64)) for step, part in values["curve"]]
         return Outcome(table, curve, [float(v) for v in values["losses"]], float(values["seconds"]))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{path} is damaged ({error!r})", "the outcome of a training", "Remove it.") from error
+
+
+def _is_there(path: Path, read: Callable[[Path], object]) -> bool:
+    """Whether a file is there and intact; a damaged one is set aside with a warning, to be made again."""
+    if not path.is_file():
+        return False
+    try:
+        read(path)
+    except DataError as error:
+        warnings.warn(f"{error}; it is made again", stacklevel=2)
+        path.replace(path.with_suffix(".damaged"))
+        return False
+    return True
 
 
 def _earlier(out: Path) -> dict[str, Any] | None:
@@ -278,7 +295,11 @@ def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
 
 def _pretrain(work: Trainings, tasks: Sequence[tuple[Row, Pair]], progress: bool) -> None:
     """Make the pretrained networks that the trainings begin with."""
-    needed = {path: task for task in tasks if (path := work.start(*task)) is not None and not path.is_file()}
+    needed = {
+        path: task
+        for task in tasks
+        if (path := work.start(*task)) is not None and not _is_there(path, pretraining_seconds)
+    }
     with in_processes(work.pretrain, list(needed.values()), min(work.plan.jobs, max(1, len(needed)))) as done:
         for _ in tqdm(done, total=len(needed), desc="pretraining", disable=not progress):
             pass

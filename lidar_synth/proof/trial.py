@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.optim.swa_utils import update_bn
@@ -23,6 +23,7 @@ from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.evaluate.segmentation import Images, confusion
 from lidar_synth.files.disk import write_file
+from lidar_synth.generate.checkpoint import weights_hash
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -188,13 +189,24 @@ def pretrain(job: Job, path: Path) -> None:
     mixed, _ = next(job.mixtures(collate="range"))
     _learn(network, job, stage, mixed, count, height)
     state = {name: value.contiguous() for name, value in network.state_dict().items()}
-    write_file(path, save(state, {SECONDS: str(time.monotonic() - start)}))
+    facts = {SECONDS: str(time.monotonic() - start), "weights": weights_hash(state)}
+    write_file(path, save(state, facts))
 
 
 def pretraining_seconds(path: Path) -> float:
-    """How long ``pretrain`` took for a file of its own."""
-    with safe_open(path, "pt") as file:
-        return float(file.metadata()[SECONDS])
+    """How long ``pretrain`` took for a file of its own.
+
+    Raises:
+        DataError: if the file is damaged.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            facts = file.metadata()
+        if facts["weights"] == weights_hash(load_file(path)):
+            return float(facts[SECONDS])
+    except (SafetensorError, LookupError, TypeError, ValueError) as error:
+        raise DataError(f"{path} is damaged ({error})", "a pretrained network") from error
+    raise DataError(f"{path} is damaged (the sum of its weights differs)", "a pretrained network")
 
 
 def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:

@@ -1,5 +1,6 @@
 """From a training configuration to what a run needs: networks, task, data and the header of the checkpoint."""
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 from tqdm import tqdm
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.flow.path import METRICS, balanced_velocity_loss, velocity_loss
 from lidar_synth.flow.solvers import towards, uniform_grid
 from lidar_synth.flow.timesteps import Selection, select_timesteps
@@ -245,7 +246,10 @@ def _selection(config: DistillConfig, velocity: Any, plan: TrainingPlan, acceler
     """The timesteps of the student; those of an earlier call with the same settings are reused."""
     path, settings = config.output / "selection.npz", selection_settings(config, plan.header)
     if path.exists():
-        return load_selection(path, settings)
+        try:
+            return load_selection(path, settings)
+        except DataError as error:
+            warnings.warn(f"{error}; the timesteps are selected again", stacklevel=2)
     conditions = open_data(config, plan, accelerator.device).conditions if plan.header.conditioning else None
     with accelerator.autocast():
         selection = select_timesteps(

@@ -24,6 +24,7 @@ import torch
 import yaml
 from tqdm import tqdm
 
+from lidar_synth.bake.lock import one_writer
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.files.disk import write_file
 from lidar_synth.generate.checkpoint import save_checkpoint
@@ -38,7 +39,7 @@ from lidar_synth.train.loop import Record, steps
 from lidar_synth.train.plan import TrainingPlan, make_plan, open_data
 from lidar_synth.train.precision import computed
 from lidar_synth.train.resume import check_parents, check_resumed
-from lidar_synth.train.state import STATE, Training
+from lidar_synth.train.state import STATE, Training, set_damaged_aside
 from lidar_synth.viz import write_view
 
 if TYPE_CHECKING:
@@ -73,8 +74,10 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
     if state.exists():
         if not resume:
             raise ConfigError(f"{config.output} holds a run", "--resume to continue it, or another output=FOLDER")
+        set_damaged_aside(config.output)
+    if state.exists():
         check_resumed(config)
-    with _accelerator(config) as accelerator:
+    with _accelerator(config) as accelerator, _lock(config, accelerator.is_main_process):
         plan = make_plan(config, accelerator)
         training = Training(plan.network.to(accelerator.device), config.recipe)
         if state.exists():
@@ -125,6 +128,25 @@ def _accelerator(config: Run) -> Iterator["Accelerator"]:
     finally:
         if not by_caller:
             AcceleratorState._reset_state()
+
+
+@contextmanager
+def _lock(config: Run, main: bool) -> Iterator[None]:
+    """Let one run at a time write to the output folder, and remove what a killed one was writing.
+
+    Raises:
+        ConfigError: if another run writes there.
+    """
+    if not main:
+        yield
+        return
+    config.output.mkdir(parents=True, exist_ok=True)
+    with one_writer(config.output / ".lock") as free:
+        if not free:
+            raise ConfigError(f"another run is training in {config.output}", "one at a time, or another output=FOLDER")
+        for part in config.output.glob(".*.part"):
+            part.unlink(missing_ok=True)
+        yield
 
 
 def checkpoint_path(config: Run) -> Path:

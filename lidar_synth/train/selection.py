@@ -2,16 +2,15 @@
 
 import json
 import warnings
-import zlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import write_arrays
+from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.flow.timesteps import Selection
 from lidar_synth.generate.checkpoint import Header
 from lidar_synth.train.config import DistillConfig
@@ -75,15 +74,15 @@ def load_selection(path: Path, settings: dict[str, Any]) -> Selection:
 
 def _read(path: Path) -> tuple[Selection, dict[str, Any] | None]:
     """A selection and its settings, which files of version 0.1.0 do not hold."""
+    values = read_arrays(path)
     try:
-        with np.load(path) as values:
-            found = Selection(
-                tuple(values["grid"].tolist()), float(values["cost"]), float(values["uniform_cost"]),
-                tuple(values["candidates"].tolist()), values["costs"], values["per_trajectory"],
-            )  # fmt: skip
-            return found, dict(json.loads(str(values["settings"]))) if "settings" in values else None
-    except (OSError, EOFError, KeyError, ValueError, TypeError, AttributeError, BadZipFile, zlib.error) as error:
-        raise DataError(f"{path} is damaged ({error})", "a selection of timesteps", "Remove it.") from error
+        found = Selection(
+            tuple(values["grid"].tolist()), float(values["cost"]), float(values["uniform_cost"]),
+            tuple(values["candidates"].tolist()), values["costs"], values["per_trajectory"],
+        )  # fmt: skip
+        return found, dict(parse_json(str(values["settings"]), str(path))) if "settings" in values else None
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise DataError(f"{path} is damaged ({error})", "a selection of timesteps") from error
 
 
 def _shown_by(selection: Selection) -> dict[str, Any]:

@@ -1,12 +1,14 @@
 """The state of a training run, and how it is saved for resumption.
 
 The file is safetensors like a checkpoint, but serves to resume, not to sample: it holds the network, the averaged
-weights, the optimiser's moments, the step and the seconds of training. Everything else is a function of the
+weights, the optimiser's moments, the step, the seconds of training and a checksum. Everything else is a function of the
 configuration and the step.
 """
 
 import copy
+import hashlib
 import time
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +23,7 @@ from torch import Tensor, nn
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import write_file
 from lidar_synth.flow.path import METRICS
+from lidar_synth.generate.checkpoint import weights_hash
 from lidar_synth.geometry.normalize import CHANNELS
 from lidar_synth.train.optimizers import OPTIMIZERS
 from lidar_synth.train.schedules import SCHEDULES
@@ -125,7 +128,8 @@ class Training:
             for i, moments in optimizer.state_dict()["state"].items():
                 tensors |= {f"optimizer.{k}.{i}.{n}": value for n, value in moments.items()}
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        write_file(path, save(tensors, {"step": str(self.step), "seconds": f"{self.seconds:.3f}"}))
+        facts = {"step": str(self.step), "seconds": f"{self.seconds:.3f}"}
+        write_file(path, save(tensors, facts | {"checksum": _checksum(facts, tensors)}))
 
     def load(self, path: Path) -> None:
         """Restore the state that ``save`` wrote.
@@ -134,14 +138,12 @@ class Training:
             FileError: where the file cannot be read.
             DataError: if it is not the state of such a run.
         """
-        with _opened(path) as file:
-            progress = _progress(file)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
+        progress, tensors = _read(path)
         parts: dict[str, dict[str, Any]] = {"network": {}, "average": {}, "optimizer": {}}
-        for name, tensor in tensors.items():
-            part, key = name.split(".", 1)
-            parts[part][key] = tensor
         try:
+            for name, tensor in tensors.items():
+                part, key = name.split(".", 1)
+                parts[part][key] = tensor
             self.network.load_state_dict(parts["network"])
             self.average.load_state_dict(parts["average"])
             moments: list[dict[int, dict[str, Tensor]]] = [{} for _ in self.optimizers]
@@ -150,7 +152,7 @@ class Training:
                 moments[int(which)].setdefault(int(number), {})[key] = tensor
             for optimizer, state in zip(self.optimizers, moments, strict=True):
                 optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-        except (RuntimeError, ValueError, IndexError) as error:
+        except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise DataError(f"{path} is the state of another network ({error})", "the same configuration") from error
         self.step, self.earlier = progress
         self.began = time.monotonic()
@@ -181,6 +183,36 @@ def read_progress(folder: Path) -> Progress:
         return _progress(file)
 
 
+def set_damaged_aside(folder: Path) -> None:
+    """Rename the state of a run if it is damaged, with a warning, so that the run begins anew.
+
+    Raises:
+        FileError: where the state cannot be read.
+    """
+    path = folder / STATE
+    try:
+        _read(path)
+    except DataError as error:
+        kept = path.with_suffix(".damaged")
+        warnings.warn(f"{error}. It is kept as {kept.name}, and the run begins anew", stacklevel=2)
+        path.replace(kept)
+
+
+def _read(path: Path) -> tuple[Progress, dict[str, Tensor]]:
+    """The progress and the tensors of a state, if they have the checksum that was written with them."""
+    with _opened(path) as file:
+        facts = dict(file.metadata())
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
+        expected = facts.pop("checksum", None)  # older states have none
+        if expected not in (None, _checksum(facts, tensors)):
+            raise ValueError("its checksum differs")
+        return _progress(file), tensors
+
+
+def _checksum(facts: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+    return hashlib.sha256(f"{sorted(facts.items())} {weights_hash(tensors)}".encode()).hexdigest()
+
+
 def _progress(file: Any) -> Progress:
     held = file.metadata()
     return Progress(int(held["step"]), float(held.get("seconds", 0.0)))  # older states have no seconds
@@ -193,5 +225,5 @@ def _opened(path: Path) -> Iterator[Any]:
             yield file
     except OSError as error:
         raise FileError(f"{path} cannot be read ({error})", "a saved state", "Start without --resume.") from error
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{path} is not a saved state ({error})", "state.safetensors of a run") from error

@@ -1,0 +1,189 @@
+"""What a run keeps to resume is sealed: damage is noticed, said, and that part is made again."""
+
+import shutil
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_scan
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from lidar_synth.bake.lock import one_writer
+from lidar_synth.errors import ConfigError, DataError, LidarSynthError
+from lidar_synth.files.parsing import read_sealed, seal
+from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.proof.study import _is_there, read_outcome, to_values
+from lidar_synth.proof.trial import Outcome
+from lidar_synth.train import TrainConfig, cache_latents, cache_scans, load_config, run
+from lidar_synth.train.state import STATE, Recipe, Training, read_progress
+
+SENSOR = Sensor("tiny", 32, 1.0, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+SCANS = [random_scan(SENSOR, 100, seed) for seed in range(130)]
+
+
+def flip(path: Path, at: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= 16
+    path.write_bytes(content)
+
+
+def cut(path: Path, at: int) -> None:
+    path.write_bytes(path.read_bytes()[:at])
+
+
+@pytest.mark.parametrize("damage", [flip, cut])
+@pytest.mark.parametrize("file", ["range.npy", "cache.json"])
+@pytest.mark.parametrize("at", [5, 200, -3])
+def test_a_damaged_cache_is_made_again(tmp_path: Path, damage: Callable[[Path, int], None], file: str, at: int) -> None:
+    made = np.array(cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False).fields["range"])
+    damage(tmp_path / file, at)
+    with pytest.warns(UserWarning, match="made again"):
+        again = cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False)
+    assert np.array_equal(again.fields["range"], made)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False)
+
+
+def test_only_the_damaged_scans_are_made_again(tmp_path: Path) -> None:
+    class Counted(list[Any]):
+        reads = 0
+
+        def __getitem__(self, index: Any) -> Any:
+            self.reads += 1
+            return super().__getitem__(index)
+
+    cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False)
+    flip(tmp_path / "range.npy", -3)  # of the last block: scans 128 and 129
+    counted = Counted(SCANS)
+    with pytest.warns(UserWarning, match=r"scans 128 to 191 are damaged"):
+        cache_scans(counted, SENSOR, ["range"], tmp_path, progress=False)
+    assert counted.reads == 2
+
+
+class Halves(nn.Module):
+    """A codec for tests: the tensor itself."""
+
+    shape = (1, 8, 32)
+
+    def encode(self, x: torch.Tensor) -> torch.Tensor:
+        return x
+
+
+@pytest.mark.parametrize("damage", [flip, cut])
+@pytest.mark.parametrize("suffix", [".npy", ".json"])
+def test_damaged_latents_are_made_again(tmp_path: Path, damage: Callable[[Path, int], None], suffix: str) -> None:
+    cache = cache_scans(SCANS[:3], SENSOR, ["range"], progress=False)
+    tensors = TensorFormat(("range",), NORMALISATIONS["r2flow"])
+    codec: Any = Halves()
+    made = np.array(cache_latents(cache, tensors, codec, "cpu", tmp_path, "abc", progress=False))
+    [path] = tmp_path.glob(f"latents-*{suffix}")
+    damage(path, 30)
+    with pytest.warns(UserWarning, match="latents are made again"):
+        again = cache_latents(cache, tensors, codec, "cpu", tmp_path, "abc", progress=False)
+    assert np.array_equal(again, made)
+
+
+def training() -> Training:
+    torch.manual_seed(0)
+    made = Training(nn.Linear(4, 3), Recipe(iterations=5))
+    made.network(torch.ones(1, 4)).sum().backward()
+    for optimizer in made.optimizers:
+        optimizer.step()
+    return made
+
+
+def test_no_flipped_bit_of_a_state_is_resumed(tmp_path: Path) -> None:
+    """Every damaged state is refused, or (damage between the tensors' bytes) holds the same."""
+    path = tmp_path / STATE
+    made = training()
+    made.step = 3
+    made.save(path)
+    content, expected, rng = path.read_bytes(), load_file(path), Random(0)
+    refused = 0
+    other = training()
+    for _ in range(200):
+        changed = bytearray(content)
+        changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
+        path.write_bytes(changed)
+        try:
+            other.load(path)
+        except LidarSynthError:
+            refused += 1
+            continue
+        assert other.step == 3
+        assert all(torch.equal(expected[f"network.{n}"], p) for n, p in other.network.state_dict().items())
+    assert refused > 180
+
+
+@pytest.mark.parametrize(
+    "name", ["x", "network", "network.weight", "optimizer.a.b.c", "optimizer.0.0", "optimizer.9.0.step"]
+)
+def test_a_state_with_other_names_is_refused(tmp_path: Path, name: str) -> None:
+    path = tmp_path / STATE
+    save_file({name: torch.ones(3)}, path, {"step": "1"})
+    with pytest.raises(DataError, match=r"is the state of another network"):
+        training().load(path)
+    save_file({"network.weight": torch.ones(3)}, path)
+    with pytest.raises(DataError, match="not a saved state"):
+        read_progress(tmp_path)
+
+
+def test_outcomes_are_sealed(tmp_path: Path) -> None:
+    path = tmp_path / "0-000.json"
+    outcome = Outcome(np.arange(361).reshape(19, 19), [(1, np.eye(19, dtype=np.int64))], [0.5], 2.0)
+    path.write_bytes(seal(to_values(outcome)))
+    assert np.array_equal(read_outcome(path).table, outcome.table)
+    assert _is_there(path, read_outcome)
+    content, rng = path.read_bytes(), Random(0)
+    for _ in range(300):
+        changed = bytearray(content)
+        changed[rng.randrange(len(changed))] = rng.randrange(32, 127)
+        path.write_bytes(changed)
+        if changed != content:
+            with pytest.raises(DataError):
+                read_outcome(path)
+    with pytest.warns(UserWarning, match="made again"):
+        assert not _is_there(path, read_outcome)
+    assert not path.exists()
+    path.write_bytes(seal({"table": "x"}))
+    with pytest.raises(DataError, match="is damaged"):
+        read_outcome(path)
+
+
+def test_sealed_values_are_read_back(tmp_path: Path) -> None:
+    values = {"a": [1, 2.5, None], "ü": "\ud800"}
+    (tmp_path / "a.json").write_bytes(seal(values))
+    assert read_sealed(tmp_path / "a.json", "values") == values
+
+
+def tiny(out: Path) -> TrainConfig:
+    changes = ["recipe.iterations=2", "recipe.batch=1", "data.town=2", "samples.every=0", "save_every=1"]
+    return load_config(TrainConfig, "town_tiny", [*changes, f"output={out}"])
+
+
+def test_a_run_with_a_damaged_state_begins_anew_and_says_so(tmp_path: Path) -> None:
+    expected = load_file(run(tiny(tmp_path / "run")))
+    flip(tmp_path / "run" / STATE, -100)
+    shutil.copy(tmp_path / "run" / STATE, tmp_path / "damaged")
+    (tmp_path / "run" / ".state.safetensors.12345678.part").write_bytes(b"of a killed run")
+    with pytest.warns(UserWarning, match="begins anew"):
+        found = load_file(run(tiny(tmp_path / "run"), resume=True))
+    assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
+    assert (tmp_path / "run" / "state.damaged").read_bytes() == (tmp_path / "damaged").read_bytes()
+    assert not list((tmp_path / "run").glob(".*.part"))
+
+
+def test_a_second_run_in_the_same_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    with one_writer(tmp_path / "run" / ".lock") as free:
+        assert free
+        with pytest.raises(ConfigError, match=r"another run is training in"):
+            run(tiny(tmp_path / "run"))
