@@ -6,13 +6,15 @@ from typing import Annotated
 import typer
 
 
+_ARMS = "a training to compare, repeatable [exchange, pretrain, pretrain-generator]"
+
+
 def prove(
     root: Annotated[Path, typer.Argument(metavar="ROOT", help="labelled scans, in any layout that is read")],
     out: Annotated[Path, typer.Option(help="folder of the page and of all that is needed to resume")] = Path("proof"),
     minutes: Annotated[float | None, typer.Option(min=1, help="limit of the time [none]")] = None,
     labelled: Annotated[int | None, typer.Option(min=1, help="labelled scans of a training [all, at most 200]")] = None,
-    arm: Annotated[list[str] | None, typer.Option(help="a training to compare, repeatable [exchange, pretrain]")]
-    = None,
+    arm: Annotated[list[str] | None, typer.Option(help=_ARMS)] = None,
     ratio: Annotated[list[float] | None, typer.Option(help="share of synthetic scans, repeatable [0.5]")] = None,
     iterations: Annotated[int, typer.Option(min=10, help="of each training; fewer if --minutes is short")] = 1000,
     batch: Annotated[int, typer.Option(min=1, help="scans of an iteration")] = 4,

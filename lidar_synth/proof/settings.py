@@ -41,7 +41,7 @@ class ProofSettings:
     """
 
     labelled: int | None = None
-    arms: tuple[str, ...] = ("exchange", "pretrain")
+    arms: tuple[str, ...] = ("exchange", "pretrain", "pretrain-generator")
     ratios: tuple[float, ...] = (0.5,)
     iterations: int = 1000
     batch: int = 4
