@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-
 _ARMS = "a training to compare, repeatable [exchange, pretrain, pretrain-generator]"
 
 
