@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Protocol, overload
+from weakref import WeakKeyDictionary
 
 from torch.utils.data import Sampler
 
@@ -16,6 +17,9 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, Position
 from lidar_synth.mixing.quotas import Mixture
 from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state, make_state, place
+
+_PASSED: WeakKeyDictionary[Any, dict[int, tuple[int, int]]] = WeakKeyDictionary()
+"""By dataset and rank: epoch and position where the latest complete pass began, also of a sampler made for it alone."""
 
 AHEAD = 1 << 20
 """Number of positions that are announced at a time to a source that works ahead."""
@@ -147,7 +151,6 @@ class MixedBatches(Sampler[list[int]]):
         self._by_default = rank is None
         self._start = (0, 0)  # epoch and position of the loaded state
         self._taken = (0, 0)  # epoch, and number of its batches taken so far
-        self._passed: tuple[int, int] | None = None  # epoch and position where the latest complete pass began
         self._warned = False
         self._fetched = (0, 0)  # samples that the dataset fetched before the latest complete pass, and in that pass
 
@@ -161,7 +164,7 @@ class MixedBatches(Sampler[list[int]]):
         steps, epoch = self._steps(), self.dataset.epoch
         if steps and len(steps[-1]) < self.world_size:
             warnings.warn(f"{len(steps[-1])} samples left for {self.world_size} ranks: some get none", stacklevel=2)
-        if self._passed == (epoch, steps.start) and not self._warned:
+        if _PASSED.get(self.dataset, {}).get(self.rank) == (epoch, steps.start) and not self._warned:
             self._warned = True
             warnings.warn(REPEATED.format(epoch), stacklevel=2)
         before, yielded = self._fetched
@@ -208,7 +211,8 @@ class MixedBatches(Sampler[list[int]]):
             ConfigError: on an invalid state, or one of another mixture.
         """
         self._start = checked_state(state, self.dataset.mixture)
-        self._taken, self._passed = (0, 0), None
+        self._taken = (0, 0)
+        _PASSED.get(self.dataset, {}).pop(self.rank, None)
         go_to(self.dataset, *self._start)
 
     def _batches(self, epoch: int, steps: CutSteps) -> Iterator[list[int]]:
@@ -222,7 +226,8 @@ class MixedBatches(Sampler[list[int]]):
                 number, yielded = number + 1, yielded + len(share)
                 self._taken = (epoch, number)
                 yield [Position(position, epoch) for position in share]
-        self._passed, self._fetched = (epoch, steps.start), (before, yielded)
+        _PASSED.setdefault(self.dataset, {})[self.rank] = (epoch, steps.start)
+        self._fetched = (before, yielded)
 
     def divide(self, rank: int, world_size: int) -> None:
         """Change the rank of this process and the number of ranks, before iterating."""

@@ -1,24 +1,91 @@
-"""Messages about objects without boxes, which would harm a detector; each is logged once per dataset."""
+"""Messages about what would harm a training without an error; each is logged once per dataset.
+
+Objects without boxes, unlabelled real scans, numbers of points that tell real from synthetic, a bank used very often.
+"""
 
 import logging
+from statistics import median
 
 from torch.utils.data import get_worker_info
 
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.labels.edit import measure
+from lidar_synth.mixing.plan import MixingPlan
 
 log = logging.getLogger(__name__)
 
 
-class Notices:
-    """Watches the scans of a mixture; only the main process and the first worker log."""
+OTHER_SIZE = 1.5
+"""Ratio of the numbers of points of real and synthetic scans that is reported."""
 
-    def __init__(self) -> None:
+FEW = 4
+"""Number of scans of each kind whose points are counted before the numbers are compared."""
+
+OFTEN = 4
+"""Number of times that an epoch may use a synthetic scan without a warning."""
+
+
+def report_repeats(plan: MixingPlan) -> None:
+    """Log a warning for each synthetic source whose scans come very often in an epoch."""
+    sources = zip(plan.mixture.synthetic, plan.counts[plan.reals :], strict=True)
+    for source, count in sources:
+        if source.length is not None and count > OFTEN * source.length:
+            log.warning(
+                "the %d scans of a synthetic source (%s) come %.0f times each in an epoch: a network learns them by "
+                "heart. Bake more (lidar-synth bake OUT --count %d), use a generator, or a lower ratio.",
+                source.length, source.identity[:40], count / source.length, count // OFTEN,
+            )  # fmt: skip
+
+
+class Notices:
+    """Watches the scans of a mixture; only the main process and the first worker log.
+
+    Args:
+        images: whether batches are range images, in which the number of points has no meaning.
+    """
+
+    def __init__(self, images: bool = False) -> None:
         self._real_boxes = self._told = False
+        self._unlabelled: str | None = None  # a real scan without labels
+        self._labelled = False  # whether a synthetic scan had labels
+        self._images = images
+        self._sizes: tuple[list[int], list[int]] = ([], [])  # points of real and of synthetic scans
 
     def real(self, scan: Scan) -> None:
-        """Note whether real scans have boxes."""
+        """Note whether real scans have boxes and labels, and their numbers of points."""
         self._real_boxes = self._real_boxes or scan.boxes is not None
+        if self._unlabelled is None and (scan.label is None or not (scan.label != IGNORE).any()):
+            self._unlabelled = scan.id
+        self._count(0, scan)
+
+    def _count(self, kind: int, scan: Scan) -> None:
+        """Compare the numbers of points of the first scans, and labelled synthetic scans with unlabelled real ones."""
+        if self._labelled and self._unlabelled is not None:
+            self._warn(
+                "real scan %r has no labels: all its points are 255 = ignore, and only synthetic scans teach classes. "
+                "Open labelled scans (lidar-synth label kitti360 makes labels of KITTI-360), or leave it out.",
+                self._unlabelled,
+            )
+            self._labelled = False
+            self._unlabelled = ""  # so that it is told once
+        if self._images or len(self._sizes[kind]) >= FEW:
+            return
+        self._sizes[kind].append(len(scan))
+        real, synthetic = self._sizes
+        if len(real) == len(synthetic) == FEW:
+            ours, theirs = median(synthetic), median(real)
+            if max(ours, theirs) > OTHER_SIZE * min(ours, theirs):
+                self._warn(
+                    "a real scan has %d points, a synthetic one %d, on the same nominal grid: the density tells them "
+                    "apart. Use a model of that density (town-dense), as_sensor=, or collate='range'.",
+                    theirs, ours,
+                )  # fmt: skip
+
+    def _warn(self, message: str, *values: object) -> None:
+        worker = get_worker_info()
+        if worker is None or worker.id == 0:
+            log.warning(message, *values)
 
     def synthetic(self, given: Scan, scan: Scan) -> None:
         """Report the unboxed objects of a synthetic scan, or that synthetic scans have no boxes where real ones do.
@@ -27,6 +94,9 @@ class Notices:
             given: the scan before its label policy.
             scan: the scan with the labels and boxes of the policy.
         """
+        if scan.label is not None and self._unlabelled != "":
+            self._labelled = self._labelled or bool((scan.label != IGNORE).any())
+        self._count(1, scan)
         if self._told or (scan.boxes is None and not self._real_boxes):
             return
         self._told = True

@@ -20,7 +20,7 @@ from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
 from lidar_synth.mixing.epochs import CurrentEpoch, Position
 from lidar_synth.mixing.items import copy_scan, to_item
-from lidar_synth.mixing.notices import Notices
+from lidar_synth.mixing.notices import Notices, report_repeats
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
 from lidar_synth.mixing.schedules import Schedule, make_schedule, to_integer
@@ -140,7 +140,7 @@ class MixedScans(Dataset[Any]):
         rings = frozenset() if target is None else frozenset({"ring"})
         self._policies = [make_policy(labels, real=scans, fields=s.fields | rings, **options) for s in self.synthetic]
         self._without_unboxed = make_handling(unboxed) if isinstance(unboxed, str) else unboxed
-        self._notices = Notices()
+        self._notices = Notices(images=collate == "range")
         self._augment, self._augment_real = augment, augment_real
         self._to_sample, self._real_as_is = to_sample, real_as_is
         if isinstance(collate, str):
@@ -149,6 +149,7 @@ class MixedScans(Dataset[Any]):
         self.current = CurrentEpoch()
         self._planned: tuple[int, MixingPlan] | None = None
         self.set_epoch(0)
+        report_repeats(MixingPlan(self.mixture, 0))
         if real_as_is and compare:
             check_alike(self.real, self.synthetic, self._finish)
 

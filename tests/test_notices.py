@@ -1,0 +1,86 @@
+"""What would harm a training without an error is logged once."""
+
+import logging
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mixtures import SENSOR, Endless, Scans, as_is
+from torch.utils.data import DataLoader
+
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.mixing import MixedScans
+
+
+class Dense(Scans):
+    """Real scans with twice the points of synthetic ones."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__("r", count)
+        self[:] = [twice(scan) for scan in self]
+
+
+def twice(scan: Scan) -> Scan:
+    fields = {name: np.concatenate([values, values]) for name, values in scan.fields().items()}
+    return replace(scan, points=np.concatenate([scan.points, scan.points]), **fields)
+
+
+def logged(train: MixedScans, caplog: pytest.LogCaptureFixture) -> list[str]:
+    for epoch in range(2):
+        train.set_epoch(epoch)
+        for i in range(len(train)):
+            train[i]
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def test_another_density_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    [message] = logged(MixedScans(Dense(12), Endless(), 0.5), caplog)
+    assert "a real scan has" in message and "town-dense" in message
+
+
+@pytest.mark.parametrize("collate", ["offsets", "range"])
+def test_a_like_density_or_range_images_are_not_reported(collate: str, caplog: pytest.LogCaptureFixture) -> None:
+    real = Dense(12) if collate == "range" else Scans("r", 12)
+    assert not logged(MixedScans(real, Endless(), 0.5, collate=collate), caplog)  # type: ignore[arg-type]
+
+
+def test_a_tiny_bank_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    MixedScans(Scans("r", 28), Scans("s", 6), 0.9)
+    assert "the 6 scans of a synthetic source" in caplog.text and "come 42 times each" in caplog.text
+    caplog.clear()
+    MixedScans(Scans("r", 28), Scans("s", 6), 0.4)
+    MixedScans(Scans("r", 28), Endless(), 0.9)
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_unlabelled_real_scans_are_reported_once(ignored: bool, caplog: pytest.LogCaptureFixture) -> None:
+    real = Scans("r", 12)
+    for i in (3, 5):
+        real[i] = replace(real[i], label=np.full(len(real[i]), 255, np.uint8) if ignored else None)
+    messages = logged(MixedScans(real, Endless(), 0.5), caplog)
+    assert len(messages) == 1 and "has no labels" in messages[0] and "lidar-synth label kitti360" in messages[0]
+
+
+def test_unlabelled_real_scans_in_an_unlabelled_mixture_are_not(caplog: pytest.LogCaptureFixture) -> None:
+    real = Scans("r", 12)
+    real[:] = [replace(scan, label=None) for scan in real]
+    assert not logged(MixedScans(real, Endless(), 0.5, labels="none"), caplog)
+
+
+def test_a_sampler_made_anew_for_each_epoch_does_not_hide_a_repetition() -> None:
+    train = MixedScans(Scans("r", 4), Endless(), 0.5, to_sample=as_is)
+    assert train.synthetic[0].sensor == SENSOR
+
+    def run_epoch() -> None:
+        for _ in DataLoader(train, batch_sampler=train.batches(2), collate_fn=list):
+            pass
+
+    run_epoch()
+    with pytest.warns(UserWarning, match="epoch 0 begins again"):
+        run_epoch()
+    train.set_epoch(1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run_epoch()
