@@ -20,6 +20,7 @@ from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, shorten
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
+from lidar_synth.formats.as_sensor import read_transfer
 from lidar_synth.generate.generator import load_generator
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
@@ -102,6 +103,7 @@ def mix(real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.ra
         raise ConfigError("a mixture without synthetic scans", "synthetic: a bank's folder, a checkpoint or a folder")
     options = {key: value for key, value in settings.items() if key != "synthetic"}
     synthetic = open_synthetic(settings["synthetic"])
+    options["as_sensor"] = read_transfer(settings.get("as_sensor"), synthetic)
     return MixedScans.wrap(range(real), synthetic, to_sample=to_sample, compare=False, **options)  # numbers, no samples
 
 

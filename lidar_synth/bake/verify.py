@@ -161,6 +161,12 @@ def job_of(facts: Facts, model: str | None = None) -> BakeJob:
     Raises:
         DataError: if the facts hold no valid settings.
     """
+    if "as_sensor" in facts.settings:
+        raise DataError(
+            f"scans of {facts.model!r} that were turned into scans of {facts.sensor.name!r}",
+            "scans as their model made them",
+            "Run lidar-synth bank as-sensor again: it makes again what is damaged. --deep checks the original bank.",
+        )
     stored = {"compression": facts.compression, "layout": facts.layout, "fields": facts.fields}
     try:
         return BakeJob(**facts.settings | stored, model=model or facts.model)

@@ -163,7 +163,42 @@ def head(
     typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
 
 
-bank = typer.Typer(name="bank", help="Makes new banks from existing ones: merge, split, head.", no_args_is_help=True)
+def as_sensor(
+    bank: BankFolder,
+    out: Out,
+    sensor: Annotated[str, typer.Option(help="sensor of the new bank: a preset or a YAML file")],
+    mount: Annotated[
+        str | None, typer.Option(metavar="Z,PITCH", help="metres higher, degrees looking further down [0,0]")
+    ] = None,
+    like: Annotated[Path | None, typer.Option(help="real scans of that sensor, to match its reflectance")] = None,
+    range_noise: Annotated[float, typer.Option(help="metres, noise beyond that of the bank")] = 0.0,
+    reach: Annotated[
+        float | None, typer.Option(help="metres at which it loses every second ray to a surface of 10 % reflectance")
+    ] = None,
+) -> None:
+    """Makes a bank of the scans as another sensor would have recorded them, once instead of in every epoch.
+
+    Run it again to resume an interrupted run, or to make damaged shards again.
+
+    \b
+    Example:
+      lidar-synth bank as-sensor bank as_hdl32e --sensor hdl32e_nuscenes --like nuscenes
+    """
+    from lidar_synth.bake.as_sensor import turn_bank
+    from lidar_synth.bank import Bank
+    from lidar_synth.cli.convert import read_mount
+    from lidar_synth.formats.as_sensor import make_transfer
+
+    source = Bank(bank)
+    transfer = make_transfer(sensor, read_mount(mount), like, source, range_noise=range_noise, reach=reach)
+    index = turn_bank(source, out, transfer)
+    typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
+
+
+bank = typer.Typer(
+    name="bank", help="Makes new banks from existing ones: merge, split, head, as-sensor.", no_args_is_help=True
+)
 bank.command("merge")(merge)
 bank.command("split")(split)
 bank.command("head")(head)
+bank.command("as-sensor")(as_sensor)

@@ -9,7 +9,6 @@ import typer
 if TYPE_CHECKING:
     from lidar_synth.formats import ScanFiles
     from lidar_synth.formats.convert import Report
-    from lidar_synth.geometry.scan import Scan
 
 
 Source = Annotated[Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")]
@@ -126,32 +125,22 @@ def _change(
 ) -> Any:
     """What ``--as-sensor`` and its options do to the scans; None without it."""
     from lidar_synth.errors import ConfigError
-    from lidar_synth.formats import open_scans
-    from lidar_synth.formats.as_sensor import AsSensor
-    from lidar_synth.geometry.sensor import load_sensor
-    from lidar_synth.geometry.transfer import Measurement, Response, Transfer
+    from lidar_synth.formats.as_sensor import AsSensor, make_transfer
 
     if as_sensor is None:
         given = {k: v for k, v in {"mount": mount, "sweeps": sweeps, "like": like, **how}.items() if v}
         if given:
             raise ConfigError(f"{', '.join(given)} without --as-sensor", "the sensor that the scans are turned into")
         return None
-    target = load_sensor(as_sensor)
-    response = None if like is None else Response.match(_some(scans), _some(open_scans(like, sensor=target)))
-    return AsSensor(Transfer(target, _mount(mount), Measurement(**how, response=response)), sweeps)
+    return AsSensor(make_transfer(as_sensor, read_mount(mount), like, scans, **how), sweeps)
 
 
-def _mount(text: str | None) -> Any:
+def read_mount(text: str | None) -> tuple[float, float]:
+    """Metres and degrees of the text Z,PITCH."""
     from lidar_synth.errors import ConfigError
-    from lidar_synth.geometry.transfer import Mount
 
     try:
         z, pitch = map(float, (text or "0,0").split(","))
     except ValueError:
         raise ConfigError(f"--mount {text}", "metres and degrees, for instance 0.1,0") from None
-    return Mount(z, pitch)
-
-
-def _some(scans: "ScanFiles") -> "list[Scan]":
-    """Ten scans spread over a source."""
-    return [scans.load(i) for i in sorted({round(k * (len(scans) - 1) / 9) for k in range(10)})]
+    return z, pitch

@@ -1,12 +1,16 @@
 """The scans of a source as another sensor would have recorded them, with what files need beside the scan."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.geometry.transfer import Mount, Transfer, Transferred
+from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.geometry.transfer import Measurement, Mount, Response, Transfer, Transferred
 from lidar_synth.noise import keyed_rng
 
 _SURFACE = 0.1  # metres that returns stick out of their box
@@ -73,3 +77,61 @@ class AsSensor:
 
 def _sequence(source: Source, index: int) -> str:
     return source.ids[index].rpartition("/")[0] if isinstance(source, ScanFiles) else ""
+
+
+def make_transfer(
+    sensor: str, mount: tuple[float, float], like: str | Path | None, scans: Any, **measured: Any
+) -> Transfer:
+    """The transfer of scans to a sensor.
+
+    Args:
+        sensor: a preset's name or a YAML file.
+        mount: metres higher, degrees looking further down.
+        like: real scans of that sensor, in any layout, whose distribution of reflectance the transfer gives.
+        scans: the scans that will be turned: by index, or of a generator.
+        measured: other arguments of ``Measurement``.
+
+    Raises:
+        ConfigError, FileError, DataError: on a sensor, a mount or scans that there cannot be.
+    """
+    from lidar_synth.formats import open_scans
+
+    target = load_sensor(sensor)
+    response = None
+    if like is not None:
+        response = Response.match(_some(scans), _some(open_scans(like, sensor=target)))
+    return Transfer(target, Mount(*mount), Measurement(**measured, response=response))
+
+
+def read_transfer(given: Any, scans: Any) -> Any:
+    """What the setting ``as_sensor`` of a configuration stands for.
+
+    Args:
+        given: ``{"sensor": NAME, "mount": [Z, PITCH], "like": FOLDER}``, of which only the sensor is required; anything
+            else is returned unchanged.
+        scans: as in ``make_transfer``.
+
+    Raises:
+        ConfigError: on other keys or values.
+        FileError, DataError: as ``make_transfer``.
+    """
+    if not isinstance(given, Mapping):
+        return given
+    values = {"mount": (0.0, 0.0), "like": None} | {str(key).lower(): value for key, value in given.items()}
+    mount = values["mount"]
+    numbers = isinstance(mount, list | tuple) and [type(v) in (int, float) for v in mount] == [True, True]
+    if values.keys() != {"sensor", "mount", "like"} or not isinstance(values["sensor"], str) or not numbers:
+        raise ConfigError(
+            f"as_sensor: {dict(given)}",
+            "sensor: a preset's name or a YAML file; optionally mount: [metres higher, degrees down], like: a "
+            "folder of real scans",
+        )
+    return make_transfer(values["sensor"], tuple(mount), values["like"], scans)
+
+
+def _some(scans: Any) -> list[Scan]:
+    """Ten scans spread over a source; the first four of a generator."""
+    if hasattr(scans, "range_images"):
+        return list(scans.scans(0, list(range(4))))
+    numbers = sorted({round(k * (len(scans) - 1) / 9) for k in range(10)})
+    return [scans.load(i) if isinstance(scans, ScanFiles) else scans[i] for i in numbers]

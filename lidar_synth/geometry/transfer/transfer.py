@@ -1,5 +1,6 @@
 """``Transfer``: what another sensor on another mount would have recorded of the same scene."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
@@ -19,6 +20,8 @@ from lidar_synth.geometry.transfer.returns import Measurement, gather_hits, plac
 from lidar_synth.geometry.transfer.surfaces import Surfaces, estimate
 from lidar_synth.geometry.transfer.sweeps import moved
 from lidar_synth.noise import keyed_rng
+
+log = logging.getLogger(__name__)
 
 SECTORS = 360
 """Sectors of azimuth, in which a scan has returns where its sensor looked."""
@@ -90,6 +93,7 @@ class Transfer:
         """
         rays, rng = rays_of(self.target), rng or keyed_rng(0)
         surfaces = estimate(self._without_vehicle(scan))
+        _warn_of_differences(scan.sensor, self.target, self.mount.pitch, self.measurement.response is None)
         seen = _seen(surfaces, self.target, self.mount)
         upright = self.mount.matrix[2, :3]
         hits = first_hits(surfaces, self.mount.points(surfaces.scan.points), rays, upright)
@@ -181,6 +185,26 @@ class SeenAs:
 
     def __getitem__(self, index: int) -> Scan:
         return self.transfer(self.source[index], keyed_rng(self.seed, index % len(self)))
+
+
+@lru_cache(maxsize=256)
+def _warn_of_differences(given: Sensor, target: Sensor, pitch: float, unmatched: bool) -> None:
+    """Say once what scans of the target will lack: lasers outside the field of view, and its own reflectance."""
+    if given.name == target.name:
+        return
+    elevation = np.degrees(target.optics()[0]) - pitch
+    seen = np.degrees(given.optics()[0])
+    blind = int(((elevation < seen.min() - 0.5) | (elevation > seen.max() + 0.5)).sum())
+    lacks = []
+    if blind:
+        lacks.append(
+            f"{blind} of its {len(elevation)} lasers look outside the recorded {seen.min():.1f} to {seen.max():.1f} "
+            "degrees and return nothing"
+        )
+    if unmatched:
+        lacks.append("reflectance is the recording sensor's (like=FOLDER or --like matches it to real scans)")
+    if lacks:
+        log.warning("scans of %r as %r: %s", given.name, target.name, "; ".join(lacks))
 
 
 def _seen(surfaces: Surfaces, target: Sensor, mount: Mount) -> float:
