@@ -1,8 +1,9 @@
 """A web server for files with support for byte ranges, which records its requests."""
 
 import re
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -18,12 +19,20 @@ class Served:
         ranges: whether it supports byte ranges.
         requests: (file, size of the response body), in order.
         broken: names of files for which it responds with status 500.
+        busy: it responds with status 503 to one of this many requests; 0 = never.
+        endless: names of files that have no end.
+        silent: names of files for which it never responds.
+        moved: {name of a file: URL to which it redirects}.
     """
 
     url: str = ""
     ranges: bool = True
     requests: list[tuple[str, int]] = field(default_factory=list)
     broken: set[str] = field(default_factory=set)
+    busy: int = 0
+    endless: set[str] = field(default_factory=set)
+    silent: set[str] = field(default_factory=set)
+    moved: dict[str, str] = field(default_factory=dict)
 
     @property
     def bytes(self) -> int:
@@ -41,6 +50,18 @@ def serve(root: Path) -> Iterator[Served]:
         def do_GET(self) -> None:
             path = root / self.path.lstrip("/")
             name = path.name
+            if served.busy and len(served.requests) % served.busy == served.busy - 1:
+                self._answer(503, b"", {})
+                return
+            if name in served.moved:
+                self._answer(302, b"", {"Location": served.moved[name]})
+                return
+            if name in served.silent:
+                time.sleep(3)
+                return
+            if name in served.endless:
+                self._stream()
+                return
             if name in served.broken or not path.is_file():
                 self._answer(500 if name in served.broken else 404, b"", {})
                 return
@@ -54,6 +75,14 @@ def serve(root: Path) -> Iterator[Served]:
                 return
             part = content[first : last + 1]
             self._answer(206, part, {"Content-Range": f"bytes {first}-{first + len(part) - 1}/{len(content)}"})
+
+        def _stream(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.close_connection = True
+            with suppress(OSError):  # the client has had enough
+                while True:
+                    self.wfile.write(bytes(1 << 20))
 
         def do_HEAD(self) -> None:
             path = root / self.path.lstrip("/")

@@ -274,3 +274,13 @@ def test_a_deeply_nested_index_is_refused(tmp_path: Path) -> None:
 def test_a_bank_of_this_sensor_is_read(tmp_path: Path) -> None:
     write_bank(tmp_path, [some_image(i, SENSOR) for i in range(3)])
     use(tmp_path)
+
+
+def test_cards_show_markup_as_text(tmp_path: Path) -> None:
+    evil = '<img src=x onerror="alert(1)"> | [x](javascript:y) `z`\n# title'
+    write_bank(tmp_path / "bank", [some_image()], provenance={"licence": evil, "data": evil})
+    card = dataset_card(evil, Bank(tmp_path / "bank").index)
+    body = card.split("---\n", 2)[2]
+    assert "<img" not in body and "[x](" not in body.replace("\\[", "")
+    assert all(line.count("|") - line.count("\\|") == 3 for line in body.splitlines() if line.startswith("| "))
+    assert body.count("\n# ") == 1

@@ -1,5 +1,6 @@
 """Banks at a URL: what is read over a network, and the errors when that fails."""
 
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -13,10 +14,11 @@ from hypothesis import given, settings
 from servers import Served, serve
 from torch.utils.data import DataLoader
 
+import lidar_synth.bank.storage as storage
 import lidar_synth.bank.writer as writer
 from lidar_synth.bank import Bank
 from lidar_synth.bank.shard import _GAP, _side_by_side
-from lidar_synth.bank.storage import LocalFile, View
+from lidar_synth.bank.storage import LocalFile, RemoteFile, View
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.sensor import load_sensor
@@ -89,8 +91,51 @@ def test_a_server_without_ranges_is_refused(served: Served) -> None:
         Bank(f"{served.url}/bank").image(0)
 
 
-def test_a_failed_request_is_not_reported_as_damage(served: Served, tmp_path: Path) -> None:
+def test_a_busy_server_costs_no_scan(served: Served, tmp_path: Path) -> None:
+    served.busy = 20
+    near = Bank(tmp_path / "bank")
+    for _ in range(8):
+        far = Bank(f"{served.url}/bank")
+        assert all(np.array_equal(far.image(i).range, near.image(i).range) for i in range(5))
+    assert len(served.requests) > 60
+
+
+def test_a_silent_server_is_left_after_the_time_limit(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(storage, "PATIENCE", 0.5)
+    served.silent.add("index.json")
+    start = time.monotonic()
+    with pytest.raises(FileError, match=r"index.json cannot be read"):
+        Bank(f"{served.url}/bank")
+    assert time.monotonic() - start < 2
+
+
+def test_an_endless_index_is_refused_within_limits(served: Served) -> None:
+    served.endless.add("index.json")
+    with pytest.raises(DataError, match=r"index.json is longer than 1000000 bytes"):
+        RemoteFile(f"{served.url}/bank/index.json").read_all(1_000_000)
+
+
+def test_redirects_end(served: Served) -> None:
+    served.moved["index.json"] = f"{served.url}/bank/index.json"
+    with pytest.raises(FileError, match=r"index.json cannot be read"):
+        Bank(f"{served.url}/bank")
+    served.moved = {"moved": f"{served.url}/bank/index.json"}
+    assert RemoteFile(f"{served.url}/bank/moved").read_all() == RemoteFile(f"{served.url}/bank/index.json").read_all()
+
+
+@pytest.mark.parametrize(
+    "url", ["reference://a", "jupyter://a", "zip://a::http://b", "simplecache::http://a", "ftp://a"]
+)
+def test_other_kinds_of_urls_are_refused(url: str) -> None:
+    with pytest.raises(FileError, match=r"with scheme .*expected one of abfs"):
+        Bank(f"{url}/bank")
+
+
+def test_a_failed_request_is_not_reported_as_damage(
+    served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A network failure must not suggest a repair."""
+    monkeypatch.setattr(storage, "WAITS", (0.0,))
     bank = Bank(f"{served.url}/bank")
     served.broken.add("shard-00000.h5")
     with pytest.raises(FileError, match="shard-00000.h5 cannot be read .*500"):

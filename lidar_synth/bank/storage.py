@@ -1,12 +1,35 @@
-"""Access to the bytes of a bank: files on a disk, or URLs that fsspec supports. Only requested ranges are read."""
+"""Access to the bytes of a bank: files on a disk, or URLs that fsspec supports. Only requested ranges are read.
+
+A failed request is repeated three times with growing waits, but not once 30 seconds are over; a server that is silent
+for 30 seconds has failed. At most 3 redirects are followed, to any host, but never from https to http. No answer may
+be longer than what was asked for.
+"""
 
 import io
 import os
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 from lidar_synth.errors import DataError, FileError, LibraryError
+
+SCHEMES = frozenset("http https s3 gs gcs az abfs abfss hf file memory".split())
+"""Kinds of URLs that are opened; others of fsspec's lead to further files or run what they name."""
+
+LONGEST_INDEX = 64 << 20
+"""Maximum size of a bank's index at a URL in bytes; that of a million scans takes about 1 MB."""
+
+WAITS = (0.1, 0.5, 2.0)
+"""Seconds before a failed request is repeated."""
+
+PATIENCE = 30.0
+"""Seconds in which a server has to connect, and to send the next bytes."""
+
+_TEMPORARY = frozenset((408, 425, 429, 500, 502, 503, 504))
+"""HTTP's statuses of failures that may pass."""
+
+_REDIRECTS = 3
 
 
 class Storage(Protocol):
@@ -103,13 +126,16 @@ class RemoteFile:
 
     Raises:
         LibraryError: if fsspec, or its package for such a URL, is not installed.
-        FileError: on a kind of URL that fsspec does not support.
+        FileError: on a kind of URL that is not among ``SCHEMES``, or that fsspec does not support.
     """
 
     window = 12 << 10
 
     def __init__(self, url: str, size: int = 0) -> None:
         self.url, self.size = url, size
+        scheme = url.partition("://")[0]
+        if scheme not in SCHEMES:  # a chain such as zip::http is not among them either
+            raise FileError(f"{url} with scheme {scheme!r}", f"one of {', '.join(sorted(SCHEMES))}")
         try:
             import fsspec
 
@@ -126,7 +152,7 @@ class RemoteFile:
     def read(self, offset: int, size: int) -> bytes:
         if offset + size > self.size:
             raise DataError(f"{self.url} ends before byte {offset + size}", "the size in the bank's index")
-        content = self._fetch(start=offset, end=offset + size)
+        content = self._fetch(offset, offset + size)
         if len(content) != size:
             raise FileError(
                 f"{self.url} gave {len(content)} bytes for a range of {size}",
@@ -135,13 +161,17 @@ class RemoteFile:
             )
         return content
 
-    def read_all(self) -> bytes:
-        """The complete file, of any size.
+    def read_all(self, at_most: int = LONGEST_INDEX) -> bytes:
+        """The complete file.
 
         Raises:
             FileError: if it cannot be read.
+            DataError: if it is longer than ``at_most`` bytes.
         """
-        return self._fetch()
+        content = self._fetch(0, None, at_most)
+        if len(content) > at_most:
+            raise DataError(f"{self.url} is longer than {at_most} bytes", "the index of a bank")
+        return content
 
     def close(self) -> None:
         pass
@@ -149,12 +179,50 @@ class RemoteFile:
     def reopen(self) -> bool:
         return True
 
-    def _fetch(self, **span: int) -> bytes:
-        try:
-            return bytes(self._system.cat_file(self._path, **span))
-        except Exception as error:  # each file system of fsspec raises its own classes
-            reason = str(error) or type(error).__name__
-            raise FileError(f"{self.url} cannot be read ({reason})", "a file of a bank") from error
+    def _fetch(self, start: int, end: int | None, at_most: int = 0) -> bytes:
+        """The bytes of a request, repeated while its failure may pass; a few more than asked for may come."""
+        began = time.monotonic()
+        for wait in (*WAITS, None):
+            try:
+                return self._request(start, end, at_most if end is None else end - start)
+            except Exception as error:  # each file system of fsspec raises its own classes
+                if wait is None or not _may_pass(error) or time.monotonic() - began > PATIENCE:
+                    reason = str(error) or type(error).__name__
+                    raise FileError(f"{self.url} cannot be read ({reason})", "a file of a bank") from error
+            time.sleep(wait)
+        raise AssertionError
+
+    def _request(self, start: int, end: int | None, at_most: int) -> bytes:
+        if self.url.startswith("http"):
+            from fsspec.asyn import sync
+
+            return bytes(sync(self._system.loop, self._get, start, end, at_most))
+        return bytes(self._system.cat_file(self._path, start=start, end=end or at_most + 1))
+
+    async def _get(self, start: int, end: int | None, at_most: int) -> bytearray:
+        """One byte more than ``at_most`` at most; fsspec itself would read an answer of any length."""
+        from aiohttp import ClientTimeout
+
+        session = await self._system.set_session()
+        headers = {} if end is None else {"Range": f"bytes={start}-{end - 1}"}
+        timeout = ClientTimeout(total=4 * PATIENCE, sock_connect=PATIENCE, sock_read=PATIENCE)
+        asked = session.get(self.url, headers=headers, timeout=timeout, max_redirects=_REDIRECTS)
+        async with asked as answer:
+            if self.url.startswith("https") and any(r.url.scheme != "https" for r in (*answer.history, answer)):
+                raise PermissionError("it redirects from https to http")
+            answer.raise_for_status()
+            content = bytearray()
+            while len(content) <= at_most and (part := await answer.content.read(at_most + 1 - len(content))):
+                content += part
+        return content
+
+
+def _may_pass(error: Exception) -> bool:
+    """Whether a request may succeed when it is repeated."""
+    status = getattr(error, "status", None)
+    if isinstance(status, int) and status:
+        return status in _TEMPORARY
+    return not isinstance(error, FileNotFoundError | PermissionError | ValueError)
 
 
 class View(io.RawIOBase):
