@@ -100,9 +100,9 @@ def test_intensities_on_another_scale(tmp_path: Path) -> None:
     points = np.column_stack([scan.points, np.round(scan.reflectance * 255)]).astype("<f4")
     (tmp_path / "in").mkdir()
     np.save(tmp_path / "in" / "a.npy", points)
-    with pytest.raises(DataError, match=r"on another scale \(convert (--reflectance-max 255)") as error:
+    with pytest.raises(DataError, match=r"on another scale \((--reflectance-max 255)") as error:
         convert(open_scans(tmp_path / "in"), WRITERS["kitti"](tmp_path / "no"), progress=False)
-    advice = re.search(r"convert (--\S+ \S+),", str(error.value))
+    advice = re.search(r"\((--\S+ \S+),", str(error.value))
     assert advice is not None
     arguments = [str(tmp_path / "in"), str(tmp_path / "out"), "--to", "kitti", *advice[1].split()]
     assert CliRunner().invoke(app, arguments).exit_code == 0

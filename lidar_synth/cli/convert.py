@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidar_synth.cli.options import Reading, only_given, options_from
+
 if TYPE_CHECKING:
     from lidar_synth.formats import ScanFiles
     from lidar_synth.formats.convert import Report
@@ -22,8 +24,6 @@ To = Annotated[
 InputSensor = Annotated[
     str | None, typer.Option(help="sensor of the input: a preset or a YAML file [named by the files]")
 ]
-Layout = Annotated[str | None, typer.Option(help="layout of the input [detected]")]
-Split = Annotated[str | None, typer.Option(help="split of the input, for instance r2flow/train")]
 AsSensorName = Annotated[
     str | None, typer.Option(help="scans as this sensor would have recorded them: a preset or a YAML file")
 ]
@@ -39,28 +39,16 @@ Reach = Annotated[
     typer.Option(help="of --as-sensor: metres at which it loses every second ray to a surface of 10 % reflectance"),
 ]
 Unfold = Annotated[bool, typer.Option("--unfold", help="assign one row to each laser, from KITTI's order of points")]
-Fields = Annotated[int | None, typer.Option(help="floats per point in plain .bin files [4]")]
-ReflectanceMax = Annotated[
-    float | None, typer.Option(help="highest reflectance value in plain files, for instance 255 [1]")
-]
-OnBad = Annotated[
-    str,
-    typer.Option(
-        help="bad scans: error = stop at the first one | skip = leave them out | drop-points = leave out their NaN "
-        "and infinite points"
-    ),
-]
 Strict = Annotated[bool, typer.Option("--strict", help="stop at a scan with something that the format cannot hold")]
 Jobs = Annotated[int, typer.Option(help="number of worker processes")]
 
 
+@options_from(Reading, after="sensor")
 def convert(
     source: Source,
     out: Out,
     to: To,
     sensor: InputSensor = None,
-    layout: Layout = None,
-    split: Split = None,
     as_sensor: AsSensorName = None,
     mount: MountText = None,
     sweeps: Sweeps = 0,
@@ -68,11 +56,9 @@ def convert(
     range_noise: RangeNoise = 0.0,
     reach: Reach = None,
     unfold: Unfold = False,
-    fields: Fields = None,
-    reflectance_max: ReflectanceMax = None,
-    on_bad: OnBad = "error",
     strict: Strict = False,
     jobs: Jobs = 1,
+    **reading: Any,
 ) -> None:
     """Converts scans from one format to another. Run it again to resume an interrupted conversion.
 
@@ -95,10 +81,9 @@ def convert(
     from lidar_synth.formats.source import choose
 
     writer = choose("--to", to, WRITERS)(out)
-    given = {"layout": layout, "split": split, "fields": fields, "reflectance_max": reflectance_max}
-    scans = open_scans(source, sensor=sensor, on_bad=on_bad, **given)  # type: ignore[arg-type]
+    scans = open_scans(source, sensor=sensor, **only_given(reading))
     change = _change(scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach)
-    how: dict[str, Any] = {"jobs": jobs, "on_bad": on_bad, "unfold": unfold, "strict": strict}
+    how: dict[str, Any] = {"jobs": jobs, "on_bad": scans.on_bad, "unfold": unfold, "strict": strict}
     report = run(scans, writer, as_sensor=change, **how)
     _print(report, out, to, as_sensor)
 

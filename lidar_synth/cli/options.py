@@ -1,4 +1,4 @@
-"""Command-line options generated from the fields of a pydantic model."""
+"""Command-line options generated from the fields of a pydantic model, and those of all commands that read scans."""
 
 import inspect
 from collections.abc import Callable
@@ -6,8 +6,29 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import typer
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from pydantic.fields import FieldInfo
+
+
+class Reading(BaseModel):
+    """How scans are read: the options of every command that opens a path."""
+
+    layout: str | None = Field(None, description="layout of the input [detected]")
+    split: str | None = Field(None, description="split of the input, for instance r2flow/train")
+    fields: int | None = Field(None, description="floats per point in plain .bin files [4]")
+    reflectance_max: float | None = Field(
+        None, description="highest reflectance value in plain files, for instance 255 [1; 255 in logs of drivers]"
+    )
+    on_bad: str | None = Field(
+        None,
+        description="bad scans: error = stop at the first one | skip = leave them out | drop-points = leave out their "
+        "NaN and infinite points [error]",
+    )
+
+
+def only_given(values: dict[str, Any]) -> dict[str, Any]:
+    """The options that the user gave."""
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def options_from(kind: type[BaseModel], after: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -1,14 +1,17 @@
 """``lidar-synth sensor``: sensors fitted to scans."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from lidar_synth.cli.options import Reading, only_given, options_from
 
 if TYPE_CHECKING:
     from lidar_synth.geometry.fitting import SensorFit
 
 
+@options_from(Reading, after="scans")
 def fit_from_scans(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="file, folder or root of a dataset with scans")],
     out: Annotated[Path, typer.Option(help="YAML file to write, for --sensor of any command")],
@@ -16,6 +19,7 @@ def fit_from_scans(
     columns: Annotated[int | None, typer.Option(help="columns of the range images [from the firings]")] = None,
     picture: Annotated[Path | None, typer.Option(help="PNG file to write with a plot of the fit")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    **reading: Any,
 ) -> None:
     """Fits a sensor to scans: elevation and azimuth offset of each beam, firings, range limits, quantisation.
 
@@ -26,6 +30,7 @@ def fit_from_scans(
     Examples:
       lidar-synth sensor fit my_scans --out my.yaml
       lidar-synth sensor fit my_scans --out my.yaml --scans 20 --picture fit.png
+      lidar-synth sensor fit logs --out my.yaml --reflectance-max 255 --on-bad drop-points
       lidar-synth town streets --sensor my.yaml --scans 10 --no-camera
     """
     import json
@@ -42,7 +47,7 @@ def fit_from_scans(
         raise ConfigError(f"--out {out}", "a file that ends in .yaml")
     if picture is not None and picture.suffix != ".png":
         raise ConfigError(f"--picture {picture}", "a file that ends in .png")
-    source = open_scans(path)
+    source = open_scans(path, **only_given(reading))
     source.skip_sensor_check()
     chosen = np.unique(np.linspace(0, len(source) - 1, min(scans, len(source))).round().astype(int))
     found = fit_sensor([source[int(index)] for index in chosen], name=out.stem, columns=columns)
@@ -69,6 +74,7 @@ def _values(found: "SensorFit") -> dict[str, object]:
     tilt = float(np.degrees(np.arccos(np.clip(found.mount[2, 2], -1, 1))))
     return {
         "beams": f"{len(elevations)}, from {elevations[0]:.2f} to {elevations[-1]:.2f} degrees",
+        "looks like": found.vendor or "no sensor of the table of vendors",
         "rings from": found.source,
         "points on a beam": f"{found.share:.1%} within 0.05 degrees; the worst beam {found.within.min():.1%}",
         "spread of a beam": f"{np.median(found.spread):.4f} degrees (median)",

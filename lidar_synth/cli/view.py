@@ -1,22 +1,26 @@
 """``lidar-synth view``: shows scans."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidar_synth.cli.options import Reading, only_given, options_from
 from lidar_synth.errors import ConfigError
 
 if TYPE_CHECKING:
+    from lidar_synth.formats import ScanFiles
     from lidar_synth.geometry.scan import Scan
 
 
+@options_from(Reading, after="sensor")
 def view(
     path: Annotated[Path, typer.Argument(help="file, folder, root of a dataset, or bank")],
     index: Annotated[int, typer.Option(help="number of the first scan, from 0; -1 is the last one")] = 0,
     count: Annotated[int, typer.Option(min=1, max=256, help="number of scans")] = 1,
     out: Annotated[Path | None, typer.Option(help="file to write: .png (sheet) or .html (interactive page)")] = None,
     sensor: Annotated[str | None, typer.Option(help="sensor: a preset or a YAML file [named by the files]")] = None,
+    **reading: Any,
 ) -> None:
     """Shows scans as range image, bird's-eye view and 3-D points.
 
@@ -27,12 +31,14 @@ def view(
       lidar-synth view scan.bin
       lidar-synth view kitti/ --index 7 --out scan.png
       lidar-synth view town/ --count 16 --out town.html
+      lidar-synth view logs/ --sensor fitted.yaml --reflectance-max 255
     """
+    from lidar_synth.formats import open_scans
     from lidar_synth.viz import show, view_suffix, write_view
 
     if out is not None:
         view_suffix(out)
-    scans = _read(path, index, count, sensor)
+    scans = _read(open_scans(path, sensor=sensor, **only_given(reading)), index, count)
     if out is None:
         if show(scans, title=str(path)):
             return
@@ -41,7 +47,7 @@ def view(
     typer.echo(f"{out}: {len(scans)} of the scans in {path}")
 
 
-def _read(path: Path, index: int, count: int, sensor: str | None) -> "list[Scan]":
+def _read(source: "ScanFiles", index: int, count: int) -> "list[Scan]":
     """Read scans ``index``, ``index`` + 1, ... of a source.
 
     Raises:
@@ -49,11 +55,8 @@ def _read(path: Path, index: int, count: int, sensor: str | None) -> "list[Scan]
     """
     from tqdm import tqdm
 
-    from lidar_synth.formats import open_scans
-
-    source = open_scans(path, sensor=sensor)
     first = index + len(source) if index < 0 else index
     if not 0 <= first < len(source):
-        raise ConfigError(f"--index {index}: {path} holds {len(source)} scans", f"0 .. {len(source) - 1}")
+        raise ConfigError(f"--index {index}: {source.root} holds {len(source)} scans", f"0 .. {len(source) - 1}")
     chosen = range(first, min(first + count, len(source)))
     return [source[i] for i in tqdm(chosen, "reading", unit="scan", disable=len(chosen) < 8)]

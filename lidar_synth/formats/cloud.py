@@ -3,6 +3,10 @@
 Reflectance is stored in the field ``intensity``, which other tools understand; all other fields of a scan keep their
 names. ``raw_label`` is stored bit for bit as a signed integer, because not every PLY reader supports unsigned 32-bit
 values.
+
+The logs of drivers have other names and types, which are read too: ``ring`` or ``channel`` of any integers, the time as
+``time`` (float32 seconds), ``t`` or ``time_stamp`` (nanoseconds) or ``timestamp``, and Ouster's ``reflectivity``, which
+is calibrated and takes precedence over its ``intensity``, the number of photons.
 """
 
 import io
@@ -22,7 +26,15 @@ STORED = {"label": "<u1", "raw_label": "<i4", "instance": "<i4", "ring": "<i4", 
 
 IN_MEMORY = {"label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2", "confidence": "f4", "time": "f4"}
 
-WANTED = ("x", "y", "z", "intensity", "reflectance", *STORED)
+REFLECTANCES = ("reflectivity", "intensity", "reflectance")
+RINGS = ("ring", "channel")
+TIMES = ("t", "time_stamp", "timestamp")
+"""Names of a field in the logs of drivers, of which the first one counts."""
+
+LONGEST_TURN = 1.05
+"""Seconds from the first to the last point of a scan, by which the unit of float times is recognised."""
+
+WANTED = ("x", "y", "z", *REFLECTANCES, *STORED, "channel", *TIMES)
 """The fields that are read from a file; all others are ignored."""
 
 WIDEST = 1 << 20
@@ -137,13 +149,38 @@ def _typed(values: NDArray[np.float64], field: Field, where: str) -> NDArray[Any
 def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Rename and convert a file's fields to those of a ``Scan``.
 
-    Label, ring and the like are read only if they have the type of ``STORED``; other programs use the names otherwise.
+    Labels and the like are read only if they have the type of ``STORED``; other programs use the names otherwise.
     """
     with np.errstate(over="ignore"):
         points = np.column_stack([stored[axis] for axis in "xyz"]).astype(np.float32)
-        intensity = stored.get("intensity", stored.get("reflectance", np.zeros(len(points)))).astype(np.float32)
+        intensity = _first(stored, REFLECTANCES)
+        reflectance = np.zeros(len(points), np.float32) if intensity is None else intensity.astype(np.float32)
     own = [n for n, kind in STORED.items() if n in stored and stored[n].dtype.newbyteorder("<") == np.dtype(kind)]
-    return {"points": points, "reflectance": intensity} | {n: stored[n].astype(IN_MEMORY[n]) for n in own}
+    arrays = {"points": points, "reflectance": reflectance} | {n: stored[n].astype(IN_MEMORY[n]) for n in own}
+    ring, time = _first(stored, RINGS), _first(stored, TIMES)
+    if ring is not None and ring.dtype.kind in "iu" and 0 <= ring.min() <= ring.max() < 1 << 15:
+        arrays["ring"] = ring.astype(np.int16)
+    if time is not None and "time" not in arrays:
+        arrays |= _seconds(time)
+    return arrays
+
+
+def _first(stored: Mapping[str, NDArray[Any]], names: Sequence[str]) -> NDArray[Any] | None:
+    """The first of these fields that a file has."""
+    return next((stored[name] for name in names if name in stored), None)
+
+
+def _seconds(time: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """``time`` as seconds from the first point: nanoseconds if whole, otherwise in the unit in which a turn is short.
+
+    Nothing if there is no such unit, or all points have one time: that is the time of the file.
+    """
+    if not np.isfinite(time).all() or time.min() == time.max():
+        return {}
+    since = (time - time.min()).astype(np.float64)
+    units = (1e-9,) if time.dtype.kind in "iu" else (1.0, 1e-3, 1e-6, 1e-9)
+    unit = next((unit for unit in units if since.max() * unit <= LONGEST_TURN), None)
+    return {} if unit is None else {"time": (since * unit).astype(np.float32)}
 
 
 def to_records(scan: Scan) -> NDArray[np.void]:

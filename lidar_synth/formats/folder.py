@@ -30,8 +30,12 @@ from lidar_synth.formats.point_labels import encode_labels, read_labels, write_l
 from lidar_synth.formats.points import check_scan, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import DETAILS, LABELS, FileWriter, Picture
+from lidar_synth.geometry.fitting.assign import assign_beams
 from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
+
+LOG_REFLECTANCE = 255.0
+"""Maximum of the reflectance in the logs of Velodyne's, Hesai's and Ouster's drivers."""
 
 SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 
@@ -47,7 +51,8 @@ class Folder(ScanFiles):
         sensor: the sensor that recorded the scans; by default the one that the files name (``.npz``, ``.pcd`` and
             ``.ply`` files of this package), or ``scans.json`` beside them, or else ``hdl64e_kitti``.
         fields: floats per point of ``.bin`` files.
-        reflectance_max: maximum of the reflectance in the files; values are divided by it.
+        reflectance_max: maximum of the reflectance in the files; values are divided by it. By default 1, and 255 in
+            scans of PCD and PLY logs of a driver that hold more than 1: those have rings and no description of ours.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -64,10 +69,10 @@ class Folder(ScanFiles):
         *,
         sensor: str | Path | Sensor | None = None,
         fields: int = 4,
-        reflectance_max: float = 1.0,
+        reflectance_max: float | None = None,
         on_bad: OnBad = "error",
     ) -> None:
-        if fields < 4 or not 0 < reflectance_max < np.inf:
+        if fields < 4 or not (reflectance_max is None or 0 < reflectance_max < np.inf):
             raise ConfigError(f"fields={fields}, reflectance_max={reflectance_max}", "at least 4, and above 0")
         root = Path(root)
         base, self._paths = scan_paths(root, SUFFIXES)
@@ -86,24 +91,30 @@ class Folder(ScanFiles):
 
     def _decode(self, path: Path) -> Scan:
         suffix = path.suffix.lower()
+        scale = self._reflectance_max or 1.0
         if suffix == ".bin":
-            points = read_points(path, self._fields, self._reflectance_max)
+            points = read_points(path, self._fields, scale)
             beside = path.with_suffix(".label")
             labels = read_labels(beside, path, len(points), SEMANTIC_KITTI) if beside.is_file() else {}
             scan = Scan(points[:, :3], points[:, 3], self.sensor, **labels)
         elif suffix == ".npz":
-            scan = decode_scan(read_arrays(path), str(path), self._given)
+            scan = decode_scan(read_arrays(path), str(path), self.sensor if self._unknown else self._given)
             check_scan(scan, str(path))
             return scan
         else:
             arrays: dict[str, Any] = ARRAYS[suffix](path)
             said = _description(path)
             scan = Scan(sensor=self._given or (said.sensor if said else None) or self.sensor, **arrays)
-            scan = said.origin.apply(scan) if said else scan
+            scan = said.origin.apply(scan) if said else without_empty_firings(scan)
             scan.boxes = read_boxes(path)
-            check_scan(scan, str(path), self._reflectance_max)
-        if self._reflectance_max != 1:
-            scan.reflectance = scan.reflectance / np.float32(self._reflectance_max)
+            is_log = said is None and scan.ring is not None
+            if is_log and self._reflectance_max is None and np.nanmax(scan.reflectance, initial=0) > 1:
+                scale = LOG_REFLECTANCE
+            check_scan(scan, str(path), scale)
+            if is_log and not self._unknown:
+                scan.ring = rows_of_rings(scan)
+        if scale != 1:
+            scan.reflectance = scan.reflectance / np.float32(scale)
         return scan
 
 
@@ -137,6 +148,23 @@ def write_boxes(path: Path, boxes: Boxes | None) -> None:
     if boxes is not None:
         values = {f.name: np.asarray(getattr(boxes, f.name)).tolist() for f in fields(Boxes)}
         write_file(path.with_suffix(BOXES), json.dumps(values).encode())
+
+
+def without_empty_firings(scan: Scan) -> Scan:
+    """The scan without points at the origin, as drivers write firings that had no return."""
+    there = scan.points.any(axis=1)
+    return scan if there.all() else scan[there]
+
+
+def rows_of_rings(scan: Scan) -> NDArray[np.int16]:
+    """(N,) the row of the sensor for each ring: drivers count from below, or in the order of the lasers.
+
+    A ring is the row that is nearest to most of its points.
+    """
+    _, number = np.unique(scan.ring, return_inverse=True)
+    rows = scan.sensor.shape[0]
+    votes = np.bincount(number * rows + assign_beams(scan).ring, minlength=rows * (int(number.max()) + 1))
+    return votes.reshape(-1, rows).argmax(axis=1)[number].astype(np.int16)
 
 
 def _columns(path: Path) -> dict[str, NDArray[Any]]:

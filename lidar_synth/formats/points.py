@@ -20,6 +20,8 @@ from lidar_synth.geometry.scan import FARTHEST, Scan
 LONGEST = 60.0
 """Maximum time of a point from the moment of its scan's pose, seconds."""
 
+_FOR_ALL = ", or the largest value of all scans: all are divided by it"
+
 _bad_points_kept = ContextVar("bad points kept", default=False)
 
 
@@ -50,7 +52,7 @@ def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> ND
         hint = ""
         if fits:
             n = fits[0]
-            hint = f"The size fits {n} floats per point: pass fields={n} (convert --fields {n}) if it holds them. "
+            hint = f"The size fits {n} floats per point: pass fields={n} (--fields {n}) if it holds them. "
         raise DataError(
             f"{path} is {size} bytes long",
             f"a multiple of {4 * fields}: {fields} float32 for each point",
@@ -96,14 +98,14 @@ def check_points(
     low, high = float(reflectance.min()), float(reflectance.max())
     if suspicious or not np.isfinite(high - low):
         _find_bad_value(points, reflectance, where)
-    scale = 255 if high <= 255 else 65535
+    scale = 255 if high <= 255 else int(np.ceil(high))
     if not 0 <= low <= high <= reflectance_max:
         raise DataError(
             f"{where}: its reflectance (the fourth value of a point) runs from {low:g} to {high:g}",
             f"values in [0, {reflectance_max:g}]",
-            f"Either it holds intensities on another scale (convert --reflectance-max {scale}, in Python "
-            f"reflectance_max={scale}), or another number of floats per point (convert --fields 5, fields=5; nuScenes "
-            "has 5), or it is damaged.",
+            f"Either it holds intensities on another scale (--reflectance-max {scale}, in Python reflectance_max="
+            f"{scale}{_FOR_ALL if scale > 255 else ''}), or another number of floats per point (--fields 5, fields=5; "
+            "nuScenes has 5), or it is damaged.",
         )
 
 
@@ -164,7 +166,7 @@ def _find_bad_value(points: NDArray[np.float32], reflectance: NDArray[np.float32
         raise DataError(
             f"{where}: {len(bad)} of {len(points)} points are NaN or infinite, the first is point {bad[0]}",
             "finite float32 values",
-            f"{SKIP_HINT} on_bad='drop-points' (convert --on-bad drop-points) drops only these points.",
+            f"{SKIP_HINT} on_bad='drop-points' (--on-bad drop-points) drops only these points.",
         )
     farthest = np.abs(points[:, :3]).max()
     if farthest > FARTHEST:

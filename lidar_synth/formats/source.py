@@ -86,6 +86,7 @@ class ScanFiles(ABC):
                 stacklevel=3,
             )
         self._unchecked = named is None
+        self._unknown = False
         self.on_bad = on_bad
         self.skipped: dict[str, str] = {}
         self.dropped: dict[str, int] = {}
@@ -142,8 +143,9 @@ class ScanFiles(ABC):
                 self._compare(self.read(index))
 
     def skip_sensor_check(self) -> None:
-        """Do not compare any scan with the sensor, because its sensor is not known yet."""
+        """Do not compare any scan with the sensor, because it is not known yet: rings keep the file's numbers."""
         self._unchecked = False
+        self._unknown = True
 
     def _compare(self, scan: Scan) -> None:
         shares = agreement(scan.points, self.sensor)

@@ -6,6 +6,7 @@ range image do. Azimuth 0 is straight ahead, at the edge between columns W/2-1 a
 Row 0 is the highest beam.
 """
 
+import warnings
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from importlib.resources import files
@@ -55,7 +56,8 @@ class Sensor:
             without ``beams``, the rows are the lasers, and the rays of their cells start there.
         firings: of each laser in one revolution; as many as columns by default.
         azimuths: degrees, clockwise, by which each laser points away from the direction of its firing, one per row;
-            0 by default.
+            0 by default. None (``null`` or ``.nan`` in YAML) where it is not known: rays are cast as for 0, with a
+            warning, and ``assign_beams`` gives no firing.
         range_step: metres, the step in which the sensor gives ranges, if it is known.
         reflectance_levels: number of values of reflectance, such as 256, if it is known.
         description: one line of text.
@@ -83,7 +85,7 @@ class Sensor:
     beams: tuple[float, ...] | None = None
     heights: tuple[float, ...] | None = None
     firings: int | None = None
-    azimuths: tuple[float, ...] | None = None
+    azimuths: tuple[float | None, ...] | None = None
     range_step: float | None = None
     reflectance_levels: int | None = None
     description: str = ""
@@ -120,7 +122,8 @@ class Sensor:
     def _check_firings(self, rows: int) -> None:
         if self.firings is not None and self.firings < 2:
             raise self._error(f"firings = {self.firings}", "at least 2 per revolution")
-        if self.azimuths is not None and (len(self.azimuths) != rows or max(map(abs, self.azimuths)) > 180):
+        known = [abs(offset) for offset in self.azimuths or () if offset is not None]
+        if self.azimuths is not None and (len(self.azimuths) != rows or max(known, default=0) > 180):
             raise self._error(f"azimuths = {self.azimuths}", f"one per row ({rows}), within +-180 degrees")
         if self.range_step is not None and not 0 < self.range_step <= 1:
             raise self._error(f"range_step = {self.range_step}", "metres, 0 < range_step <= 1")
@@ -146,9 +149,13 @@ class Sensor:
             if table is None:
                 continue
             is_list = isinstance(table, list | tuple) or (isinstance(table, np.ndarray) and table.ndim == 1)
-            if not is_list or not len(table) or not all(_is_finite(_plain(value)) for value in table):
+            values = [_plain(value) for value in table] if is_list else []
+            if key == "azimuths":
+                values = [None if _is_nan(value) else value for value in values]
+            numbers = [value for value in values if not (key == "azimuths" and value is None)]
+            if not values or not all(_is_finite(value) for value in numbers):
                 raise self._error(f"{key} = {table!r}", "a list of finite numbers")
-            object.__setattr__(self, key, tuple(float(value) for value in table))
+            object.__setattr__(self, key, tuple(None if value is None else float(value) for value in values))
 
     def _error(self, given: str, expected: str) -> ConfigError:
         return ConfigError(f"sensor {shorten(repr(self.name), 100)}: {shorten(given, 400)}", expected)
@@ -233,8 +240,15 @@ class Sensor:
         Offsets can lead beyond +-pi: firing 0 of a laser with a negative offset belongs to the end of the turn.
         """
         count = self.firings or self.columns
+        offsets = np.zeros(self.shape[0]) if self.azimuths is None else np.asarray(self.azimuths, np.float64)
+        if unknown := int(np.isnan(offsets).sum()):
+            warnings.warn(
+                f"sensor {self.name!r}: the azimuth offsets of {unknown} of {len(offsets)} beams are not known; their "
+                "rays are cast with 0",
+                stacklevel=2,
+            )
         firing = (2 * (np.arange(count) + 0.5) / count - 1) * np.pi
-        return firing + np.radians(self.azimuths if self.azimuths is not None else np.zeros(self.shape[0]))[:, None]
+        return np.asarray(firing + np.radians(np.nan_to_num(offsets))[:, None])
 
     def ray_angles(self, rays: Rays = "centre") -> NDArray[np.float32]:
         """(2, H, W) elevation and azimuth of every cell, radians."""
@@ -297,6 +311,10 @@ def _plain(value: Any) -> Any:
 def _is_finite(value: object) -> bool:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return bool(is_number and -1e300 < value < 1e300)  # type: ignore[operator]  # isfinite fails on very large integers
+
+
+def _is_nan(value: object) -> bool:
+    return isinstance(value, float) and value != value
 
 
 def _is_integer(value: object) -> bool:

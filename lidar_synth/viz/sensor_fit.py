@@ -38,7 +38,7 @@ def _beams(fit: SensorFit) -> Any:
 
 def _elevations(axes: Any, fit: SensorFit) -> None:
     beams = _beams(fit)
-    seen = np.concatenate([beams[ring] + off for ring, off in zip(fit.rings, fit.off, strict=True)])
+    seen = np.concatenate([(beams[ring] + off)[ring >= 0] for ring, off in zip(fit.rings, fit.off, strict=True)])
     low, high = beams[-1] - 1, beams[0] + 1
     axes.hist(seen, bins=np.arange(low, high, 0.02), histtype="step", color=_LINE, log=True)
     axes.vlines(beams, 0.6, 1.0, color=_POINT, linewidth=0.8)

@@ -15,7 +15,7 @@ class Assigned(NamedTuple):
 
     Args:
         ring: (N,) int16 the nearest beam, 0 = highest.
-        firing: (N,) int32 its firing, 0 = behind the sensor, clockwise.
+        firing: (N,) int32 its firing, 0 = behind the sensor, clockwise; -1 on a beam of unknown azimuth offset.
         off: (N,) float32 degrees by which the point lies above its beam.
     """
 
@@ -51,6 +51,8 @@ def assign_beams(scan: Scan, sensor: Sensor | None = None) -> Assigned:
     count = sensor.firings or sensor.columns
     azimuth = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     if sensor.azimuths is not None:
-        azimuth -= np.asarray(sensor.azimuths)[ring] / 360
-    firing = np.floor(((azimuth + 0.5) % 1.0) * count).astype(np.int32) % count
+        azimuth -= np.asarray(sensor.azimuths, np.float64)[ring] / 360
+    unknown = np.isnan(azimuth)
+    firing = np.floor(((np.nan_to_num(azimuth) + 0.5) % 1.0) * count).astype(np.int32) % count
+    firing[unknown] = -1
     return Assigned(ring.astype(np.int16), firing, off.astype(np.float32))

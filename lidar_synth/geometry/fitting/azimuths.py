@@ -32,6 +32,9 @@ LARGEST_OFFSET = 20.0
 SIDES = np.arange(-0.06, 0.0601, 0.002)
 """Lateral offsets of lasers that are tried, metres."""
 
+FEWEST = 10
+"""A beam needs as many far points in a scan for its offset by the time."""
+
 FEW = 100
 """A beam needs as many points in a scan."""
 
@@ -43,7 +46,7 @@ class Azimuths:
     Args:
         firings: of each beam in a turn; None if not found.
         lattice: steps of a turn on which the azimuths lie, None if they lie on none.
-        offsets: (B,) degrees, clockwise; None if not found.
+        offsets: (B,) degrees, clockwise, NaN for beams of which it is not known; None if not found.
         known: how the offsets are known: "time", "encoder", "one firing" (up to a multiple of the angle between
             firings) or "".
         spread: degrees, the median disagreement of offsets between scans or within them.
@@ -115,14 +118,19 @@ def _wrap(turns: Floats) -> Floats:
     return np.asarray((turns + 0.5) % 1.0 - 0.5)
 
 
-def _combined(by_scan: Floats, beams: int, known: str, period: float = 360.0) -> tuple[Floats, str, float]:
-    """Offsets (B,) as the median over scans (S, B), how they are known, and the median disagreement."""
+def _combined(by_scan: Floats, beams: int, known: str, period: float = 360.0) -> tuple[Floats | None, str, float]:
+    """Offsets (B,) as the median over scans (S, B), how they are known, and the median disagreement.
+
+    A beam of which no scan knows the offset has NaN.
+    """
     reference = np.nan_to_num(by_scan[0])
     turned = reference + period * _wrap((by_scan - reference) / period)
     seen = ~np.isnan(turned).all(0)
-    offsets = np.zeros(beams)
+    if not seen.any():
+        return None, "", 0.0
+    offsets = np.full(beams, np.nan)
     offsets[seen] = np.nanmedian(turned[:, seen], axis=0)
-    spread = float(np.nanmedian(np.abs(turned[:, seen] - offsets[seen]))) if seen.any() else 0.0
+    spread = float(np.nanmedian(np.abs(turned[:, seen] - offsets[seen])))
     return offsets, known, spread
 
 
@@ -213,7 +221,8 @@ def _by_pattern(turn: Turn, beams: int, lattice: int, sides: Floats, phases: Flo
 def _offsets_by_time(turn: Turn, beams: int) -> Floats:
     """(B,) degrees beyond the azimuth of the turning head, which is a smooth function of time; their median is 0."""
     assert turn.time is not None
-    far = np.flatnonzero(turn.rho > FAR)
+    far = turn.rho > FAR
+    far = np.flatnonzero(far & (np.bincount(turn.ring[far], minlength=beams) >= FEWEST)[turn.ring])
     far = far[np.argsort(turn.time[far], kind="stable")]
     offsets = np.full(beams, np.nan)
     if len(far) < FEW:

@@ -1,14 +1,16 @@
 """``fit_sensor``: from a few scans to a ``Sensor``."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.fitting.azimuths import Azimuths, fit_azimuths, turn_of
-from lidar_synth.geometry.fitting.beams import Beams, fit_beams, in_order_of_time, room_of
+from lidar_synth.geometry.fitting.beams import NEAREST, Beams, fit_beams, in_order_of_time, room_of, with_lost_beams
+from lidar_synth.geometry.fitting.doubts import doubts, name_vendor
 from lidar_synth.geometry.fitting.limits import range_limits, range_step, reflectance_levels
 from lidar_synth.geometry.fitting.lines import Cloud, Model, nearest_beams, residuals
 from lidar_synth.geometry.scan import Scan, Source
@@ -23,7 +25,7 @@ TURNS = 5
 """Number of scans in which firings are looked for."""
 
 LEAST_POINTS = 500
-"""A fit needs as many points, and a beam a tenth of them to be certain."""
+"""A fit needs as many points."""
 
 LEAST_QUALITY = 0.92
 """Share of points in the middle half between the borders of their beams; less is no fit, and 0.5 are any points."""
@@ -43,7 +45,7 @@ class SensorFit:
 
     Args:
         sensor: the sensor; its elevations are those of the lasers, seen from their heights.
-        points: (B,) number of points of each beam.
+        points: (B,) number of points of each beam, without those nearer than 0.5 m, which are not fitted.
         spread: (B,) degrees, the median distance of a beam's points from it.
         within: (B,) share of a beam's points within 0.05 degrees.
         mount: (4, 4) the sensor's pose in the frame of the given points, metres; its heading is not fitted.
@@ -53,9 +55,10 @@ class SensorFit:
         nearest: metres, of all points.
         farthest: metres, of all points.
         azimuths: firings and azimuth offsets, with what they rest on.
-        rings: for each scan (N,) int16, the beam of each point.
+        rings: for each scan (N,) int16, the beam of each point; -1 for points at the origin: firings without a return.
         off: for each scan (N,) float32 degrees, how far each point lies above its beam.
         uncertain: one sentence for each part that the fit is not sure of.
+        vendor: the sensor that a vendor sells with these beams, and how many of its channels are missing; "" if none.
 
     Example:
         >>> from lidar_synth import Town, fit_sensor
@@ -79,6 +82,7 @@ class SensorFit:
     rings: tuple[NDArray[np.int16], ...] = field(repr=False)
     off: tuple[NDArray[np.float32], ...] = field(repr=False)
     uncertain: tuple[str, ...] = ()
+    vendor: str = ""
 
     @property
     def share(self) -> float:
@@ -111,27 +115,42 @@ def fit_sensor(scans: Source | Sequence[Scan], *, name: str = "fitted", columns:
         ((128, 1024), (22.3242, 21.9727), 1.0)
     """
     given = [scans[i] for i in np.unique(np.linspace(0, len(scans) - 1, min(SCANS, len(scans))).round().astype(int))]
-    count = sum(len(scan) for scan in given)
+    returned = [scan.points.any(axis=1) for scan in given]
+    scans = [scan if there.all() else scan[there] for scan, there in zip(given, returned, strict=True)]
+    count = sum(len(scan) for scan in scans)
     if count < LEAST_POINTS:
-        raise DataError(f"{len(given)} scans with {count} points", f"at least {LEAST_POINTS} points to fit a sensor to")
-    beams, cloud = fit_beams(given)
+        raise DataError(f"{len(scans)} scans with {count} points", f"at least {LEAST_POINTS} points to fit a sensor to")
+    beams, cloud = fit_beams(scans)
     if beams is None:
         given_points = f"{count} points whose elevations show fewer than two beams"
         raise DataError(given_points, "two beams or more", FRAME_HINT)
-    return _described(beams, cloud, given, name, columns)
+    found = _described(beams, cloud, scans, name, columns)
+    rings = tuple(_spread(there, part, -1) for there, part in zip(returned, found.rings, strict=True))
+    off = tuple(_spread(there, part, 0) for there, part in zip(returned, found.off, strict=True))
+    return replace(found, rings=rings, off=off)
+
+
+def _spread(there: NDArray[np.bool_], values: NDArray[Any], other: int) -> NDArray[Any]:
+    """Values of the points that are there, as values of all points, with another one for the rest."""
+    spread = np.full(len(there), other, values.dtype)
+    spread[there] = values
+    return spread
 
 
 def _described(beams: Beams, cloud: Cloud, scans: Sequence[Scan], name: str, columns: int | None) -> SensorFit:
-    model = _highest_first(beams.model)
+    points = beams.model.aligned(cloud)
+    lost = beams.model if cloud.kept else with_lost_beams(beams.model, points)
+    model = _highest_first(lost)
     points = model.aligned(cloud)
     ring = nearest_beams(points, model.tangents, model.heights)
     off = residuals(points, ring, model.tangents, model.heights)
-    usable = np.hypot(points[:, 0], points[:, 1]) > 0.5
+    usable = np.hypot(points[:, 0], points[:, 1]) > NEAREST
     _check(model, ring[usable], off[usable])
     rows = len(model.tangents)
-    number = np.bincount(ring, minlength=rows)
-    order = np.split(np.argsort(ring, kind="stable"), np.cumsum(number)[:-1])
-    degrees = np.abs(np.degrees(off))
+    number = np.bincount(ring[usable], minlength=rows)
+    order = np.split(np.argsort(ring[usable], kind="stable"), np.cumsum(number)[:-1])
+    degrees = np.abs(np.degrees(off))[usable]
+    within = np.array([np.mean(degrees[part] < CLOSE) if len(part) else 0.0 for part in order])
     azimuths = _azimuths(scans, cloud, points, ring, rows)
     distance = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2 + (points[:, 2] - model.heights[ring]) ** 2)
     nearest, farthest = range_limits(np.linalg.norm(points[usable], axis=1))
@@ -156,11 +175,12 @@ def _described(beams: Beams, cloud: Cloud, scans: Sequence[Scan], name: str, col
     return SensorFit(
         sensor, number,
         spread=np.array([np.median(degrees[part]) if len(part) else 0.0 for part in order]),
-        within=np.array([np.mean(degrees[part] < CLOSE) if len(part) else 0.0 for part in order]),
+        within=within,
         mount=mount, motion=model.motion, source=beams.source, nearest=nearest, farthest=farthest, azimuths=azimuths,
         rings=tuple(np.split(ring.astype(np.int16), splits)),
         off=tuple(np.split(np.degrees(off).astype(np.float32), splits)),
-        uncertain=tuple(_doubts(elevations, number, azimuths)),
+        uncertain=tuple(doubts(np.array(elevations), number, within, 1 - float(usable.mean()), azimuths)),
+        vendor=name_vendor(np.array(elevations), number),
     )  # fmt: skip
 
 
@@ -196,7 +216,7 @@ def _check(model: Model, ring: NDArray[np.int64], off: Floats) -> None:
 def _azimuths(scans: Sequence[Scan], cloud: Cloud, points: Floats, ring: NDArray[np.int64], rows: int) -> Azimuths:
     turns = []
     for number in range(min(TURNS, len(scans))):
-        use = np.flatnonzero((cloud.scan == number) & (np.hypot(points[:, 0], points[:, 1]) > 0.5))
+        use = np.flatnonzero((cloud.scan == number) & (np.hypot(points[:, 0], points[:, 1]) > NEAREST))
         time: Floats | None = None
         if scans[number].time is not None:
             time = cloud.time[use]
@@ -215,21 +235,7 @@ def _columns(azimuths: Azimuths) -> int:
 
 
 def _offsets(azimuths: Azimuths) -> tuple[float, ...] | None:
+    """Offsets in degrees, NaN where they are not known; None if nothing is known or all are 0."""
     if azimuths.offsets is None or np.abs(azimuths.offsets).max() < 0.005:
         return None
     return tuple(azimuths.offsets.round(3).tolist())
-
-
-def _doubts(elevations: tuple[float, ...], points: NDArray[np.int64], azimuths: Azimuths) -> list[str]:
-    doubts = []
-    if few := [f"{elevations[i]:.2f}" for i in np.flatnonzero(points < LEAST_POINTS // 10)]:
-        doubts.append(f"The beams at {', '.join(few)} degrees have fewer than {LEAST_POINTS // 10} points.")
-    if azimuths.firings is None:
-        doubts.append("The number of firings is not known: too few points for each beam.")
-    if azimuths.offsets is None:
-        doubts.append("The azimuth offsets are not known: the points have neither a time nor a common raster.")
-    elif azimuths.known == "one firing" and _offsets(azimuths) is not None:
-        doubts.append("The azimuth offsets are known up to a multiple of the angle between two firings.")
-    elif azimuths.spread > 0.05:
-        doubts.append(f"The azimuth offsets differ between scans by {azimuths.spread:.2f} degrees.")
-    return doubts
