@@ -221,8 +221,9 @@ def _by_pattern(turn: Turn, beams: int, lattice: int, sides: Floats, phases: Flo
 def _offsets_by_time(turn: Turn, beams: int) -> Floats:
     """(B,) degrees beyond the azimuth of the turning head, which is a smooth function of time; their median is 0."""
     assert turn.time is not None
-    far = turn.rho > FAR
-    far = np.flatnonzero(far & (np.bincount(turn.ring[far], minlength=beams) >= FEWEST)[turn.ring])
+    beyond_near = turn.rho > FAR
+    count = np.bincount(turn.ring[beyond_near], minlength=beams)
+    far = np.flatnonzero(beyond_near & (count >= FEWEST)[turn.ring])
     far = far[np.argsort(turn.time[far], kind="stable")]
     offsets = np.full(beams, np.nan)
     if len(far) < FEW:
