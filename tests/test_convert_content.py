@@ -114,7 +114,7 @@ def test_intensities_on_another_scale(tmp_path: Path) -> None:
 def test_five_floats_per_point(tmp_path: Path) -> None:
     scan = some_scan(0)[:41]  # not a multiple of four
     np.column_stack([scan.points, scan.reflectance, np.zeros(41)]).astype("<f4").tofile(tmp_path / "a.bin")
-    with pytest.raises(DataError, match="convert --fields 5"):
+    with pytest.raises(DataError, match="--fields 5"):
         open_scans(tmp_path / "a.bin")[0]
     assert np.array_equal(open_scans(tmp_path / "a.bin", fields=5)[0].points, scan.points)
 
