@@ -91,6 +91,7 @@ def test_the_wheel_works_from_any_folder(built: Path, tmp_path: Path) -> None:
 def test_the_unpacked_sdist_runs_its_tests(built: Path, tmp_path: Path) -> None:
     """Those of a minute; all of them take as long as those of the checkout."""
     [archive] = built.glob("*.tar.gz")
+    assert archive.stat().st_size < 70e6
     with tarfile.open(archive) as file:
         file.extractall(tmp_path, filter="data")
     [root] = tmp_path.iterdir()

@@ -275,3 +275,12 @@ def test_invalid_paths_and_empty_lists_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(FileError, match="cannot be written"):
         write_view(tmp_path / "file" / "out.html", [random_scan(SMALL)])
+
+
+@pytest.mark.parametrize("name", [r"$\frac", "a$b$c", r"$$_{"])
+def test_names_of_scans_are_no_formulas(name: str, tmp_path: Path) -> None:
+    scan = replace(random_scan(SMALL, 50, 0), id=name)
+    for number, figure in enumerate((sheet(scan), contact_sheet([scan, scan], title=name))):
+        path = tmp_path / f"{number}.png"
+        figure.savefig(path)
+        assert path.stat().st_size > 1000

@@ -12,6 +12,7 @@ from layouts import some_scan, write_tars
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.evaluate.extractors.archive import Archive
 from lidar_synth.formats import WebDataset, open_scans
 from lidar_synth.formats.convert import SETTINGS, Report, convert
 from lidar_synth.formats.webdataset import WebDatasetWriter
@@ -211,3 +212,19 @@ def test_damaged_and_missing_files(tmp_path: Path) -> None:
     path.unlink()
     with pytest.raises(FileError, match="scans-000001.tar cannot be read"):
         scans[1]
+
+
+PAX = {"GNU.sparse.map": "x,y", "GNU.sparse.size": "x", "size": "-5", "GNU.sparse.offset": "x"}
+
+
+@pytest.mark.parametrize("key", PAX)
+def test_numbers_in_pax_headers_are_checked(key: str, tmp_path: Path) -> None:
+    member = tarfile.TarInfo("a.json")
+    member.pax_headers = {key: PAX[key]}
+    path = tmp_path / "shard.tar"
+    with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as tar:
+        tar.addfile(member)
+    with pytest.raises(DataError):
+        open_scans(path)[0]
+    with pytest.raises((DataError, FileError)):
+        Archive(path, "bonnetal").yaml("a.yaml")

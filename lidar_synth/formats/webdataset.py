@@ -30,7 +30,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError, shorten
+from lidar_synth.errors import ConfigError, DataError, LidarSynthError, shorten
 from lidar_synth.files.disk import SKIP_HINT, list_files, unreadable, write_file
 from lidar_synth.files.parsing import parse_json, parse_npy
 from lidar_synth.formats.calibration import Calibration
@@ -261,7 +261,9 @@ def _open(path: Path) -> Iterator[tarfile.TarFile]:
             tarfile.open(fileobj=file, mode="r:", tarinfo=_Member) as tar,
         ):
             yield tar
-    except (tarfile.TarError, UnicodeDecodeError) as error:
+    except (tarfile.TarError, ValueError) as error:  # ValueError: of numbers in pax headers
+        if isinstance(error, LidarSynthError):
+            raise
         raise DataError(
             f"{path} is truncated, damaged or not a tar file ({error})", "a file of a WebDataset"
         ) from error

@@ -48,7 +48,15 @@ def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: flo
         len(heights), 2, width_ratios=[2, 1], height_ratios=heights, hspace=0.34, wspace=0.1,
         left=0.045, right=0.945, bottom=0.01, top=1 - 0.75 / (sum(heights) + 0.7),
     )  # fmt: skip
-    figure.text(0.045, 1 - 0.28 / figure.get_figheight(), caption(view.scan), color=_INK, fontsize=15, va="center")
+    figure.text(
+        0.045,
+        1 - 0.28 / figure.get_figheight(),
+        caption(view.scan),
+        color=_INK,
+        fontsize=15,
+        va="center",
+        parse_math=False,
+    )
     _perspective(figure.add_subplot(grid[0, 0]), view, by, colours[by], camera)
     _from_above(figure.add_subplot(grid[0, 1]), view, colours["height"], extent)
     for row, channel in enumerate(view.channels, 1):
@@ -89,14 +97,14 @@ def contact_sheet(
     grid = figure.add_gridspec(
         rows, columns, hspace=0.11, wspace=0.03, left=0.01, right=0.99, bottom=legend / height, top=1 - 0.72 / height
     )
-    figure.text(0.01, 1 - 0.25 / height, title, color=_INK, fontsize=15, va="center")
+    _write_head(figure, title, 0.01, 1 - 0.25 / height)
     for place, view in enumerate(tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)):
         tile = grid[place].subgridspec(1 + len(strips), 1, height_ratios=[5, *[1] * len(strips)], hspace=0.02)
         above, *below = (figure.add_subplot(tile[row]) for row in range(1 + len(strips)))
         _show_pixels(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
         for axes, channel in zip(below, strips, strict=True):
             _show_pixels(axes, picture(view.image, channel, colours[channel]))
-        above.set_title(caption(view.scan, short=True), color=_DIM, fontsize=9, loc="left", pad=3)
+        above.set_title(caption(view.scan, short=True), color=_DIM, fontsize=9, loc="left", pad=3, parse_math=False)
     if by == "label":
         _legend(figure, all_views, colours[by].table)
     return figure
@@ -127,7 +135,7 @@ def histograms(
         bottom=0.7 / height,
         top=1 - 0.9 / height,
     )
-    figure.text(0.01, 1 - 0.3 / height, title, color=_INK, fontsize=14, va="center")
+    _write_head(figure, title, 0.01, 1 - 0.3 / height)
     for place, (name, numbers) in enumerate(values.items()):
         axes = figure.add_subplot(grid[place], facecolor=_BACK)
         colours = [tuple((np.array(colour) / 255).tolist()) for colour in DOMAINS.values()]
@@ -149,6 +157,11 @@ def _figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor=_BACK)
     FigureCanvasAgg(figure)
     return figure
+
+
+def _write_head(figure: Figure, text: str, x: float, y: float) -> None:
+    """Write a heading; names of scans may hold "$", which is no formula."""
+    figure.text(x, y, text, color=_INK, fontsize=15, va="center", parse_math=False)
 
 
 def _show_pixels(axes: Any, pixels: Any) -> None:

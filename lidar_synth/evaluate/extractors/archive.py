@@ -62,7 +62,7 @@ class Archive:
         try:
             with tarfile.open(self.path) as tar:
                 return self._member(tar, name, at_most)
-        except (tarfile.TarError, EOFError, zlib.error, OSError) as error:
+        except (tarfile.TarError, EOFError, zlib.error, OSError, ValueError) as error:
             if isinstance(error, LidarSynthError):
                 raise
             raise DataError(
