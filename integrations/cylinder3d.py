@@ -22,7 +22,8 @@ from lidar_synth.integrations.mixture import (
     points_of,
     read_settings,
     refuse_unlabelled,
-    require_ids,
+    take_classes,
+    trainer_ids,
 )
 
 from lidar_synth.errors import LibraryError
@@ -56,7 +57,7 @@ def register() -> Any:
             if imageset == "train":
                 settings = read_settings()
                 refuse_unlabelled(settings, "Cylinder3D")
-                require_ids(self.learning_map, _IDS)
+                self._ids = trainer_ids(self.learning_map, take_classes(settings), _IDS)
                 self.mixed = mix(len(self.im_idx), settings, lambda scan, rng: scan)
 
         def set_epoch(self, epoch: int) -> None:
@@ -72,7 +73,7 @@ def register() -> Any:
             sample = index if self.mixed is None else self.mixed[index]
             if not isinstance(sample, Scan):
                 return super().__getitem__(sample)
-            points, label = points_of(sample), class_ids(sample, _IDS)[:, None]
+            points, label = points_of(sample), class_ids(sample, self._ids)[:, None]
             return (points[:, :3], label, points[:, 3]) if self.return_ref else (points[:, :3], label)
 
     Mixed.__name__ = NAME

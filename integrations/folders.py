@@ -4,6 +4,7 @@ The folders are complete: labels for every scan (some trainers read a missing ``
 label_2, calib, image_2, planes and ImageSets, so that a trainer's stock loader and converter read them.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +21,7 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA, KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.formats.writer import Writer, claim
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.mixing import MixedScans
 
 COMPARED = 3
@@ -35,12 +36,14 @@ def export_mixture(
     *,
     epoch: int = 0,
     calibration: Calibration | None = None,
+    validation: Source | None = None,
     progress: bool = True,
 ) -> int:
     """Write all samples of a mixture in an epoch; a rerun resumes an interrupted export.
 
     Scans are numbered by their positions, in sequence 00 or in ``training``. ``mixture.csv`` lists frame, domain and id
-    of each, and the plan's hash.
+    of each, and the plan's hash. Scans for validation become sequence 08, or follow the mixture's in ``training`` and
+    are listed in ``ImageSets/val.txt``.
 
     Args:
         mixed: a mixture of scans, with ``to_sample=lambda scan, rng: scan``.
@@ -48,6 +51,7 @@ def export_mixture(
         layout: ``"semantic_kitti"`` or ``"kitti"`` (the object set).
         epoch: the epoch to write.
         calibration: camera 2, for ``"kitti"``; by default an ideal camera at the sensor.
+        validation: real scans that are not in the mixture, for the trainer's validation.
         progress: whether to show a progress bar.
 
     Returns:
@@ -61,30 +65,45 @@ def export_mixture(
     """
     if layout not in ("semantic_kitti", "kitti"):
         raise ConfigError(f"layout {layout!r}", "'semantic_kitti' or 'kitti'")
-    root = Path(out)
+    root, count = Path(out), len(mixed)
     camera = calibration or OBJECT_CAMERA
+    held = [] if validation is None else validation
     claim(root / SETTINGS, {
         "plan": mixed.plan(epoch).hash, "samples": _first_synthetic(mixed, epoch), "layout": layout,
         "projection": camera.projection.tolist(), "camera_from_sensor": camera.camera_from_sensor.tolist(),
-        "image": camera.image_size,
+        "image": camera.image_size, **({} if validation is None else {"validation": len(held)}),
     })  # fmt: skip
     writer: Writer = SemanticKITTIWriter(root) if layout == "semantic_kitti" else KITTIObjectWriter(root)
     rows, written = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"], 0
-    for position in tqdm(range(len(mixed)), unit="scan", disable=not progress):
+    for position in tqdm(range(count), unit="scan", disable=not progress):
         scan = _sample(mixed, epoch, position)
         rows.append(f"{position:06d},{scan.domain},{scan.id}")
-        if writer.complete(position):
-            continue
-        needed = "label" if layout == "semantic_kitti" else "boxes"
-        if getattr(scan, needed) is None:
-            raise DataError(f"scan {scan.id!r} has no {needed}", f"{needed} for {layout!r}", "Choose a label policy.")
-        if layout == "kitti":
-            _write_plane(root, f"{position:06d}", scan, camera)
-        writer.write(scan, position, calibration=None if layout == "semantic_kitti" else camera)
-        written += 1
+        written += _write(writer, scan, position, camera)
+    first = 0 if layout == "semantic_kitti" else count
+    others: Writer = SemanticKITTIWriter(root, sequence="08") if layout == "semantic_kitti" else writer
+    for number in tqdm(range(len(held)), "validation", unit="scan", disable=not progress):
+        written += _write(others, replace(held[number], id=f"validation {number}"), first + number, camera)
     writer.finish()
+    if layout == "kitti" and validation is not None:
+        for split, frames in {"train": range(count), "val": range(count, count + len(held))}.items():
+            listed = "".join(f"{frame:06d}\n" for frame in frames)
+            write_file(root / "ImageSets" / f"{split}.txt", listed.encode())
     write_file(root / MANIFEST, "".join(f"{row}\n" for row in rows).encode())
     return written
+
+
+def _write(writer: Writer, scan: Scan, number: int, camera: Calibration) -> int:
+    """Write a scan with all that the layout needs; returns how many were written, 0 if it is complete."""
+    if writer.complete(number):
+        return 0
+    kitti = isinstance(writer, KITTIObjectWriter)
+    needed = "boxes" if kitti else "label"
+    if getattr(scan, needed) is None:
+        raise DataError(f"scan {scan.id!r} has no {needed}", f"{needed} for this layout", "Choose a label policy.")
+    if kitti:
+        _write_plane(writer.root, f"{number:06d}", scan, camera)
+    writer.write(scan, number, calibration=camera if kitti else None)
+    return 1
 
 
 def _sample(mixed: MixedScans, epoch: int, position: int) -> Scan:

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 
 from lidar_synth.bank import Bank, is_bank
 from lidar_synth.bank.storage import is_url
-from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
+from lidar_synth.datasets.classes import FILE_CLASSES, IGNORE, NAMES, SEMANTIC_KITTI, TRAIN_ID, Taxonomy
 from lidar_synth.errors import ConfigError, DataError, shorten
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
@@ -28,7 +28,18 @@ from lidar_synth.mixing import MixedScans
 VARIABLE = "LIDAR_SYNTH_MIX"
 """Environment variable with the YAML file of settings, for trainers whose configuration allows no further keys."""
 
-OPTIONS = ("synthetic", "ratio", "labels", "seed", "reuse", "epoch_size", "label_options", "unboxed", "as_sensor")
+OPTIONS = (
+    "synthetic",
+    "ratio",
+    "labels",
+    "seed",
+    "reuse",
+    "epoch_size",
+    "label_options",
+    "unboxed",
+    "as_sensor",
+    "classes",
+)
 """Keys of the settings: the source of synthetic scans, and arguments of ``MixedScans``."""
 
 
@@ -99,12 +110,63 @@ def mix(real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.ra
     """
     if unknown := sorted(set(settings) - set(OPTIONS)):
         raise ConfigError(f"settings {unknown} of a mixture", f"some of {', '.join(OPTIONS)}")
+    if "classes" in settings:
+        raise ConfigError(
+            f"classes: {settings['classes']} for this trainer",
+            "no key classes: SemanticKITTI's",
+            "The adapters of lidar-bonnetal's family, Cylinder3D and Pointcept take others.",
+        )
     if settings.get("synthetic") is None:
         raise ConfigError("a mixture without synthetic scans", "synthetic: a bank's folder, a checkpoint or a folder")
     options = {key: value for key, value in settings.items() if key != "synthetic"}
     synthetic = open_synthetic(settings["synthetic"])
     options["as_sensor"] = read_transfer(settings.get("as_sensor"), synthetic)
     return MixedScans.wrap(range(real), synthetic, to_sample=to_sample, compare=False, **options)  # numbers, no samples
+
+
+def take_classes(settings: dict[str, Any]) -> Taxonomy:
+    """Take the key ``classes`` out of settings: the class ids of the trainer's label files.
+
+    Args:
+        settings: ``classes`` is a name of ``FILE_CLASSES`` or {class name of SemanticKITTI: id in the files}; classes
+            that it leaves out are unlabelled (0). By default SemanticKITTI's.
+
+    Raises:
+        ConfigError: on another name, class or id.
+    """
+    given = settings.pop("classes", "semantic_kitti")
+    if not isinstance(given, Mapping):
+        if given not in FILE_CLASSES:
+            raise ConfigError(f"classes: {given}", f"one of {', '.join(FILE_CLASSES)}, or {{class name: id}}")
+        return FILE_CLASSES[given]
+    wrong = {n: i for n, i in given.items() if n not in TRAIN_ID or type(i) is not int or not 0 < i < 1 << 16}
+    if wrong or not given:
+        raise ConfigError(f"classes: {wrong}", f"ids from 1 to 65535 by some of {', '.join(NAMES)}")
+    return Taxonomy(
+        "classes", {0: IGNORE} | {i: TRAIN_ID[n] for n, i in given.items()}, tuple(given.get(n, 0) for n in NAMES)
+    )
+
+
+def trainer_ids(learning_map: Mapping[int, int], taxonomy: Taxonomy, table: NDArray[Any]) -> NDArray[Any]:
+    """(256,) a trainer's id by train id, through its own map of the ids in its label files.
+
+    Args:
+        learning_map: the trainer's id by the file's class.
+        taxonomy: of the files, see ``take_classes``.
+        table: (256,) what SemanticKITTI's classes must get, see ``id_table``.
+
+    Raises:
+        ConfigError: if the map has not the file's classes, or gives SemanticKITTI's other ids.
+    """
+    if taxonomy is SEMANTIC_KITTI:
+        require_ids(learning_map, table)
+        return table
+    classes = taxonomy.encode(np.arange(len(NAMES), dtype=np.uint8)).tolist()
+    if missing := sorted({raw for raw in classes if raw} - set(learning_map)):
+        raise ConfigError(f"a map of classes without {missing}", f"the ids of {taxonomy.name}", "Set classes.")
+    ids = np.full_like(table, table[IGNORE])
+    ids[: len(NAMES)] = [learning_map[raw] if raw else table[IGNORE] for raw in classes]
+    return ids
 
 
 def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:

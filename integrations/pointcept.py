@@ -20,7 +20,8 @@ from lidar_synth.integrations.mixture import (
     points_of,
     read_settings,
     refuse_unlabelled,
-    require_ids,
+    take_classes,
+    trainer_ids,
 )
 
 from lidar_synth.datasets.classes import IGNORE
@@ -59,8 +60,8 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
         self._labelled = settings.get("labels", "generated") not in ("none", "ignore")
         if collects_labels(options.get("transform")):
             refuse_unlabelled(settings, "Pointcept")
-        self._ids = id_table(0, self.ignore_index, np.int32)
-        require_ids(self.learning_map, self._ids)
+        taxonomy = take_classes(settings)
+        self._ids = trainer_ids(self.learning_map, taxonomy, id_table(0, self.ignore_index, np.int32))
         self.mixed = mix(len(self.data_list), settings, lambda scan, rng: scan)
 
     def set_epoch(self, epoch: int) -> None:

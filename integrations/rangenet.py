@@ -17,11 +17,19 @@ from typing import Any
 
 import numpy as np
 from lidar_synth.integrations.launcher import prepare_script, run
-from lidar_synth.integrations.mixture import class_ids, id_table, mix, points_of, read_settings, refuse_unlabelled
+from lidar_synth.integrations.mixture import (
+    class_ids,
+    id_table,
+    mix,
+    points_of,
+    read_settings,
+    refuse_unlabelled,
+    take_classes,
+)
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from lidar_synth.datasets.classes import SEMANTIC_KITTI
+from lidar_synth.datasets.classes import Taxonomy
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry.scan import Scan
@@ -69,7 +77,9 @@ def dataset_class(stock: Any) -> Any:
             refuse_unlabelled(settings, "a range-view trainer")
             if not self.gt:
                 raise ConfigError("a mixture without labels (gt=False)", "gt=True, for training")
-            _check_classes(self.learning_map, self.learning_map_inv)
+            settings = dict(settings)
+            self.taxonomy = take_classes(settings)
+            _check_classes(self.learning_map, self.learning_map_inv, self.taxonomy)
             self.mixed = mix(len(self.scan_files), settings, lambda scan, rng: scan)
             check_stripes(self)
 
@@ -93,7 +103,7 @@ def dataset_class(stock: Any) -> Any:
                 )
             with tempfile.TemporaryDirectory(dir=_MEMORY) as folder:
                 files = self.scan_files, self.label_files
-                self.scan_files, self.label_files = ([path] for path in _write(Path(folder), sample))
+                self.scan_files, self.label_files = ([path] for path in _write(Path(folder), sample, self.taxonomy))
                 try:
                     return super().__getitem__(0)
                 finally:
@@ -258,26 +268,26 @@ def main() -> None:
     run(script)
 
 
-def _write(folder: Path, scan: Scan) -> tuple[str, str]:
+def _write(folder: Path, scan: Scan, taxonomy: Taxonomy) -> tuple[str, str]:
     """Write the scan as the two files of sequence ``synthetic``; the trainer reads names from the path."""
     name = "".join(letter if letter.isalnum() else "_" for letter in scan.id)
     class_ids(scan, _TRAIN_IDS)  # refuses a scan without a valid label
     paths = [folder / "synthetic" / kind / f"{name}.{ext}" for kind, ext in (("velodyne", "bin"), ("labels", "label"))]
-    for path, values in zip(paths, (points_of(scan), encode_labels(scan, SEMANTIC_KITTI)), strict=True):
+    for path, values in zip(paths, (points_of(scan), encode_labels(scan, taxonomy)), strict=True):
         path.parent.mkdir(parents=True)
         path.write_bytes(values.astype(values.dtype.newbyteorder("<")).tobytes())
     return str(paths[0]), str(paths[1])
 
 
-def _check_classes(learning_map: dict[int, int], inverse: dict[int, int]) -> None:
-    """Check that the trainer's classes distinguish our 19: mapping each class and back must not change it."""
-    raw = SEMANTIC_KITTI.from_train or ()
+def _check_classes(learning_map: dict[int, int], inverse: dict[int, int], taxonomy: Taxonomy) -> None:
+    """Check that the trainer's classes distinguish ours: mapping each class and back must not change it."""
+    raw = sorted(set(taxonomy.from_train or ()) - {0})
     lost = [c for c in raw if inverse.get(learning_map.get(c, -1)) != c]
     if lost or learning_map.get(0) != 0:
         raise ConfigError(
-            f"a learning_map in which SemanticKITTI's classes {lost or [0]} do not come back",
-            "its 19 classes, and 0 = unlabelled",
-            "Use the stock config/labels/semantic-kitti.yaml.",
+            f"a learning_map in which {taxonomy.name}'s classes {lost or [0]} do not come back",
+            "its classes, and 0 = unlabelled",
+            "Use the stock config/labels/semantic-kitti.yaml, or set classes in the mixture's YAML.",
         )
 
 

@@ -231,6 +231,20 @@ def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:
         assert abs(read_plane(root / "training" / "planes" / f"{i:06d}.txt")[3] - 1.73) < 0.05
 
 
+@pytest.mark.parametrize("layout", ["semantic_kitti", "kitti"])
+def test_an_export_has_validation_apart_from_training(mixed: MixedScans, tmp_path: Path, layout: Any) -> None:
+    held = [street(i) for i in (7, 8)]
+    options = {"calibration": CAMERA, "validation": held, "progress": False}
+    assert export_mixture(mixed, tmp_path / "out", layout, **options) == 7
+    assert export_mixture(mixed, tmp_path / "out", layout, **options) == 0
+    train, val = (open_scans(tmp_path / "out", split=split) for split in ("train", "val"))
+    assert len(train) == 5 and len(val) == 2
+    wanted = [scan if layout == "semantic_kitti" else in_view(scan, CAMERA) for scan in held]
+    for scan, own in zip(val, wanted, strict=True):
+        assert layout == "kitti" or np.array_equal(scan.points, own.points)
+        assert scan.boxes is None or len(scan.boxes) == len(own.boxes or ())
+
+
 def test_scans_without_labels_are_not_exported(tmp_path: Path) -> None:
     """Trap: KITTI-360 has no label per scan."""
     real = [replace(street(i), label=None, raw_label=None) for i in range(2)]

@@ -59,6 +59,27 @@ def test_a_command_runs_as_a_user_does(trial: Any, monkeypatch: pytest.MonkeyPat
     assert str(trial.folder) in output and "'GIVEN': '1'" in output and "PYTHONPATH" not in output
 
 
+def test_a_trial_types_the_commands_of_the_page(
+    script: Any, trial: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As they stand in the Markdown, in one shell; a name that the page no longer has fails the trial."""
+    page = tmp_path / "docs" / "how-to" / "trainers" / "some.md"
+    page.parent.mkdir(parents=True)
+    page.write_text("# Some\n\n```python\nno\n```\n\n```sh\npip install x\ncd TREE    # yours\nexport A=B\n```\n"
+                    "\n```sh\necho $PWD $A \\\n    TREES --set -p \"\"    # more\n```\n")  # fmt: skip
+    monkeypatch.setattr(sys.modules["trainers.trial"], "ROOT", tmp_path)
+    said = trial.type_page("type", Path(sys.executable), "some", {"TREE": trial.folder, "B": "C"}, skip="^pip")
+    assert said.splitlines()[-1] == f"{trial.folder} C TREES --set -p "
+    with pytest.raises(script.Failed, match="some.md has no 'OUT'"):
+        trial.type_page("type", Path(sys.executable), "some", {"OUT": "x"}, skip="^pip")
+
+
+@pytest.mark.parametrize("page", ["range-view", "cylinder3d", "waffleiron", "openpcdet", "pointcept"])
+def test_pages_name_what_to_install_and_how_to_train(script: Any, page: str) -> None:
+    commands = sys.modules["trainers.trial"].commands_of(page)
+    assert commands[0].startswith("pip install ") and any("train" in each for each in commands)
+
+
 def test_the_source_tree_is_a_copy(script: Any, trial: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(script.Failed, match="SOME_ROOT= names no folder"):
         trial.tree("SOME_ROOT")

@@ -3,10 +3,11 @@
 Inside the package a label is a train id 0..18 as uint8, or ``IGNORE`` (255) for unlabelled points.
 The sources are http://www.semantic-kitti.org/dataset.html (``semantic-kitti.yaml``),
 https://www.cvlibs.net/datasets/kitti-360/documentation.php,
-https://www.nuscenes.org/nuscenes#lidarseg and PandaSet's ``classes.json``.
+https://www.nuscenes.org/nuscenes#lidarseg, PandaSet's ``classes.json``, Waymo's ``segmentation.proto`` and
+http://www.poss.pku.edu.cn/semanticposs.html.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -119,7 +120,7 @@ class Taxonomy:
             DataError: on a train id that is neither 0..18 nor ``IGNORE``, or if ``from_train`` is None.
         """
         if self.from_train is None:
-            raise DataError(f"no table from train ids to {self.name}", "SemanticKITTI or KITTI-360")
+            raise DataError(f"no table from train ids to {self.name}", f"one of {', '.join(FILE_CLASSES)}")
         table = np.zeros(256, np.uint32)
         table[: len(NAMES)] = self.from_train
         bad = (train >= len(NAMES)) & (train != IGNORE)
@@ -128,7 +129,7 @@ class Taxonomy:
         return table[train]
 
 
-def _by_name(table: Mapping[str, tuple[int, ...]], known: range) -> dict[int, int]:
+def _by_name(table: Mapping[str, tuple[int, ...]], known: Iterable[int]) -> dict[int, int]:
     """{id: train id} from {class name: ids}; the ids of ``known`` that no class names are ignored."""
     ids = dict.fromkeys(known, IGNORE)
     return ids | {i: TRAIN_ID[name] for name, group in table.items() for i in group}
@@ -200,3 +201,54 @@ PANDASET = Taxonomy(
 are road, driveways are sidewalk and pickups are trucks as in SemanticKITTI; barriers become fence. Ignored: smoke,
 exhaust, spray and reflections (1 to 4), personal mobility devices (24), animals (32, 33), pylons and cones (34, 37),
 rolling containers (40) and *other static object* (42), which holds poles, walls and fences alike."""
+
+NUSCENES_16 = Taxonomy(
+    "nuScenes-lidarseg's 16 classes",
+    _by_name(
+        {
+            "car": (4,), "bicycle": (2,), "motorcycle": (6,), "truck": (10,), "other-vehicle": (3, 5, 9),
+            "person": (7,), "road": (11,), "sidewalk": (13,), "other-ground": (12,), "building": (15,), "fence": (1,),
+            "vegetation": (16,), "terrain": (14,),
+        },
+        range(17),
+    ),
+    (4, 2, 6, 10, 0, 7, 2, 6, 11, 11, 13, 12, 15, 15, 16, 16, 14, 15, 15),
+)  # fmt: skip
+"""The challenge's 16 classes, 0 = ignored. Lossy, as ``NUSCENES``; other vehicles (buses, trailers and construction
+vehicles there) are not written, and fences, poles and signs are written as manmade."""
+
+WAYMO = Taxonomy(
+    "Waymo Open's 22 classes",
+    _by_name(
+        {
+            "car": (1,), "bicycle": (12,), "motorcycle": (13,), "truck": (2,), "other-vehicle": (3, 4), "person": (7,),
+            "bicyclist": (6,), "motorcyclist": (5,), "road": (18, 19), "sidewalk": (17, 22), "other-ground": (20,),
+            "building": (14,), "vegetation": (15,), "trunk": (16,), "terrain": (21,), "pole": (10,),
+            "traffic-sign": (8,),
+        },
+        range(23),
+    ),
+    (1, 12, 13, 2, 4, 7, 6, 5, 18, 18, 22, 0, 14, 0, 15, 16, 21, 10, 8),
+)  # fmt: skip
+"""Waymo's 3D segmentation, 0 = undefined. Lossy: curbs are sidewalk, lane markers are road, and *walkable* is terrain;
+fences and other ground are not written."""
+
+SEMANTIC_POSS = Taxonomy(
+    "SemanticPOSS",
+    _by_name(
+        {
+            "car": (7,), "bicycle": (21,), "person": (4, 5), "bicyclist": (6,), "road": (22,), "building": (15,),
+            "fence": (17,), "vegetation": (9,), "trunk": (8,), "pole": (13,), "traffic-sign": (10, 11, 12),
+        },
+        (0, 1, *range(4, 23)),
+    ),
+    (7, 21, 21, 0, 0, 4, 6, 6, 22, 22, 22, 22, 15, 17, 9, 8, 22, 13, 10),
+)  # fmt: skip
+"""SemanticPOSS' file ids. Lossy: all ground is one class (read as road), as are riders and as are bikes; trucks and
+other vehicles are not written."""
+
+FILE_CLASSES = {
+    "semantic_kitti": SEMANTIC_KITTI, "kitti360": KITTI360, "nuscenes": NUSCENES_16, "waymo": WAYMO,
+    "semantic_poss": SEMANTIC_POSS,
+}  # fmt: skip
+"""Tables by the name of the key ``classes`` in a mixture's settings."""

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import yaml
 
-from trainers.rangenet import environment
+from trainers.rangenet import mixture
 from trainers.trial import Failed, Row, Trial
 
 TITLE = "Cylinder3D"
@@ -12,8 +12,7 @@ TITLE = "Cylinder3D"
 
 def rows(trial: Trial) -> Iterator[Row]:
     """Two epochs: its script validates from the second on."""
-    python = trial.environment("strictyaml", "spconv", "setuptools", "wheel")
-    trial.install(python, "torch-scatter", options=["--no-build-isolation", "--no-deps"])
+    python = trial.environment()
     tree = trial.tree("CYLINDER3D_ROOT")
     own = yaml.safe_load((tree / "config/semantickitti.yaml").read_text())
     own["dataset_params"]["pc_dataset_type"] = "SemKITTI_mixed"
@@ -25,10 +24,9 @@ def rows(trial: Trial) -> Iterator[Row]:
     own["train_params"] |= {"model_load_path": str(model), "model_save_path": str(model)}
     config = trial.folder / "mixed.yaml"
     config.write_text(yaml.safe_dump(own))
-    command = [python, "-m", "lidar_synth.integrations.cylinder3d", "train_cylinder_asym.py", "--config_path", config]
-    trial.run(
-        "train", command,
-        cwd=tree, env=environment(trial), minutes=120,
+    names = {"Cylinder3D": tree, "/data/mix.yaml": mixture(trial), "config/mixed.yaml": config}
+    trial.type_page(
+        "train", python, "cylinder3d", names, minutes=120,
         expect=[r"epoch 1: \d+ samples, [1-9]\d* of them synthetic", r"loss: \d", r"Current val loss is \d"],
     )  # fmt: skip
     if not model.is_file():

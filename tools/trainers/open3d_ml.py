@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from trainers.rangenet import environment
+from trainers.rangenet import mixture
 from trainers.trial import Failed, Row, Trial
 
 TITLE = "Open3D-ML, RandLANet"
@@ -17,7 +17,7 @@ def rows(trial: Trial) -> Iterator[Row]:
     data.mkdir()
     (data / "dataset").symlink_to(trial.data.semantic_kitti)
     trial.run(
-        "train", [python, SCRIPT, data, trial.folder / "mix.yaml"], env=environment(trial), minutes=90,
+        "train", [python, SCRIPT, data, mixture(trial)], minutes=90,
         expect=[r"epoch 1: \d+ samples, [1-9]\d* of them synthetic", r"Loss train: \d", r"eval: \d"],
     )  # fmt: skip
     if not list(trial.folder.rglob("ckpt_00001.pth")):

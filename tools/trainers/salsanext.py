@@ -2,8 +2,9 @@
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
-from trainers.rangenet import EPOCH, PACKAGES, WIDTH, clone, command, environment
+from trainers.rangenet import EPOCH, PAGE, WIDTH, clone, configure, mixture
 from trainers.trial import STEPS, Failed, Row, Trial
 
 TITLE = "SalsaNext"
@@ -11,16 +12,18 @@ TITLE = "SalsaNext"
 
 def rows(trial: Trial) -> Iterator[Row]:
     """Two epochs in one run, and one epoch with one more in a resumed run."""
-    python = trial.environment(*PACKAGES)
-    tree = clone(trial, "SALSANEXT_ROOT")
-    options = {"cwd": tree / "train/tasks/semantic", "env": environment(trial)}
+    python = trial.environment()
+    root = clone(trial, "SALSANEXT_ROOT")
+    tree = root / "train/tasks/semantic"
+    (tree / "salsanext.yml").write_text((root / "salsanext.yml").read_text())
     expect = [r"Loss \d", "Validation set:", "Finished Training"]
 
-    def train(title: str, epochs: int, folder: object) -> str:
-        arguments = command(trial, python, tree, "salsanext.yml", epochs=epochs, width=WIDTH)
-        return trial.run(title, [*arguments, "-p", folder], **options, expect=expect, minutes=120)
+    def train(title: str, epochs: int, resumed: Path | None = None) -> str:
+        names = configure(trial, tree, "salsanext.yml", epochs=epochs, width=WIDTH) | {"LOG": trial.folder / "log"}
+        names |= {"/data/mix.yaml": mixture(trial)} | ({'-p ""': f"-p {resumed}"} if resumed else {})
+        return trial.type_page(title, python, PAGE, names, skip="NAME", expect=expect, minutes=120)
 
-    said = train("train", 1, "")
+    said = train("train", 1)
     (log,) = (trial.folder / "log" / "logs").iterdir()
     if not re.search(EPOCH, said) or not (log / "SalsaNext").is_file():
         raise Failed("no synthetic scans, or no checkpoint")

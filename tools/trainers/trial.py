@@ -10,6 +10,7 @@ import venv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from trainers.data import Data
 
@@ -162,12 +163,47 @@ class Trial:
                 raise Failed(f"{title}: the output lacks {pattern!r}; {log}")
         return output
 
+    def type_page(
+        self, title: str, python: Path, page: str, names: Mapping[str, object], *, skip: str = "(?!)", **options: Any
+    ) -> str:
+        """Type the shell commands of a trainer's page as they stand, in one shell.
+
+        Args:
+            title: name of the log.
+            python: of the environment, whose programs come first.
+            page: name of a page of ``docs/how-to/trainers``.
+            names: what the reader has in place of names in the page, such as ``{"/data/mix.yaml": file}``.
+            skip: a regular expression of commands that the reader leaves out.
+            options: of ``run``.
+
+        Returns:
+            The output.
+
+        Raises:
+            Failed: if the page lacks one of the names, or a command fails.
+        """
+        script = "\n".join(command for command in commands_of(page) if not re.search(skip, command))
+        for name, own in names.items():
+            pattern = rf"(?<![\w./-]){re.escape(name)}(?![\w./-])"
+            if not re.search(pattern, script):
+                raise Failed(f"{title}: {page}.md has no {name!r} in {script!r}")
+            script = re.sub(pattern, str(own).replace("\\", r"\\"), script)
+        path = {"PATH": f"{python.parent}{os.pathsep}{os.environ['PATH']}"}
+        return self.run(title, ["bash", "-euxc", script], env=path | dict(options.pop("env", {})), **options)
+
     def row(self, script: str, ran: Sequence[str], left_out: str = "", *, failed: bool = False) -> Row:
         """A line of the table, with the minutes since the line before."""
         assert set(ran) <= set(STEPS), ran
         now = time.monotonic()
         minutes, self._began = (now - self._began) / 60, now
         return Row(self.title, script, tuple(ran), left_out, minutes, failed)
+
+
+def commands_of(page: str) -> list[str]:
+    """The commands in the shell blocks of a page of ``docs/how-to/trainers``, without comments."""
+    text = (ROOT / "docs" / "how-to" / "trainers" / f"{page}.md").read_text()
+    code = "\n".join(re.findall(r"^```sh\n(.*?)^```$", text, re.S | re.M)).replace("\\\n", " ")
+    return [line for line in (re.sub(r"(^|\s+)#.*", "", line) for line in code.splitlines()) if line]
 
 
 def wheel_of_checkout(folder: Path) -> Path:

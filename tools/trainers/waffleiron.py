@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import yaml
 
-from trainers.rangenet import environment
+from trainers.rangenet import mixture
 from trainers.trial import STEPS, Failed, Row, Trial
 
 TITLE = "WaffleIron"
@@ -14,7 +14,7 @@ NAME = "semantic_kitti_mixed"
 
 def rows(trial: Trial) -> Iterator[Row]:
     """Two epochs in one run; one epoch, and a second one in a resumed run."""
-    python = trial.environment("scipy", "tensorboard")
+    python = trial.environment()
     tree = trial.tree("WAFFLEIRON_ROOT")
     dataset = trial.folder / "KITTI"
     dataset.mkdir()
@@ -24,14 +24,14 @@ def rows(trial: Trial) -> Iterator[Row]:
     own["dataloader"] |= {"batch_size": 2, "num_workers": 1, "max_points": 5000}
     own["waffleiron"] |= {"depth": 6, "nb_channels": 64}
 
-    def train(log: str, epochs: int, *more: str) -> str:
+    def train(log: str, epochs: int, more: str = "") -> str:
         config = trial.folder / f"{log}-{epochs}.yaml"
         own["scheduler"] |= {"max_epoch": epochs, "epoch_warmup": 0.5}
         config.write_text(yaml.safe_dump(own))
-        command = [python, "-m", "lidar_synth.integrations.waffleiron", "launch_train.py", "--dataset", NAME]
-        files = ["--path_dataset", dataset, "--config", config, "--log_path", trial.folder / log, "--gpu", "0"]
-        said = trial.run(
-            f"{log} {epochs}", [*command, *files, *more], cwd=tree, env=environment(trial), minutes=60,
+        names = {"WaffleIron": tree, "/data/mix.yaml": mixture(trial), "KITTI": dataset}
+        names |= {"configs/WaffleIron-48-256__kitti.yaml": config, "LOG": f"{trial.folder / log} {more}"}
+        said = trial.type_page(
+            f"{log} {epochs}", python, "waffleiron", names, minutes=60,
             expect=[r"Loss = \d", "Validation: ", "Finished Training"],
         )  # fmt: skip
         found = re.findall(r"lidar_synth: epoch 1: .*", said)
