@@ -50,6 +50,7 @@ def test_the_command_line_has_every_command_and_no_control_characters() -> None:
         "bank merge",
         "bank split",
         "bank head",
+        "bank as-sensor",
         "edit remove",
         "edit insert",
         "edit move",
