@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,11 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from lidar_synth import Town
+from lidar_synth.cli import app
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError
-from lidar_synth.formats import open_scans
+from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
 from lidar_synth.mixing.meaning import contradictions, measure_tables, table_of
@@ -130,6 +133,29 @@ def test_the_ground_a_little_lower_is_only_reported(caplog: pytest.LogCaptureFix
     with caplog.at_level(logging.WARNING):
         wrapped("tuple", lower, streets(1), streets(2))
     assert "samples are unlike the real ones: [0]: the ground is at z =" in caplog.text
+
+
+def write_folder(scans: list[Scan], root: Path) -> Path:
+    writer = WRITERS["npz"](root)
+    for index, scan in enumerate(scans):
+        writer.write(scan, index)
+    writer.finish()
+    return root
+
+
+def test_check_mix_shows_both_and_names_mistakes(tmp_path: Path) -> None:
+    write_folder(streets(1), tmp_path / "real")
+    settings = tmp_path / "mix.yaml"
+    arguments = ["check-mix", str(settings), str(tmp_path / "real"), "--count", "4"]
+    settings.write_text(f"synthetic: {write_folder(streets(2), tmp_path / 'synthetic')}\nratio: 0.1\n")
+    done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "mix.png")])
+    assert done.exception is None and (tmp_path / "mix.png").stat().st_size > 10_000
+    for line in ("points of a scan", "rows in use", "ground, m", "reflectance: 1, 50, 99 %", "8 road"):
+        assert line in done.output
+    upside_down = [replace(scan, points=scan.points * np.float32([1, 1, -1])) for scan in streets(2)]
+    settings.write_text(f"synthetic: {write_folder(upside_down, tmp_path / 'wrong')}\n")
+    done = CliRunner().invoke(app, arguments)
+    assert isinstance(done.exception, ConfigError) and "z points down" in str(done.exception)
 
 
 def real_sources(real: Path, labelled: Path) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from lidar_synth import __version__
 from lidar_synth.cli.adapt import adapt
 from lidar_synth.cli.bake import bake
 from lidar_synth.cli.bank import bank, info, repair, verify
+from lidar_synth.cli.check_mix import check_mix
 from lidar_synth.cli.convert import convert
 from lidar_synth.cli.curate import curate
 from lidar_synth.cli.doctor import doctor
@@ -52,6 +53,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "evaluate": evaluate,
     "prove": prove,
     "adapt": adapt,
+    "check-mix": check_mix,
     "import": import_,
     "doctor": doctor,
 }

@@ -22,7 +22,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.mixing.meaning import Contradiction, Table, contradictions, measure_tables
+from lidar_synth.mixing.meaning import Contradiction, Table, contradictions, measure_tables, spread
 from lidar_synth.mixing.synthetic import Generated, Synthetic
 from lidar_synth.noise import keyed_rng
 
@@ -94,8 +94,8 @@ def check_alike(
                     "Change to_sample, or pass compare=False if the collate function expects them to differ.",
                 )
             if _tables(expected) and not _is_on_demand(source):
-                more = [_try("real", dataset.__getitem__, i) for i in _spread(len(dataset))[1:]]
-                numbers = _spread(source.length or SEARCHED)
+                more = [_try("real", dataset.__getitem__, i) for i in spread(len(dataset), SEARCHED)[1:]]
+                numbers = spread(source.length or SEARCHED, SEARCHED)
                 made = [
                     _try("synthetic", lambda i, n, s: finish(n, s[i], keyed_rng(i)), i, number, source) for i in numbers
                 ]
@@ -258,11 +258,6 @@ def _rows(array: NDArray[Any]) -> NDArray[np.float64] | None:
         array = array.T
     fits = array.ndim == 2 and 0 < array.shape[1] <= MOST_COLUMNS and len(array) >= LEAST_POINTS
     return array.astype(np.float64) if fits and np.isfinite(array).all() else None
-
-
-def _spread(length: int) -> list[int]:
-    """Up to ``SEARCHED`` indices from the first to the last of a source."""
-    return np.unique(np.linspace(0, length - 1, SEARCHED).astype(int)).tolist() if length else []
 
 
 def _arrays(value: Any, place: str = "sample", depth: int = DEPTH) -> Iterator[tuple[str, NDArray[Any]]]:

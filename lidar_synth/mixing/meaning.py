@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
+from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 
 Floats = NDArray[np.float64]
@@ -32,6 +33,9 @@ VARIED = 8
 
 OTHER_UNIT, UNUSUAL_UNIT = 6.0, 3.0
 """Ratios of median ranges: refused, and reported. Sensors are up to 2.8 apart, feet 3.3, centimetres 100."""
+
+OTHER_SIZE = 1.5
+"""Ratio of numbers of points that is reported."""
 
 OTHER_SCALE = 10.0
 """Ratio of the spread of a column that is refused."""
@@ -116,6 +120,17 @@ def table_of(scan: Scan) -> Table:
     return Table(columns, None if scan.label is None else scan.label.astype(np.int64), True)
 
 
+def spread(length: int, count: int) -> list[int]:
+    """Up to ``count`` indices from the first to the last of a source."""
+    return sorted({int(index) for index in np.linspace(0, length - 1, count)}) if length else []
+
+
+def rows_in_use(scans: Sequence[Scan]) -> int:
+    """The median number of rows of a scan's range image with returns in at least 2 % of their columns."""
+    filled = [(project(scan).range > 0).mean(1) >= 0.02 for scan in scans]
+    return int(np.median([rows.sum() for rows in filled]))
+
+
 def measure_tables(tables: Sequence[Table], ignored: Sequence[int]) -> Meaning:
     """Measure samples of one kind.
 
@@ -197,10 +212,14 @@ def contradictions(real: Meaning, synthetic: Meaning, place: str = "") -> Iterat
         real, synthetic: of arrays with the same columns.
         place: the arrays' name within a sample.
     """
+    coordinates = 0 if np.isnan(real.distance) else 3
     unit = list(_unit(real, synthetic))
     named = f"{place}: " if place else ""
+    size = max(real.points, synthetic.points) / min(real.points, synthetic.points)
+    if coordinates and size > OTHER_SIZE:
+        text = f"{named}{synthetic.points:,.0f} points instead of {real.points:,.0f}: density tells them apart"
+        yield Contradiction(text, False)
     geometry = unit or [*_heights(real, synthetic), *_axes(real, synthetic)]
-    coordinates = 0 if np.isnan(real.distance) else 3
     for found in [*geometry, *_columns(real, synthetic, coordinates), *_classes(real, synthetic)]:
         yield Contradiction(named + found.text, found.certain)
 

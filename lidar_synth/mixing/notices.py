@@ -11,13 +11,11 @@ from torch.utils.data import get_worker_info
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.labels.edit import measure
+from lidar_synth.mixing.meaning import OTHER_SIZE
 from lidar_synth.mixing.plan import MixingPlan
 
 log = logging.getLogger(__name__)
 
-
-OTHER_SIZE = 1.5
-"""Ratio of the numbers of points of real and synthetic scans that is reported."""
 
 FEW = 4
 """Number of scans of each kind whose points are counted before the numbers are compared."""

@@ -1,0 +1,116 @@
+"""Mixtures from plain settings, as trainers' configurations and YAML files hold them."""
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.bank import Bank, is_bank
+from lidar_synth.bank.storage import is_url
+from lidar_synth.errors import ConfigError, shorten
+from lidar_synth.files.parsing import read_yaml
+from lidar_synth.formats import open_scans
+from lidar_synth.formats.as_sensor import read_transfer
+from lidar_synth.generate.generator import load_generator
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.mixing.scans import MixedScans
+
+VARIABLE = "LIDAR_SYNTH_MIX"
+"""Environment variable with the YAML file of settings, for trainers whose configuration allows no further keys."""
+
+OPTIONS = (
+    "synthetic",
+    "ratio",
+    "labels",
+    "seed",
+    "reuse",
+    "epoch_size",
+    "label_options",
+    "unboxed",
+    "as_sensor",
+    "classes",
+)
+"""Keys of the settings: the source of synthetic scans, and arguments of ``MixedScans``."""
+
+
+def open_synthetic(where: Any) -> Any:
+    """Open the source of synthetic scans that a configuration names.
+
+    Args:
+        where: a bank's folder or URL, a checkpoint (``.safetensors``), the name of a shipped model, or a folder of
+            scans in any layout that ``open_scans`` reads. Any other object is returned unchanged.
+
+    Raises:
+        ConfigError, FileError, DataError: if there is no such source.
+    """
+    if not isinstance(where, str | Path):
+        return where
+    if is_url(where):
+        return Bank(where)
+    if not os.path.isdir(where):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
+        return load_generator(where)
+    if is_bank(where):
+        return Bank(where)
+    scans = open_scans(where)
+    own = scans[0].sensor  # files may store their own sensor
+    return scans if scans.sensor.shape == own.shape else open_scans(where, sensor=own)
+
+
+def read_settings(given: Any = None) -> dict[str, Any]:
+    """Read the settings of a mixture, with keys in lower case.
+
+    Args:
+        given: the settings or a YAML file; by default the file in the environment variable ``LIDAR_SYNTH_MIX``.
+
+    Raises:
+        ConfigError: if there are no settings.
+        FileError, DataError: if the file cannot be read.
+    """
+    source = given if given is not None else os.environ.get(VARIABLE)
+    if isinstance(source, str | Path):
+        given = read_yaml(Path(source), "the settings of a mixture")
+    if not isinstance(given, Mapping):
+        raise ConfigError(
+            f"{source!r} as the settings of a mixture",
+            f"a dict of {', '.join(OPTIONS)}, or a YAML file of them",
+            f"Set the file in the trainer's configuration or by {VARIABLE}=mix.yaml.",
+        )
+    settings = {str(key).lower(): value for key, value in given.items()}
+    options = settings.get("label_options")
+    if isinstance(options, Mapping):
+        settings["label_options"] = {str(key).lower(): value for key, value in options.items()}
+    elif options is not None:
+        raise ConfigError(f"label_options: {shorten(str(options), 40)}", "options by name, such as threshold: 0.5")
+    return settings
+
+
+def mix(real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.random.Generator], Any]) -> MixedScans:
+    """Make a mixture from settings, for a trainer that loads real samples itself.
+
+    Args:
+        real: number of the trainer's real samples.
+        settings: keys of ``OPTIONS``; ``synthetic`` is required.
+        to_sample: ``(scan, rng) -> sample`` for synthetic scans.
+
+    Returns:
+        A dataset whose real samples are only their numbers, 0 <= n < real, by which the trainer loads them.
+
+    Raises:
+        ConfigError: on an unknown key, or settings that ``MixedScans`` refuses.
+    """
+    if unknown := sorted(set(settings) - set(OPTIONS)):
+        raise ConfigError(f"settings {unknown} of a mixture", f"some of {', '.join(OPTIONS)}")
+    if "classes" in settings:
+        raise ConfigError(
+            f"classes: {settings['classes']} for this trainer",
+            "no key classes: SemanticKITTI's",
+            "The adapters of lidar-bonnetal's family, Cylinder3D and Pointcept take others.",
+        )
+    if settings.get("synthetic") is None:
+        raise ConfigError("a mixture without synthetic scans", "synthetic: a bank's folder, a checkpoint or a folder")
+    options = {key: value for key, value in settings.items() if key != "synthetic"}
+    synthetic = open_synthetic(settings["synthetic"])
+    options["as_sensor"] = read_transfer(settings.get("as_sensor"), synthetic)
+    return MixedScans.wrap(range(real), synthetic, to_sample=to_sample, compare=False, **options)  # numbers, no samples
