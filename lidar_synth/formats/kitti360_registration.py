@@ -19,12 +19,13 @@ _SIDE = 0.5  # metres, of a cube
 _FEWEST = 6  # points of a cube that show its shape
 _THIN = 0.08  # metres, standard deviation up to which a cube says where points lie
 _NOISE = 0.03  # metres, of points across a surface
-_MOST = 5_000_000  # points of a cloud that are used
+_MOST = 4_000_000  # points of a cloud that are used
 _WIDE, _CLOSE = (2.0, 1.5, 1.0, 0.7), (0.7, 0.5)  # metres between a point and its cube, for three steps each
 _STEPS, _STILL = 3, 2e-3  # steps, and metres (or radians times 10 m) below which there is no further one
 _PRIOR = np.array([1.0] * 3 + [0.05] * 3) ** -2  # of errors of a pose: metres and radians
 _SEARCHED = np.arange(-1.5, 1.51, 0.25)  # metres along the least certain direction
 _GAIN = 1.03  # factor of the score by which a transform has to be better than none
+_THINNED = 3  # of how many points one is used before the last steps
 _FEW = 100  # points near a cube, below which there is nothing to register
 
 
@@ -56,13 +57,14 @@ class Surfaces:
 
 def find_surfaces(cloud: NearestLabels) -> Surfaces:
     """The cubes of an indexed cloud that say where points lie."""
-    points = cloud.points[:: max(1, len(cloud) // _MOST)]
-    cells = (points / np.float32(_SIDE)).astype(np.int64)
-    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+    points = cloud.points[:: max(1, -(-len(cloud) // _MOST))]
+    cells = (points / np.float32(_SIDE)).astype(np.int32)
+    x, y, z = cells.astype(np.int64).T
+    keys = (x << 42) | (y << 21) | z
     order = np.argsort(keys)
     _, starts, counts = np.unique(keys[order], return_index=True, return_counts=True)
-    corner = cells[order][starts] * _SIDE
-    local = points[order] - (cells[order] * np.float32(_SIDE)).astype(np.float32)
+    corner = cells[order[starts]] * _SIDE
+    local = (points - cells * np.float32(_SIDE)).astype(np.float32)[order]
     mean = _sums(local, starts) / counts[:, None]
     products = [_sums(local * local[:, [i]], starts) / counts[:, None] for i in range(3)]
     spread = np.stack(products, axis=1) - mean[:, :, None] * mean[:, None, :]
@@ -79,15 +81,15 @@ def find_surfaces(cloud: NearestLabels) -> Surfaces:
 
 def register(points: NDArray[np.float64], surfaces: Surfaces) -> NDArray[np.float64]:
     """(4, 4) the transform in the world that lays points (N, 3) onto surfaces; the identity if it gains too little."""
-    given = np.eye(4)
-    moved, certain = _descend(given, points, surfaces, _WIDE)
+    given, few = np.eye(4), points[::_THINNED]
+    moved, certain = _descend(given, few, surfaces, _WIDE)
     if certain is None:
         return given
     directions = np.linalg.eigh(certain[:2, :2])[1]
     starts = [moved.copy() for _ in _SEARCHED]
     for start, distance in zip(starts, _SEARCHED, strict=True):
         start[:2, 3] += distance * directions[:, 0]
-    best = max(starts, key=lambda start: _score(start, points, surfaces))
+    best = max(starts, key=lambda start: _score(start, few, surfaces))
     found = _descend(best, points, surfaces, _CLOSE)[0]
     gains = _score(found, points, surfaces) > _GAIN * _score(given, points, surfaces)
     return found if gains else given
