@@ -2,19 +2,22 @@
 
 import copy
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
 import torch
 import yaml
 from conftest import Golden
+from fuzzing.text import edit
 from safetensors.torch import load_file
 from torch import Tensor
 from typer.testing import CliRunner
 
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.errors import DataError, FileError, LidarSynthError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint
 from lidar_synth.generate.generator import load_generator
 from lidar_synth.generate.importers.lidm import read_lidm
@@ -305,3 +308,29 @@ def test_an_imported_checkpoint_gives_the_results_of_lidm(golden: Golden, tmp_pa
     with torch.no_grad():
         error = (codec.decode(codec.encode(tensors["input.x"])) - tensors["output"]).norm() / tensors["output"].norm()
     assert float(error) < 6e-5
+
+
+@pytest.mark.parametrize("blocks", [2**31 - 1, "2", None, [1], 1.5, -1])
+def test_a_hostile_number_of_blocks_is_refused_soon(tmp_path: Path, blocks: Any) -> None:
+    path = release(tmp_path, config_of(FIRST), random_weights(FIRST, tmp_path))
+    config = config_of(FIRST)
+    config["model"]["params"]["ddconfig"]["num_res_blocks"] = blocks
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    start = time.process_time()
+    with pytest.raises(DataError):
+        read_lidm(path)
+    assert time.process_time() - start < 5
+
+
+def test_mutated_configurations_give_no_foreign_error(tmp_path: Path) -> None:
+    path = release(tmp_path, config_of(FIRST), random_weights(FIRST, tmp_path))
+    rng, refused = Random(0), 0
+    for _ in range(60):
+        config = config_of(FIRST)
+        edit(config, rng)
+        (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+        try:
+            read_lidm(path)
+        except LidarSynthError:
+            refused += 1
+    assert refused > 10

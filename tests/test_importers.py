@@ -5,16 +5,18 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
 import torch
 from conftest import Golden
+from fuzzing.text import edit
 from safetensors.torch import load_file
 from torch import Tensor
 from typer.testing import CliRunner
 
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint
 from lidar_synth.generate.importers.r2flow import HARMONICS, block_names, convert, peer_names, read_r2flow
 from lidar_synth.models import build_network
@@ -292,3 +294,21 @@ def test_a_pickle_of_something_else_is_refused(tmp_path: Path, content: Any) -> 
 def test_a_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="cannot be read"):
         read_r2flow(tmp_path / "none.pth")
+
+
+def test_mutated_configurations_give_no_foreign_error(tmp_path: Path) -> None:
+    rng, refused, weights = Random(0), 0, peer_weights()
+    for _ in range(60):
+        cfg = copy.deepcopy(CFG)
+        edit(cfg, rng)
+        try:
+            read_r2flow(write(tmp_path / "a.pth", weights, cfg))
+        except LidarSynthError:
+            refused += 1
+    assert refused > 10
+
+
+def test_a_hostile_number_of_blocks_is_refused_soon(tmp_path: Path) -> None:
+    cfg = change(model={"num_residual_blocks": [2**31 - 1, 1, 1, 1]})
+    with pytest.raises(DataError, match="blocks in"):
+        read_r2flow(write(tmp_path / "a.pth", peer_weights(), cfg))

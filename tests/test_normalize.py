@@ -1,5 +1,8 @@
 """Encoding and decoding of ranges, reflectance and labels."""
 
+import math
+from typing import Any
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -22,6 +25,7 @@ from lidar_synth.geometry.normalize import (
 )
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import presets
+from lidar_synth.models import network_class
 
 
 @pytest.mark.parametrize("name", sorted(NORMALISATIONS))
@@ -116,3 +120,16 @@ def test_invalid_tensors_and_formats_are_refused() -> None:
     for channels in (("reflectance",), ("range", "colour"), ("range", "range")):
         with pytest.raises(ConfigError, match="range and some of"):
             TensorFormat(channels, NORMALISATIONS["r2flow"])
+
+
+@pytest.mark.parametrize("key", ["range_min", "range_max", "scale", "offset"])
+@pytest.mark.parametrize("value", ["x", math.nan, math.inf, -1.0, [1], 10**400])
+def test_impossible_numbers_are_refused(key: str, value: Any) -> None:
+    with pytest.raises(ConfigError):
+        Normalisation(**({"kind": "log", "range_min": 1.0, "range_max": 80.0} | {key: value}))
+
+
+@pytest.mark.parametrize("name", [["hdit"], {}, None, "x"])
+def test_an_architecture_that_is_no_name_is_refused(name: Any) -> None:
+    with pytest.raises(ConfigError, match="architecture"):
+        network_class(name)

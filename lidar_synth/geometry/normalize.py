@@ -58,6 +58,9 @@ class Normalisation:
     def __post_init__(self) -> None:
         if self.kind not in ("log", "linear", "inverse"):
             raise ConfigError(f"normalisation {self.kind!r}", "log, linear or inverse")
+        numbers = (self.range_min, self.range_max, self.offset, 1.0 if self.scale is None else self.scale)
+        if not all(isinstance(n, int | float) and abs(n) < 1e30 for n in numbers) or min(numbers[2:]) <= 0:
+            raise ConfigError(f"normalisation {numbers}", "finite numbers, with a scale and an offset above 0")
         if not 0 <= self.range_min < self.range_max:
             raise ConfigError(f"range limits {self.range_min}, {self.range_max} m", "0 <= range_min < range_max")
 

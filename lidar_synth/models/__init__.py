@@ -51,7 +51,7 @@ def network_class(architecture: str) -> type[Network]:
     Raises:
         ConfigError: on a name that is not in ``NETWORKS``.
     """
-    if architecture not in NETWORKS:
+    if not isinstance(architecture, str) or architecture not in NETWORKS:
         raise ConfigError(f"architecture {architecture!r}", f"one of {', '.join(NETWORKS)}")
     return NETWORKS[architecture]
 
@@ -82,7 +82,7 @@ def build_network(architecture: str, arguments: dict[str, Any]) -> Network:
 
 
 @contextmanager
-def _bounded(most: int) -> Iterator[None]:
+def bounded(most: int) -> Iterator[None]:
     """Inside, building more than ``most`` modules fails: the arguments of a file may ask for 10^9 layers.
 
     Raises:
@@ -123,7 +123,7 @@ def assemble(
     """
     try:
         # On "meta" there is neither time nor memory for weights that will be replaced.
-        with torch.device("meta"), _bounded(64 + 16 * len(state)):
+        with torch.device("meta"), bounded(64 + 16 * len(state)):
             network = build_network(architecture, arguments)
     except ConfigError as error:
         raise DataError(f"{what}: {error}") from error

@@ -27,7 +27,7 @@ from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, Recording
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import read_yaml
-from lidar_synth.files.torch_files import load_pickle, state_of
+from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
@@ -84,11 +84,11 @@ def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             provenance=_provenance(config, path),
             conditioning=conditioning,
         )
+        return header, convert(weights, parts, str(path))
     except DataError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except MISFITS as error:
         raise DataError(f"{path}: a configuration that does not fit ({error!r})", "LiDM's own config.yaml") from error
-    return header, convert(weights, parts, str(path))
 
 
 def _config(path: Path) -> dict[str, Any]:
@@ -299,9 +299,11 @@ def _check_schedule(weights: Mapping[str, Tensor], arguments: Mapping[str, Any],
     if (signal := weights.get("alphas_cumprod")) is None:
         return
     times = schedule_times(arguments["beta_start"], arguments["beta_end"], arguments["steps"])
+    if signal.shape != times.shape:
+        raise DataError(f"{what}: a noise schedule of shape {tuple(signal.shape)}", f"{tuple(times.shape)}")
     signal = signal.double()
     stored = (1 - signal).sqrt() / (signal.sqrt() + (1 - signal).sqrt())
-    if stored.shape != times.shape or not torch.allclose(stored, times, atol=1e-4):
+    if not torch.allclose(stored, times, atol=1e-4):
         raise DataError(
             f"{what}: another noise schedule than in its config.yaml", "linear_start, linear_end, timesteps"
         )

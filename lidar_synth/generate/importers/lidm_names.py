@@ -5,7 +5,7 @@ from collections.abc import Collection
 import torch
 
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
-from lidar_synth.models import build_network
+from lidar_synth.models import bounded, build_network
 
 UNET, UNET_EMA = "model.diffusion_model.", "model_ema."
 FIRST_STAGE, COND_STAGE = "first_stage_model.", "cond_stage_model."
@@ -31,6 +31,8 @@ CODEC_RESIDUAL = {"shortcut": "nin_shortcut"}
 CODEC_ATTENTION: Sources = {"norm": ("norm",), "qkv": ("q", "k", "v"), "out": ("proj_out",)}
 """Names inside the autoencoder's blocks; all other names are the same in both."""
 MIDDLE = ("mid.block_1", "mid.attn_1", "mid.block_2")
+MOST_MODULES = 4_000
+"""Maximum number of modules of a network; a configuration may ask for 10^9 blocks. LiDM's have about 1,000."""
 STATISTICS = ("shift", "scale", "codebook.counts", "codebook.sums")
 """Buffers that only our autoencoder has."""
 
@@ -43,7 +45,7 @@ def peer_names(name: str, part: NetworkSpec, nested: bool) -> Sources:
         part: the network.
         nested: whether the file is that of a diffusion model, whose names have prefixes.
     """
-    with torch.device("meta"):
+    with torch.device("meta"), bounded(MOST_MODULES):
         keys = list(build_network(*part).state_dict())
     if name == VELOCITY:
         attending = {key.partition(".attention.")[0] for key in keys if ".attention." in key}

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, whole
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import sha256
-from lidar_synth.files.torch_files import load_pickle, state_of
+from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
 from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec
 from lidar_synth.geometry.normalize import Normalisation
@@ -80,11 +80,11 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             time_grid=_time_grid(content["cfg"]),
             provenance=_provenance(content, path),
         )
+        return header, {VELOCITY: convert(weights, part, str(path))}
     except DataError:
         raise
-    except (KeyError, TypeError, ValueError) as error:
+    except MISFITS as error:
         raise DataError(f"{path}: a configuration that does not fit ({error!r})", "R2Flow's groups and keys") from error
-    return header, {VELOCITY: convert(weights, part, str(path))}
 
 
 def _load(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -168,6 +168,8 @@ def convert(weights: Mapping[str, Tensor], part: NetworkSpec, what: str = "R2Flo
         DataError: on missing or unexpected keys, other shapes, or buffers with values that R2Flow never writes.
     """
     depths, position = part.arguments["depths"], part.arguments["position"]
+    if sum(depths) > len(weights):
+        raise DataError(f"{what}: {sum(depths)} blocks in {len(weights)} weights", "the weights of its configuration")
     names = peer_names(depths, position)
     known = {*names.values(), *(f"{block}.{name}" for block in block_names(depths).values() for name in HARMONICS)}
     known |= set(FOURIER) if position == "fourier_features" else set()
