@@ -140,6 +140,25 @@ def test_an_inserted_car_hides_and_is_hidden() -> None:
     assert_nothing_shares_a_ray(alone, 1)
 
 
+def test_a_car_beside_a_wall_returns_to_its_place() -> None:
+    """Where it stood it can stand, whatever is near; but not twice."""
+    full = cast([car(12, 0)], [wall(12, 1.1, length=6)])
+    item = cut_out(full, 0)
+    back = edit.insert(edit.remove(full, 0), item)
+    assert back.boxes is not None and np.abs(back.boxes.values[0] - full.boxes.values[0]).max() < 0.12
+    assert cells_of(back, back.label == CAR).sum() > 0.9 * cells_of(full, full.label == CAR).sum()
+    with pytest.raises(DataError, match="other returns|no level ground"):
+        edit.insert(replace(full, boxes=None), item)
+
+
+def test_what_is_estimated_behind_a_car_does_not_stand_in_its_way() -> None:
+    full = cast([car(12, 0)], [wall(12.5, 2.6, np.pi / 2, length=2), BEHIND])
+    result = edit.move(full, 0, (12.6, 0))
+    assert result.boxes is not None and np.allclose(result.boxes.values[0, :2], (12.6, 0), atol=1e-3)
+    inside = result.boxes.contain(result.points, above_floor=FLOOR)[0]
+    assert (result.label[inside] == CAR).all() and inside.sum() > 100
+
+
 @pytest.mark.slow
 def test_removed_objects_return_to_their_places() -> None:
     """In streets with fences, hedges and poles beside the cars; their own returns stand in the way until removed."""

@@ -87,9 +87,10 @@ def tried(scans: Sequence[Scan], factor: float) -> tuple[Counter[str], Counter[s
             name = scan.boxes.names[number]
             all_of[name] += 1
             try:
-                item = cut_out(scan, number)
-                pose = None if factor == 1 else tuple(factor * item.box[:2])
-                edit.insert(edit.remove(scan, number), item, pose)
+                if factor == 1:
+                    edit.insert(edit.remove(scan, number), cut_out(scan, number))
+                else:
+                    edit.move(scan, number, factor * scan.boxes.values[number, :2])
                 done[name] += 1
             except DataError as error:
                 why[str(error).split(";")[0].split(", ")[-1][:60]] += 1

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.datasets.classes import GROUND
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
@@ -22,7 +23,7 @@ from lidar_synth.labels.boxes import grown, joined, overlapping
 from lidar_synth.labels.edit.compose import composed, next_instance
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
 from lidar_synth.labels.edit.removal import remove, selected
-from lidar_synth.labels.ground import ground_under
+from lidar_synth.labels.ground import FLOOR, ground_under
 from lidar_synth.labels.objects import Object, objects_of
 from lidar_synth.labels.pasting import occluded, still_visible
 
@@ -99,18 +100,23 @@ def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5
         >>> len(back.boxes) - len(emptied.boxes), back.boxes.names[-1]
         (1, 'Car')
     """
-    placed = _place(scan, item, pose)
+    return _set(scan, item, _place(scan, item, pose), least, np.zeros(len(scan), bool))
+
+
+def _set(scan: Scan, item: Object, placed: Placed, least: int, estimated: NDArray[np.bool_]) -> Scan:
+    """Set an object into a scan at its place; it replaces (N,) estimated returns, whatever their distance."""
     rays = rays_of_scan(scan)
     window = np.flatnonzero(rays.through(placed.box + np.array([0, 0, 0, 0.6, 0.6, 0.6, 0], np.float32)))
     rho, hits, at = _hits(item, placed, rays, window)
-    seen = np.isfinite(rho) & (rho < rays.rho[window] - GRAZE)
+    guess = (rays.point[window] >= 0) & estimated[rays.point[window]]
+    seen = np.isfinite(rho) & (guess | (rho < rays.rho[window] - GRAZE))
     if seen.sum() < least:
         raise DataError(
             f"an object at {_place_text(placed.box)} with {seen.sum()} visible returns of {np.isfinite(rho).sum()}",
             f"at least {least}",
             "Choose a nearer place, or one that nothing hides.",
         )
-    replaced = np.zeros(len(scan), bool)
+    replaced = estimated & Boxes(placed.box, ("Misc",)).contain(scan.points, above_floor=FLOOR)[0]
     hidden = seen | _behind(rays, window, rho)
     points = rays.point[window[hidden]]
     replaced[points[points >= 0]] = True
@@ -135,7 +141,7 @@ def move(
     Args:
         scan: N points with boxes.
         box: the number of the object's box.
-        pose, least: see ``insert``.
+        pose, least: see ``insert``. What is only estimated behind the object does not stand in its way.
         model, seed: see ``remove``.
 
     Returns:
@@ -154,7 +160,10 @@ def move(
         ('Car', True)
     """
     cut = cut_out(scan, box)
-    return insert(remove(scan, box, model=model, seed=seed), cut, pose, least=least)
+    emptied = remove(scan, box, model=model, seed=seed)
+    recorded = _shared(emptied, scan)
+    sure = recorded if emptied.label is None else recorded | GROUND[emptied.label]
+    return _set(emptied, cut, _place(emptied[sure], cut, pose), least, ~recorded)
 
 
 def cut_out(scan: Scan, box: int) -> Object:
@@ -191,6 +200,9 @@ def _place(scan: Scan, item: Object, pose: Pose | None) -> Placed:
         number = int(np.flatnonzero(taken)[0])
         raise DataError(f"an object at {_place_text(box)}, which overlaps box {number} ({scan.boxes.names[number]})",
                         "a free place", "Remove that object first, or choose another place.")  # fmt: skip
+    if _recorded_here(scan, item, box):
+        box[2] = old[2]
+        return Placed(old, box, False)
     ground = ground_under(scan, box)
     if ground is None or not ground.encloses:
         raise DataError(f"an object at {_place_text(box)}, where the scan has no level ground", "ground around the box")
@@ -198,6 +210,18 @@ def _place(scan: Scan, item: Object, pose: Pose | None) -> Placed:
         raise DataError(f"an object at {_place_text(box)}, where the scan has other returns", "a free place")
     box[2] = ground.height + old[2] - item.ground
     return Placed(old, box, _mirrored(old, x, y, yaw))
+
+
+def _recorded_here(scan: Scan, item: Object, box: NDArray[np.float32]) -> bool:
+    """Whether an object returns to its own place in its own scan, where its returns are no more."""
+    same = item.scan.id == scan.id and bool(np.allclose(box[[0, 1, 6]], item.box[[0, 1, 6]], atol=1e-3))
+    return same and not _shared(item.scan, scan).any()
+
+
+def _shared(scan: Scan, other: Scan) -> NDArray[np.bool_]:
+    """(N,) which points of a scan another one has too."""
+    one, two = (np.ascontiguousarray(s.points).view("V12").ravel() for s in (scan, other))
+    return np.isin(one, two)
 
 
 def _complete(old: NDArray[np.float64], pose: Pose | None) -> tuple[float, float, float]:
