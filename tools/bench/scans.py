@@ -20,7 +20,7 @@ from typing import NamedTuple
 import torch
 from timing import print_table, time_in_turns
 
-from lidar_synth import Generator, load_generator
+from lidar_synth import Generator, Scan, Town, load_generator
 
 STEPS = (4, 2, 1)
 TOGETHER = 6
@@ -42,6 +42,11 @@ class Kind(NamedTuple):
         return load_generator(self.model, columns=self.columns)
 
 
+def conditions(generator: Generator) -> list[Scan] | None:
+    """A scan of the town, from which a conditional model takes its condition; None for an unconditional one."""
+    return None if generator.condition is None else [Town(0, generator.sensor, 1)[0]]
+
+
 def kinds(models: list[str]) -> list[Kind]:
     """All columns and steps of the models."""
     found = []
@@ -61,11 +66,12 @@ def _start(barrier: Barrier) -> None:
 def _alone(kind: Kind) -> tuple[float, float]:
     """Scans per second of this process, beside others that began at the same time; its peak memory in megabytes."""
     generator = kind.generator()
-    generator.scans(0, [0], steps=kind.steps)
+    given = conditions(generator)
+    generator.scans(0, [0], given, steps=kind.steps)
     _barrier.wait()
     start = time.perf_counter()
     for index in range(1, TOGETHER + 1):
-        generator.scans(0, [index], steps=kind.steps)
+        generator.scans(0, [index], given, steps=kind.steps)
     return TOGETHER / (time.perf_counter() - start), _peak()
 
 
@@ -96,7 +102,8 @@ def main() -> None:
     calls = {"product of 4096 x 4096 (137 GFLOP)": lambda: a @ a}
     for kind in kinds(given.model):
         generator = kind.generator()
-        calls[str(kind)] = lambda g=generator, k=kind: g.scans(0, [next(index)], steps=k.steps)
+        streets = conditions(generator)
+        calls[str(kind)] = lambda g=generator, k=kind, c=streets: g.scans(0, [next(index)], c, steps=k.steps)
     seconds = time_in_turns(calls, given.rounds, time.process_time if given.busy else time.perf_counter)
     what = "processor time" if given.busy else "wall time"
     title = f"A labelled scan on the CPU, {given.threads} threads, float32, {what}; torch {torch.__version__}"
