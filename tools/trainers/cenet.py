@@ -19,7 +19,7 @@ def rows(trial: Trial) -> Iterator[Row]:
     names = configure(trial, tree, ARCH, epochs=1, width=512) | {"LOG": trial.folder / "log", "NAME": "mixed"}
     names["/data/mix.yaml"] = mixture(trial)
     expect = [EPOCH, r"Loss \d", "Validation set:", "IoU avg"]
-    said = trial.type_page("train", python, PAGE, names, skip="-p", expect=expect, minutes=60)
+    said = trial.type_page("train", python, PAGE, names, skip=" -p ", expect=expect, minutes=60)
     if "Loss nan" in said or not list((trial.folder / "log").rglob("SENet*")):
         raise Failed("a loss of NaN, or no checkpoint")
     left_out = "mixed precision; it cannot resume an epoch"

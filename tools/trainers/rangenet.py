@@ -24,10 +24,10 @@ def rows(trial: Trial) -> Iterator[Row]:
     names = configure(trial, tree, ARCH, epochs=1, width=STOCK_WIDTH) | {"LOG": trial.folder / "log"}
     names["/data/mix.yaml"] = mixture(trial)
     expect = ["empty cell to the right", f"width: {WIDTH}"]
-    trial.type_page("1024 columns", python, PAGE, names, skip="-p", fails=True, expect=expect)
+    trial.type_page("1024 columns", python, PAGE, names, skip=" -p ", fails=True, expect=expect)
     names["/data/mix.yaml"] = mixture(trial, trial.data.dense_bank)
     expect = [EPOCH, r"Loss \d", "Validation set:", "IoU avg"]
-    said = trial.type_page("train", python, PAGE, names, skip="-p|pip", expect=expect, minutes=60)
+    said = trial.type_page("train", python, PAGE, names, skip=" -p |^pip", expect=expect, minutes=60)
     if "Loss nan" in said or not list((trial.folder / "log").glob("segmentation_head*")):
         raise Failed("a loss of NaN, or no checkpoint")
     left_out = "Darknet-53: time; it cannot resume an epoch"
