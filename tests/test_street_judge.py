@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -176,3 +177,13 @@ def test_a_real_archive_recognises_real_streets(street_judge: StreetJudge) -> No
     found = recognise(street_judge, [scans[i] for i in range(0, len(scans), 7)], progress=False)
     assert found.accuracy > 0.7  # 0.753 over all 28 frames at 64 x 2048
     assert found.iou()["road"] > 0.6 and found.iou()["car"] > 0.6 and found.iou()["vegetation"] > 0.5
+
+
+@pytest.mark.parametrize("value", ["x", 1.5, -1, 2**40, None, [1], True])
+def test_ids_that_are_no_class_numbers_are_refused(archive: Path, value: Any) -> None:
+    path = archive / "data_cfg.yaml"
+    settings = yaml.safe_load(path.read_text())
+    settings["learning_map_inv"][3] = value
+    path.write_text(yaml.safe_dump(settings))
+    with pytest.raises(ConfigError, match="data_cfg.yaml lacks or misstates"):
+        load_archive(archive)

@@ -93,7 +93,9 @@ def load_archive(folder: Path, columns: int | None = None) -> StreetJudge:
     segmenter = read_segmenter(archive, columns)
     try:
         ids = [classes["learning_map_inv"][i] for i in range(len(classes["learning_map_inv"]))]
-    except (KeyError, TypeError) as error:
+        if not all(type(i) is int and 0 <= i < 1 << 32 for i in ids):
+            raise ValueError(f"ids {ids}")
+    except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"{folder}: data_cfg.yaml lacks or misstates {error}", "learning_map_inv as lidar-bonnetal "
                           "writes it") from error  # fmt: skip
     if len(segmenter.channels) != len(CHANNELS):

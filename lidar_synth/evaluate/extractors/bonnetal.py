@@ -20,6 +20,7 @@ from lidar_synth.evaluate.extractors.inputs import CHANNELS, nearest_points, pre
 from lidar_synth.evaluate.extractors.per_scan import PerScan, some
 from lidar_synth.evaluate.extractors.pooling import mean_over_bands, subsample
 from lidar_synth.evaluate.extractors.squeezeseg import SqueezeSeg
+from lidar_synth.files.torch_files import MISFITS
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -100,7 +101,7 @@ def read_segmenter(archive: Archive, columns: int | None = None) -> Segmenter:
             raise ConfigError(f"backbone, decoder and head {names}", f"one of {', '.join(NETWORKS)}")
         grid = _grid(sensor, columns, HALVINGS[names[0]])
         network = NETWORKS[names[0]](len(channels), _classes(states["segmentation_head"]), backbone)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except MISFITS as error:
         if isinstance(error, ConfigError):
             raise ConfigError(f"{archive.path}: {error}") from error
         raise ConfigError(f"{archive.path}: its settings lack or misstate {error}", "arch_cfg.yaml and data_cfg.yaml "
@@ -175,7 +176,7 @@ def load_lidm(path: Path, prepared: str) -> PerScan:
     settings = archive.yaml("config.yaml")
     try:
         network = _darknet(len(_channels(settings["backbone"]["input_depth"])), 0, settings["backbone"])
-    except (KeyError, TypeError, AttributeError) as error:
+    except MISFITS as error:
         raise ConfigError(f"{path}: config.yaml lacks or misstates {error}", "the settings of LiDM's RangeNet"
                           ) from error  # fmt: skip
     for part in PARTS[:2]:
