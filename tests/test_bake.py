@@ -235,7 +235,7 @@ def test_a_checkpoint_that_was_replaced_is_loaded_again(tmp_path: Path) -> None:
 def test_a_bank_without_bake_settings_is_refused(plan: BakePlan) -> None:
     bake(plan, progress=False)
     (plan.out / SETTINGS).unlink()
-    with pytest.raises(ConfigError, match="holds a bank that was not made by a bake"):
+    with pytest.raises(ConfigError, match="holds another bank; expected an empty folder"):
         bake(plan, progress=False)
 
 

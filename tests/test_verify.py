@@ -355,7 +355,7 @@ def test_banks_of_several_bakes_can_be_merged_and_repaired(root: Path, tmp_path:
 
 
 def test_invalid_edits_are_refused(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="holds a bank; expected an empty folder"):
+    with pytest.raises(ConfigError, match="was filled with|holds another bank"):
         head(Bank(root), 2, root, progress=False)
     for shares in ({"a": 0.5, "b": 0.6}, {"a": 1.5, "b": -0.5}, {"a": 0.99, "b": 0.01}):
         with pytest.raises(ConfigError, match="sum to 1|at least one scan"):
@@ -364,7 +364,7 @@ def test_invalid_edits_are_refused(root: Path, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=f"part '{part}'; expected FOLDER=SHARE"):
             call("bank", "split", root, part)
     (tmp_path / "file").touch()
-    with pytest.raises(FileError, match="file cannot be created"):
+    with pytest.raises(FileError, match=r"file.\.made\.json cannot be written"):
         head(Bank(root), 2, tmp_path / "file", progress=False)
 
 

@@ -3,21 +3,26 @@ where the file system has no links.
 
 The index of a curated bank leaves out some scans of its shards. The names of these shards end in ``.curated.h5``,
 because they still hold the dropped scans. Every bank that is made from a curated one is curated too.
+
+A call that was killed is completed by the same call.
 """
 
 import os
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import write_bank_files
+from lidar_synth.bake.making import making
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files.disk import part_of, sha256
+from lidar_synth.files.disk import hash_of_names, part_of, sha256
 
 
 def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
@@ -29,7 +34,8 @@ def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
         progress: show a bar.
 
     Raises:
-        ConfigError: on banks with different sensors or fields, banks that share scans, or a folder that is not empty.
+        ConfigError: on banks with different sensors or fields, banks that share scans, or a folder that holds something
+            else.
         FileError: if it cannot be written.
     """
     first = banks[0].facts
@@ -40,7 +46,8 @@ def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
                 f"{first.fields} of sensor {first.sensor.name!r}, as {banks[0].root}",
             )
     _check_disjoint(banks)
-    return _write(out, [(bank, 0, len(bank)) for bank in banks], progress)
+    with _making(out, "merge", banks) as complete:
+        return _write(out, complete, [(bank, 0, len(bank)) for bank in banks], progress)
 
 
 def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dict[Path, Index]:
@@ -52,7 +59,7 @@ def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dic
         progress: show a bar.
 
     Raises:
-        ConfigError: on shares that do not sum to 1 or leave a part empty, or a folder that is not empty.
+        ConfigError: on shares that do not sum to 1 or leave a part empty, or a folder that holds something else.
         FileError: if it cannot be written.
     """
     if any(not share > 0 for share in parts.values()) or abs(sum(parts.values()) - 1) > 1e-9:
@@ -63,22 +70,26 @@ def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dic
         ends.append(round(total * len(bank)))
     if any(start == stop for start, stop in pairwise(ends)):
         raise ConfigError(f"{len(bank)} scans in shares {list(parts.values())}", "at least one scan for each")
-    for out in parts:
-        _check_empty(out)
-    ranges = zip(parts, ends, ends[1:], strict=False)
-    return {out: _write(out, [(bank, start, stop)], progress) for out, start, stop in ranges}
+    with ExitStack() as claims:
+        made = {}
+        for out, start, stop in zip(parts, ends, ends[1:], strict=False):
+            made[out] = claims.enter_context(_making(out, "split", [bank], start, stop)), start, stop
+        return {
+            out: _write(out, complete, [(bank, start, stop)], progress) for out, (complete, start, stop) in made.items()
+        }
 
 
 def head(bank: Bank, scans: int, out: Path, progress: bool = True) -> Index:
     """A new bank with the first scans of a bank.
 
     Raises:
-        ConfigError: on more scans than the bank holds, or a folder that is not empty.
+        ConfigError: on more scans than the bank holds, or a folder that holds something else.
         FileError: if it cannot be written.
     """
     if not 1 <= scans <= len(bank):
         raise ConfigError(f"the first {scans} scans of {bank.root}", f"1 to {len(bank)}")
-    return _write(out, [(bank, 0, scans)], progress)
+    with _making(out, "head", [bank], scans) as complete:
+        return _write(out, complete, [(bank, 0, scans)], progress)
 
 
 def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool = True) -> Index:
@@ -92,7 +103,7 @@ def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool
         progress: show a bar.
 
     Raises:
-        ConfigError: if no scan is left, on a number out of range, or a folder that is not empty.
+        ConfigError: if no scan is left, on a number out of range, or a folder that holds something else.
         FileError: if it cannot be written.
     """
     left_out = set(numbers)
@@ -100,7 +111,12 @@ def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool
         raise ConfigError(f"scans {invalid[:8]} to leave out", f"0 to {len(bank) - 1}")
     if len(left_out) == len(bank):
         raise ConfigError(f"all {len(bank)} scans of {bank.root} left out ({why})", "a rule that leaves some")
-    _check_empty(out)
+    with _making(out, "drop", [bank], hash_of_names(map(str, sorted(left_out))), why) as complete:
+        return Bank(out).index if complete else _link_kept(bank, left_out, why, out, progress)
+
+
+def _link_kept(bank: Bank, left_out: set[int], why: str, out: Path, progress: bool) -> Index:
+    """Write the index of a curated bank beside links to the shards of which a scan is left."""
     entries: list[Entry] = []
     shards = tqdm(bank.index.shards, desc="shards", unit="shard", disable=not progress)
     for entry, end in zip(shards, bank.index.ends, strict=True):
@@ -118,9 +134,10 @@ def _name(number: int, curated: bool) -> str:
     return f"shard-{number:05d}{'.curated' if curated else ''}.h5"
 
 
-def _write(out: Path, parts: Sequence[tuple[Bank, int, int]], progress: bool) -> Index:
-    """Write a bank from ranges of scans: (bank, first, one past the last)."""
-    _check_empty(out)
+def _write(out: Path, complete: bool, parts: Sequence[tuple[Bank, int, int]], progress: bool) -> Index:
+    """Write a bank from ranges of scans (bank, first, one past the last), unless it is complete."""
+    if complete:
+        return Bank(out).index
     curation = tuple(dict.fromkeys(why for bank, _, _ in parts for why in bank.index.curation))
     sources: list[Facts] = []
     entries: list[Entry] = []
@@ -175,13 +192,23 @@ def _link(source: Path, path: Path) -> None:
     part.replace(path)
 
 
-def _check_empty(out: Path) -> None:
-    if (out / INDEX).exists() or any(out.glob("*.h5")):
-        raise ConfigError(f"{out} holds a bank", "an empty folder for the new one")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{out} cannot be created ({error.strerror})", "a writable folder") from error
+@contextmanager
+def _making(out: Path, what: str, banks: Sequence[Bank], *more: Any) -> Iterator[bool]:
+    """Claim the folder of a new bank, without the shards of a killed call; yields whether it is complete.
+
+    Args:
+        out: the folder.
+        what: the operation.
+        banks: those that it is made from.
+        more: the operation's other arguments, plain values.
+    """
+    settings = {"made": what, "from": [bank.index.checksum for bank in banks], "arguments": more}
+    with making(out, settings):
+        complete = (out / INDEX).is_file()
+        if not complete:
+            for shard in out.glob("*.h5"):
+                shard.unlink()
+        yield complete
 
 
 def _check_disjoint(banks: Sequence[Bank]) -> None:

@@ -42,19 +42,19 @@ def prepare(plan: BakePlan) -> None:
         FileError: if it cannot be written.
     """
     if not (plan.out / SETTINGS).exists():
-        _refuse_others(plan.out)
+        refuse_others(plan.out)
     claim(plan.out / SETTINGS, plan.settings)
     _clear_up(plan.out, finished=False)
 
 
-def _refuse_others(root: Path) -> None:
-    """Refuse a folder with files of the names that a bake writes at its end.
+def refuse_others(root: Path) -> None:
+    """Refuse a folder with a bank, or with files of the names that a bank has.
 
     Raises:
         ConfigError: naming the file.
     """
-    if (root / INDEX).exists():
-        raise ConfigError(f"{root} holds a bank that was not made by a bake", "an empty folder")
+    if (root / INDEX).exists() or any(root.glob("*.h5")):
+        raise ConfigError(f"{root} holds another bank", "an empty folder for the new one")
     for name in (CARD, CROISSANT):
         if (root / name).exists():
             raise ConfigError(

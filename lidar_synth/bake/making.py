@@ -1,0 +1,39 @@
+"""The folder of a new bank that one process writes: claimed, locked, and resumed by the same call."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from lidar_synth.bake.folder import refuse_others
+from lidar_synth.bake.lock import alone
+from lidar_synth.errors import ConfigError
+from lidar_synth.formats.writer import claim
+
+NOTE = ".made.json"
+"""File in the bank's folder with the settings of the call that makes it; a run holds a lock on it."""
+
+
+@contextmanager
+def making(out: Path, settings: dict[str, Any]) -> Iterator[None]:
+    """Claim a folder for a new bank, and keep other processes out of it until the block ends.
+
+    The claim stays, so that the same call resumes after a kill. Temporary files of killed calls are removed.
+
+    Args:
+        out: the new bank's folder.
+        settings: plain values that determine its content.
+
+    Raises:
+        ConfigError: on a folder that holds something else, or in which another process works.
+        FileError: if it cannot be written.
+    """
+    if not (out / NOTE).is_file():
+        refuse_others(out)
+    claim(out / NOTE, settings)
+    with alone(out / NOTE) as exclusive:
+        if not exclusive:
+            raise ConfigError(f"{out}, in which another process works", "a folder for this process")
+        for part in out.glob(".*.part"):
+            part.unlink(missing_ok=True)
+        yield

@@ -1,0 +1,93 @@
+"""Banks made from banks: a call that is killed at any moment is completed by the same call."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from banks import some_image, write_bank
+
+from lidar_synth.bake import edit
+from lidar_synth.bake.edit import drop, head, merge, split
+from lidar_synth.bake.lock import shared
+from lidar_synth.bake.making import NOTE
+from lidar_synth.bank import INDEX, Bank
+from lidar_synth.errors import ConfigError
+
+CALLS: dict[str, Callable[[Bank, Path], object]] = {
+    "merge": lambda bank, out: merge([bank], out / "one", progress=False),
+    "head": lambda bank, out: head(bank, 5, out / "one", progress=False),
+    "split": lambda bank, out: split(bank, {out / "one": 0.5, out / "two": 0.5}, progress=False),
+    "drop": lambda bank, out: drop(bank, [1, 4], "by hand", out / "one", progress=False),
+}
+
+
+@pytest.fixture
+def bank(tmp_path: Path) -> Bank:
+    write_bank(tmp_path / "bank", [some_image(seed) for seed in range(8)])
+    return Bank(tmp_path / "bank")
+
+
+class Killed(BaseException):
+    """Raised between two files in the place of SIGKILL; no handler of the package catches it."""
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_a_killed_call_is_completed_by_the_same_call(
+    call: str, bank: Bank, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    CALLS[call](bank, tmp_path / "whole")
+    expected = contents(tmp_path / "whole")
+    files = len([name for name in expected if name.endswith(".h5")])
+    out, replace = tmp_path / "out", Path.replace
+    for survivors in range(files + 2):
+        shutil.rmtree(out, ignore_errors=True)
+        left = iter(range(survivors))
+
+        def replace_or_die(path: Path, target: Path, left: object = left) -> Path:
+            if next(left, None) is None:  # type: ignore[call-overload]
+                raise Killed
+            return replace(path, target)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "replace", replace_or_die)
+            with pytest.raises(Killed):
+                CALLS[call](bank, out)
+        CALLS[call](bank, out)
+        assert contents(out) == expected, f"killed before file {survivors + 1}"
+        CALLS[call](bank, out)
+        assert contents(out) == expected
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_the_folder_of_another_call_is_refused(call: str, bank: Bank, tmp_path: Path) -> None:
+    head(bank, 3, tmp_path / "out" / "one", progress=False)
+    before = contents(tmp_path / "out")
+    with pytest.raises(ConfigError, match="was filled with"):
+        CALLS[call](bank, tmp_path / "out")
+    with pytest.raises(ConfigError, match="holds another bank"):
+        CALLS[call](bank, shutil.copytree(tmp_path / "bank", tmp_path / "other" / "one").parent)
+    assert contents(tmp_path / "out") == before
+
+
+def test_a_file_of_the_user_is_not_replaced(bank: Bank, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "README.md").write_text("mine")
+    with pytest.raises(ConfigError, match="holds a README.md"):
+        head(bank, 3, tmp_path / "out", progress=False)
+    assert contents(tmp_path / "out") == {"README.md": b"mine"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="files are not locked on Windows")
+def test_two_calls_do_not_write_one_folder(bank: Bank, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    head(bank, 3, out, progress=False)
+    (out / INDEX).unlink()
+    with shared(out / NOTE), pytest.raises(ConfigError, match="in which another process works"):
+        head(bank, 3, out, progress=False)
+    assert edit.head(bank, 3, out, progress=False).scans == 3
