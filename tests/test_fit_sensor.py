@@ -108,6 +108,17 @@ def test_the_place_of_the_sensor_on_a_vehicle_is_found() -> None:
     assert np.abs(np.array(fit.sensor.elevations) - beams).max() < 0.02
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["os1_128", "pandar64"])
+def test_tilts_of_up_to_six_degrees_are_found_without_rings(name: str) -> None:
+    offset, turn = np.array([-0.76, -1.29, 0.88]), tilt_of(np.radians([-4.0, 2.5]))
+    [scan] = moved(shuffled([Town(0, name, 1, motion=False)[0]]), offset, turn)
+    fit = fit_sensor([replace(scan, ring=None)])
+    beams = np.degrees(load_sensor(name).row_elevations())
+    assert np.allclose(fit.mount[:3, 3], offset, atol=0.02) and np.allclose(fit.mount[2, :2], turn[2, :2], atol=1e-3)
+    assert np.abs(np.array(fit.sensor.elevations) - beams).max() < 0.02
+
+
 FIRINGS: dict[str, tuple[Callable[[], list[Scan]], int, str]] = {
     "times": (lambda: some(azimuths=OFFSETS), 1000, "time"),
     "the order of time": (lambda: untimed(some(azimuths=OFFSETS)), 1000, "time"),

@@ -172,7 +172,7 @@ def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud
     still = Model(np.zeros(1), np.zeros(1), np.zeros(3), np.eye(3), np.zeros((len(scans), 6)))
     best, quality = _attempt(part, still, seed)
     if quality < GOOD:
-        offset, turn = find_mount([part.points[part.scan == scan] for scan in range(len(scans))], seed)
+        offset, turn = find_mount([cloud.points[cloud.scan == scan] for scan in range(len(scans))], seed)
         moved, better = _attempt(part, replace(still, offset=offset, turn=turn), seed, frozenset({"mount"}))
         if better > quality:
             best, quality = moved, better

@@ -1,10 +1,11 @@
 """A first guess of where the sensor stands in the frame of the points, from points alone.
 
 Seen from the sensor, elevations concentrate on the beams; seen from elsewhere, they do not. A tilt hides this all
-around, but within a narrow sector of azimuth it is only a constant. So the offset is found first, by the sharpness of
-the elevations within many sectors, and the tilt then, as sectors are joined.
+around, but within a narrow sector of azimuth it is only a constant. So offset and tilt are tried on a grid first, by
+the sharpness of the elevations within many narrow sectors, and made exact as sectors are joined.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -35,8 +36,12 @@ SHIFTS = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5, 3.0)
 MOTION_POINTS = 4000
 """Number of points with which it does."""
 
+GRID_POINTS = 9000
+"""Number of points with which the grid is searched; they fill whole sectors, where pairs of points tell beams."""
+
 _BIN = np.radians(0.05)
-_SECTORS = (32, 16, 8, 4, 2, 1)
+_NARROW = 128  # sectors within which a tilt of a degree moves no point by more than 0.05 degrees
+_SECTORS = (64, 32, 16, 8, 4, 2, 1)
 
 
 def find_mount(scans: Sequence[Floats], seed: int = 0) -> tuple[Floats, Floats]:
@@ -84,13 +89,15 @@ def find_motion(cloud: Cloud, model: Model, scan: int) -> Floats:
 def _place_in(points: Floats, seed: int) -> tuple[float, Floats]:
     """The sharpness of one scan's elevations at its best place, and the place."""
     points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
+    part = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+    dense = points[(part * _NARROW / 2).astype(np.int64) % max(len(points) // GRID_POINTS, 1) == 0]
     if len(points) > POINTS:
         points = points[np.random.default_rng(seed).choice(len(points), POINTS, replace=False)]
-    place = _best_on_grid(points)
+    place = _best_on_grid(dense)
     for sectors in _SECTORS:
         step = np.array([0.1, 0.1, 0.1, 0.004, 0.004]) * (1 if sectors > 8 else 0.5)
-        step = step * (1 if sectors < 32 else (4, 4, 4, 0, 0))
-        place = climb(partial(_sharpness_within, points, sectors), place, step)
+        step = step * (1 if sectors < 32 else 4)
+        place = climb(partial(_sharpness_within, dense if sectors > 32 else points, sectors), place, step)
     return sector_sharpness(points, place, 1), place
 
 
@@ -126,9 +133,10 @@ def _sharpness_within(points: Floats, sectors: int, place: Floats) -> float:
 
 
 def _best_on_grid(points: Floats) -> Floats:
-    sides, heights = np.arange(-1.5, 1.6, 1.0), np.arange(-0.5, 3.1, 0.5)
-    places = [np.array([x, y, z, 0, 0]) for x in (0.0, *sides) for y in (0.0, *sides) for z in heights]
-    return max(places, key=lambda place: sector_sharpness(points, place, _SECTORS[0]))
+    sides, heights = (-1.2, 0.0, 1.2), (-0.2, 0.6, 1.4, 2.2)
+    tilts = np.radians([-5.0, -2.5, 0.0, 2.5, 5.0])
+    places = [np.array(place) for place in itertools.product(sides, sides, heights, tilts, tilts)]
+    return max(places, key=lambda place: sector_sharpness(points, place, _NARROW))
 
 
 def climb(value: Callable[[Floats], float], place: Floats, step: Floats, halvings: int = 6) -> Floats:
