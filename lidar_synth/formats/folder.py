@@ -161,10 +161,12 @@ def rows_of_rings(scan: Scan) -> NDArray[np.int16]:
 
     A ring is the row that is nearest to most of its points.
     """
+    assert scan.ring is not None
     _, number = np.unique(scan.ring, return_inverse=True)
     rows = scan.sensor.shape[0]
     votes = np.bincount(number * rows + assign_beams(scan).ring, minlength=rows * (int(number.max()) + 1))
-    return votes.reshape(-1, rows).argmax(axis=1)[number].astype(np.int16)
+    nearest = votes.reshape(-1, rows).argmax(axis=1)
+    return np.asarray(nearest[number], np.int16)
 
 
 def _columns(path: Path) -> dict[str, NDArray[Any]]:

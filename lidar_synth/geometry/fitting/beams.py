@@ -382,7 +382,8 @@ def _distance(elevation: Floats, beams: Floats) -> Floats:
 
 def _count(elevation: Floats, places: Floats) -> NDArray[np.intp]:
     """Number of elevations (sorted) within ``WINDOW`` of each place."""
-    return np.searchsorted(elevation, places + WINDOW) - np.searchsorted(elevation, places - WINDOW)
+    above = np.searchsorted(elevation, places + WINDOW)
+    return np.asarray(above - np.searchsorted(elevation, places - WINDOW), np.intp)
 
 
 def _stands_alone(elevation: Floats, place: float, beams: Floats, points: int) -> bool:

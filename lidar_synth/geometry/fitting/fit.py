@@ -115,7 +115,7 @@ def fit_sensor(scans: Source | Sequence[Scan], *, name: str = "fitted", columns:
         ((128, 1024), (22.3242, 21.9727), 1.0)
     """
     given = [scans[i] for i in np.unique(np.linspace(0, len(scans) - 1, min(SCANS, len(scans))).round().astype(int))]
-    returned = [scan.points.any(axis=1) for scan in given]
+    returned = [np.asarray(scan.points.any(axis=1)) for scan in given]
     scans = [scan if there.all() else scan[there] for scan, there in zip(given, returned, strict=True)]
     count = sum(len(scan) for scan in scans)
     if count < LEAST_POINTS:
