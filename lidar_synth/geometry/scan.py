@@ -72,9 +72,12 @@ class Boxes:
             ("alpha", (count,), np.float32, -10),
         ):
             given = getattr(self, name)
-            setattr(self, name, np.full(shape, unknown, dtype) if given is None else np.asarray(given, dtype))
-            if getattr(self, name).shape != shape:
-                raise DataError(f"boxes: {name} has shape {getattr(self, name).shape}", f"{shape}")
+            value = np.full(shape, unknown, dtype) if given is None else np.asarray(given, dtype)
+            if count == 0 and value.size == 0:  # an empty list has no second axis
+                value = value.reshape(shape)
+            if value.shape != shape:
+                raise DataError(f"boxes: {name} has shape {value.shape}", f"{shape}")
+            setattr(self, name, value)
         if len(self.names) != count:
             raise DataError(f"boxes: {len(self.names)} names for {count} boxes", "one name per box")
         self.dont_care = np.asarray(self.dont_care, np.float32).reshape(-1, 4)
