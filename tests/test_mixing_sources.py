@@ -33,6 +33,11 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Generator:
     return load_generator(write(tmp_path_factory.mktemp("mixing") / "tiny.safetensors"))
 
 
+def test_exchanged_arguments_are_named(generator: Generator) -> None:
+    with pytest.raises(ConfigError, match=r"real=Generator, which has no length; expected real scans first"):
+        MixedScans(generator, Scans("r", 4, GENERATED_SENSOR), 0.5)
+
+
 @pytest.mark.slow
 def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> None:
     real = Scans("r", 4, GENERATED_SENSOR)

@@ -155,6 +155,13 @@ def test_damage_of_other_files_is_found_and_repaired(root: Path, original: Path,
         assert (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
 
 
+def test_repair_removes_what_a_killed_repair_left(root: Path, model: Path) -> None:
+    part = root / ".shard-00000.h5.1.part"
+    part.write_bytes(b"half a shard")
+    assert repair(root, str(model), progress=False) == {part.name: "removed: a killed repair left it"}
+    assert not part.exists() and repair(root, str(model), progress=False) == {}
+
+
 def test_verify_and_repair_report_damage_of_other_files(root: Path, model: Path) -> None:
     (root / SETTINGS).write_text("{}")
     status, output = call("verify", root)

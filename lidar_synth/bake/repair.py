@@ -37,6 +37,9 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
         FileError: if a file cannot be read or written.
     """
     done: dict[str, str] = {}
+    for part in root.glob(".*.part"):
+        part.unlink(missing_ok=True)
+        done[part.name] = "removed: a killed repair left it"
     try:
         index = read_index(root)
         baked = SETTINGS in index.files or (root / SETTINGS).is_file()

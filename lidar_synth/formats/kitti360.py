@@ -180,8 +180,9 @@ class KITTI360Writer(Writer):
         for folder in sorted((self.root / "data_poses").glob("*")):
             notes = read_notes(folder)
             poses = read_poses(self.root, folder.name, read_calibration(self.root))
-            poses |= {f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None}
-            write_poses(self.root, folder.name, poses)
+            new = {f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None}
+            write_poses(self.root, folder.name, new)
+            poses |= new
             boxes = {
                 f: (Boxes(note["boxes"], note["names"], instance=note["instance"]), poses[f])
                 for f, note in notes.items()

@@ -170,7 +170,8 @@ def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64
                 f"{path}: {error}", "KITTI-360's data_3d_bboxes", "Remove it to write a new one."
             ) from error
     objects = [node for frame, (boxes, pose) in sorted(frames.items()) for node in _objects(frame, boxes, pose)]
-    root[:] = [*kept, *objects]
+    # In the order of frames, so that a resumed export has the bytes of one in a single run.
+    root[:] = sorted([*kept, *objects], key=lambda node: int(node.findtext("timestamp") or -1))
     for index, node in enumerate(root):
         node.tag = f"object{index}"
         _child(node, "index").text = str(index)

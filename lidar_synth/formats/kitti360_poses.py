@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import numbers, read_matrix, read_named_matrices, write_file, write_named_matrices
+from lidar_synth.files.disk import (
+    numbers,
+    read_matrix,
+    read_named_matrices,
+    read_text,
+    write_file,
+    write_named_matrices,
+)
 from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneous, ideal_camera, read_image_size
 
 CAMERA = ideal_camera(552.554261, (1408, 376))
@@ -104,21 +111,27 @@ def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, 
 
 
 def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -> None:
-    """The inverse of ``read_poses``, with the calibration in ``root``; writes nothing if there are no poses.
+    """The inverse of ``read_poses``, with the calibration in ``root``; poses of other frames in the files stay.
 
     ``cam0_to_world.txt``, which the dataset also has, is written beside ``poses.txt``.
     """
     camera = read_calibration(root)
     if not poses or camera is None:
         return
-    sensor_from_imu = np.linalg.inv(imu_from_sensor(camera))
-    imu, cam0 = [], []
-    for frame, pose in sorted(poses.items()):
-        imu.append(f"{frame} {numbers((pose @ sensor_from_imu)[:3].ravel())}\n")
-        cam0.append(f"{frame} {numbers((pose @ camera.sensor_from_camera).ravel())}\n")
     folder = root / "data_poses" / drive
-    write_file(folder / "poses.txt", "".join(imu).encode())
-    write_file(folder / "cam0_to_world.txt", "".join(cam0).encode())
+    sensor_from_imu = np.linalg.inv(imu_from_sensor(camera))
+    imu = {frame: numbers((pose @ sensor_from_imu)[:3].ravel()) for frame, pose in poses.items()}
+    cam0 = {frame: numbers((pose @ camera.sensor_from_camera).ravel()) for frame, pose in poses.items()}
+    _add_lines(folder / "poses.txt", imu)
+    _add_lines(folder / "cam0_to_world.txt", cam0)
+
+
+def _add_lines(path: Path, lines: dict[int, str]) -> None:
+    """Write lines by frame; those of other frames stay as they are, since reading a pose rounds it."""
+    there = read_text(path).splitlines() if path.is_file() else []
+    kept = {int(float(frame)): values for frame, _, values in (line.partition(" ") for line in there if line)}
+    text = [f"{frame} {values}\n" for frame, values in sorted((kept | lines).items())]
+    write_file(path, "".join(text).encode())
 
 
 def fill_poses(poses: dict[int, NDArray[np.float64]], frames: Iterable[int]) -> dict[int, NDArray[np.float64]]:

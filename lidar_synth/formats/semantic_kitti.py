@@ -28,6 +28,7 @@ from lidar_synth.files.disk import (
     read_file,
     read_matrix,
     read_named_matrices,
+    read_text,
     write_file,
     write_named_matrices,
 )
@@ -196,10 +197,9 @@ class SemanticKITTIWriter(Writer):
         for folder in sorted((self.root / "sequences").glob("*")):
             notes = read_notes(folder)
             camera = read_calibration(folder)
-            poses = read_poses(folder, camera)
-            poses |= {f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None}
+            poses = {f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None}
             if notes and camera is not None:
-                write_poses(folder, camera, poses, frames=1 + max([*notes, *poses]))
+                write_poses(folder, camera, poses, frames=1 + max(notes))
             clear_notes(folder)
 
 
@@ -241,10 +241,17 @@ def read_poses(folder: Path, camera: Calibration | None) -> dict[int, NDArray[np
 
 
 def write_poses(folder: Path, camera: Calibration, poses: dict[int, NDArray[np.float64]], frames: int) -> None:
-    """The inverse of ``read_poses``; writes nothing if no pose is known."""
-    if not poses:
+    """The inverse of ``read_poses``, for at least this number of frames; writes nothing if no pose is known.
+
+    Poses of other frames in the file stay as they are, since reading a pose rounds it.
+    """
+    path = folder / "poses.txt"
+    lines = read_text(path).splitlines() if path.is_file() else []
+    if not poses and not lines:
         return
-    lines = np.full((frames, 12), np.nan)
+    unknown = numbers(np.full(12, np.nan))
+    lines += [unknown] * (frames - len(lines))
     for frame, pose in poses.items():
-        lines[frame] = (camera.camera_from_sensor @ pose @ camera.sensor_from_camera)[:3].ravel()
-    write_file(folder / "poses.txt", "".join(numbers(line) + "\n" for line in lines).encode())
+        line = (camera.camera_from_sensor @ pose @ camera.sensor_from_camera)[:3]
+        lines[frame] = numbers(line.ravel())
+    write_file(path, "".join(line + "\n" for line in lines).encode())

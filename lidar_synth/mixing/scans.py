@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
+from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.geometry.transfer import Transfer
@@ -122,6 +123,13 @@ class MixedScans(Dataset[Any]):
         compare: bool = True,
     ) -> None:
         reals, seed = each(real), to_integer(seed, "seed")
+        for source, _ in reals:
+            if not hasattr(source, "__len__"):
+                raise ConfigError(
+                    f"real={type(source).__name__}, which has no length",
+                    "real scans first, then what synthetic ones come from",
+                    "MixedScans(real, synth, ratio)",
+                )
         synthetics = [(make_synthetic(source, seed), weight) for source, weight in each(synth)]
         self.real = tuple(source for source, _ in reals)
         self.synthetic = tuple(source for source, _ in synthetics)

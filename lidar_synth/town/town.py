@@ -132,6 +132,10 @@ class Town:
         """The calibration of the camera next to the sensor."""
         return CAMERA
 
+    def __repr__(self) -> str:
+        scans = f"{len(self)} scans, {self.interval:g} s apart"
+        return f"Town of seed {self.seed}: {scans}\n  sensor {self.sensor.grid_text()}"
+
     def __len__(self) -> int:
         return self._scans
 
