@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,10 +12,10 @@ from banks import some_image, write_bank
 
 from lidar_synth.bake import edit
 from lidar_synth.bake.edit import drop, head, merge, split
-from lidar_synth.bake.lock import shared
 from lidar_synth.bake.making import NOTE
 from lidar_synth.bank import INDEX, Bank
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.lock import shared
 
 CALLS: dict[str, Callable[[Bank, Path], object]] = {
     "merge": lambda bank, out: merge([bank], out / "one", progress=False),
@@ -91,3 +93,16 @@ def test_two_calls_do_not_write_one_folder(bank: Bank, tmp_path: Path) -> None:
     with shared(out / NOTE), pytest.raises(ConfigError, match="in which another process works"):
         head(bank, 3, out, progress=False)
     assert edit.head(bank, 3, out, progress=False).scans == 3
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the script forks")
+def test_commands_that_are_killed_resume_to_the_same_bytes() -> None:
+    script = Path(__file__).parent.parent / "tools" / "kill_commands.py"
+    some = ["convert", "convert, webdataset", "bank split", "curate"]
+    options = [word for name in some for word in ("--command", name)]
+    done = subprocess.run(
+        [sys.executable, script, "--kills", "2", *options], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (done.stdout + done.stderr).count("| no |") == len(some)

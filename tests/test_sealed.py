@@ -14,8 +14,8 @@ from conftest import random_scan
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from lidar_synth.bake.lock import one_writer
 from lidar_synth.errors import ConfigError, DataError, LidarSynthError
+from lidar_synth.files.lock import one_writer
 from lidar_synth.files.parsing import read_sealed, seal
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.sensor import Sensor

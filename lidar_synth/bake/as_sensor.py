@@ -12,11 +12,11 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import sync_folder, write_bank_files
-from lidar_synth.bake.lock import alone
 from lidar_synth.bake.verify import check_scans
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.disk import part_of, sha256
+from lidar_synth.files.lock import alone
 from lidar_synth.formats.writer import claim
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage

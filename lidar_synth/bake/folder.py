@@ -19,11 +19,11 @@ from functools import lru_cache
 from pathlib import Path
 
 from lidar_synth.bake.job import BakePlan, settings_of
-from lidar_synth.bake.lock import alone, shared
 from lidar_synth.bank import INDEX, Entry, Index
 from lidar_synth.bank.card import CARD, CROISSANT, card_files
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import read_file, sha256, write_file
+from lidar_synth.files.lock import alone, shared
 from lidar_synth.formats.writer import NOTES, claim
 
 SETTINGS = ".bake.json"

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.bake.folder import refuse_others
-from lidar_synth.bake.lock import alone
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.lock import alone
 from lidar_synth.formats.writer import claim
 
 NOTE = ".made.json"

@@ -19,10 +19,10 @@ import json
 import os
 import tarfile
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, BytesIO
-from itertools import chain
+from itertools import groupby
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import unquote
@@ -122,8 +122,7 @@ class WebDatasetWriter(Writer):
             parts[int(path.relative_to(self.root / NOTES).parts[0]) // self.shard_size].append(path)
         for number, paths in parts.items():
             shard = self.root / f"scans-{number:06d}{SUFFIX}"
-            again = {self._key_of(path) for path in paths}
-            members = chain(_members([shard] if shard.is_file() else [], without=again), _members(paths))
+            members = _merge(shard, {self._key_of(path): path for path in paths})
             write_file(shard, lambda file, members=members: _write_tar(file, members))  # type: ignore[misc]
         clear_notes(self.root)
         self._there = None
@@ -221,14 +220,23 @@ def _key_in(name: str) -> tuple[str, str]:
     return f"{folder}{slash}{stem}", kind
 
 
-def _members(paths: Iterable[Path], without: Collection[str] = ()) -> Iterator[tuple[str, bytes]]:
-    """The members of several tar files, each name once, without those of some scans, by their keys."""
+def _merge(shard: Path, new: dict[str, Path]) -> Iterator[tuple[str, bytes]]:
+    """The members of a shard, with those of new scans in the place of older ones with their key, or at the end."""
+    left = dict(new)
+    there = _members([shard]) if shard.is_file() else ()
+    for key, members in groupby(there, lambda member: _key_in(member[0])[0]):
+        yield from _members([left.pop(key)]) if key in left else members
+    yield from _members(left.values())
+
+
+def _members(paths: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
+    """The members of several tar files, each name once."""
     done = set()
     for path in paths:
         with _open(path) as tar:
             for member in tar:
                 content = tar.extractfile(member)
-                if member.name not in done and content is not None and _key_in(member.name)[0] not in without:
+                if member.name not in done and content is not None:
                     done.add(member.name)
                     yield member.name, content.read()
 

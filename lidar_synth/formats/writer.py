@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import inside, list_files, read_file, read_text, refuse_links, write_file
+from lidar_synth.files.lock import alone, shared
 from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import (
@@ -272,12 +273,27 @@ def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
     first = not path.is_file()
     claim(path, settings)
     try:
-        yield
+        with writing(path):
+            yield
         if not _alone(path):
             claim(path, settings)  # again: the process that came first may have written nothing and taken it back
     finally:
         if first and _alone(path):
             path.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Write into a claimed folder; the last of several runs removes the temporary files that killed ones left.
+
+    Args:
+        path: the file of the claim.
+    """
+    with shared(path):
+        yield
+    with alone(path) as exclusive:
+        for part in path.parent.rglob(".*.part") if exclusive else ():
+            part.unlink(missing_ok=True)
 
 
 def _alone(path: Path) -> bool:

@@ -15,7 +15,7 @@ from lidar_synth.formats.description import TOWN
 from lidar_synth.formats.kitti360 import KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
-from lidar_synth.formats.writer import Writer, claim
+from lidar_synth.formats.writer import Writer, claim, writing
 from lidar_synth.town.accumulate import check_accumulation, window_paths, windows_of, write_window
 from lidar_synth.town.town import Town
 from lidar_synth.town.world import STRETCH_FRAMES
@@ -84,21 +84,22 @@ def export_town(
     if accumulate:
         check_accumulation(town, layout)
     _claim_folder(Path(out), town, layout, number, camera)
-    writer = LAYOUTS[layout](out, calibration=town.calibration)
-    names = [f"{number:02d}/{i:06d}" if layout in SEQUENCES else None for i in range(len(town))]
-    missing = [i for i, name in enumerate(names) if not writer.complete(i, name)]
-    work = partial(_write_group, town, writer, names, camera)
-    with (
-        tqdm(total=len(missing), unit="scan", disable=not progress) as bar,
-        in_processes(work, _groups(missing, jobs), jobs) as done,
-    ):
-        for count in done:
-            bar.update(count)
-    writer.finish()
-    if layout == "semantic_kitti" and len(town):
-        _write_times(Path(out) / "sequences" / f"{number:02d}" / "times.txt", town)
-    if accumulate:
-        _write_windows(town, Path(out), f"2013_05_28_drive_{number:04d}_sync", jobs, progress)
+    with writing(Path(out) / SETTINGS):
+        writer = LAYOUTS[layout](out, calibration=town.calibration)
+        names = [f"{number:02d}/{i:06d}" if layout in SEQUENCES else None for i in range(len(town))]
+        missing = [i for i, name in enumerate(names) if not writer.complete(i, name)]
+        work = partial(_write_group, town, writer, names, camera)
+        with (
+            tqdm(total=len(missing), unit="scan", disable=not progress) as bar,
+            in_processes(work, _groups(missing, jobs), jobs) as done,
+        ):
+            for count in done:
+                bar.update(count)
+        writer.finish()
+        if layout == "semantic_kitti" and len(town):
+            _write_times(Path(out) / "sequences" / f"{number:02d}" / "times.txt", town)
+        if accumulate:
+            _write_windows(town, Path(out), f"2013_05_28_drive_{number:04d}_sync", jobs, progress)
     return len(missing), len(town) - len(missing)
 
 

@@ -24,9 +24,9 @@ import torch
 import yaml
 from tqdm import tqdm
 
-from lidar_synth.bake.lock import one_writer
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.files.disk import write_file
+from lidar_synth.files.lock import one_writer
 from lidar_synth.generate.checkpoint import save_checkpoint
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.generator import Generator

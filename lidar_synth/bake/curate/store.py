@@ -16,11 +16,11 @@ from tqdm import tqdm
 
 import lidar_synth
 from lidar_synth.bake.curate.features import RANGE_BINS, SIGNATURE, features, measured
-from lidar_synth.bake.lock import alone, shared
 from lidar_synth.bank import INDEX, Bank
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import write_file
+from lidar_synth.files.lock import alone, shared
 from lidar_synth.formats.convert import in_processes
 
 BLOCK = 4096
