@@ -36,6 +36,17 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
 
     Raises:
         ConfigError: on a loader that is prepared already, or one without ``train.batches``.
+
+    Example:
+        >>> from accelerate import Accelerator
+        >>> from torch.utils.data import DataLoader
+        >>> from lidar_synth import Bank, MixedScans, open_scans
+        >>> from lidar_synth.integrations.accelerate import prepare
+        >>> train = MixedScans(open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.25)
+        >>> train.set_epoch(5)
+        >>> loader = DataLoader(train, batch_sampler=train.batches(2), collate_fn=train.collate)
+        >>> sum(len(batch["domain"]) for batch in prepare(Accelerator(cpu=True), loader))
+        4
     """
     divided = loader.dataset if isinstance(loader.dataset, MixedStream) else loader.batch_sampler
     if not isinstance(divided, MixedBatches | MixedStream):

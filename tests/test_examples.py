@@ -25,6 +25,7 @@ FURTHER = {
     "lidar_synth.geometry.projection": ("fill_points", "locate", "project_batch"),
     "lidar_synth.geometry.transfer": ("Mount", "SeenAs", "Transfer"),
     "lidar_synth.generate.inpaint": ("inpaint",),
+    "lidar_synth.integrations.accelerate": ("prepare",),
     "lidar_synth.labels.augment": ("compose",),
     "lidar_synth.labels.edit": ("insert", "measure", "move", "remove"),
     "lidar_synth.mixing": ("Generated", "MixedScans.batches", "MixedScans.domain", "MixedScans.wrap"),

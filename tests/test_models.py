@@ -267,7 +267,10 @@ FILES: dict[str, tuple[str, str]] = {
         r"teacher.needs with 'data'; expected keys among teacher, weaker, init, codec",
     ),
     "the name of a key": ("stages: {data: {recipe: a, minutes: 1}}", r"stage 'data'; expected a name .* no key"),
-    "an unknown recipe": ("stages: {codec: {recipe: town_codecs, minutes: 1}}", r"recipe 'town_codecs'; expected"),
+    "an unknown recipe": (
+        "stages: {codec: {recipe: town_codecs, minutes: 1}}",
+        r"recipe or model 'town_codecs'; expected",
+    ),
 }
 
 

@@ -111,7 +111,7 @@ class Folder(ScanFiles):
             if is_log and self._reflectance_max is None and np.nanmax(scan.reflectance, initial=0) > 1:
                 scale = LOG_REFLECTANCE
             check_scan(scan, str(path), scale)
-            if is_log and not self._unknown:
+            if is_log and self._given is not None:
                 scan.ring = rows_of_rings(scan)
         if scale != 1:
             scan.reflectance = scan.reflectance / np.float32(scale)

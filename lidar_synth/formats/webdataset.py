@@ -168,7 +168,7 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
         boxes = Boxes(arrays.pop("boxes"), _texts(facts["names"])) if "boxes" in arrays else None
         points = arrays.pop("points")
         arrays |= {"points": points[:, :3], "reflectance": points[:, 3]}
-        if facts.get("labelled") is False:
+        if "labelled" in facts and facts["labelled"] is False:
             del arrays["label"]
         texts = {name: json.dumps(facts[name]) for name in ("sensor", "provenance") if name in facts}
         arrays |= {name: np.array(text) for name, text in texts.items()}

@@ -193,7 +193,7 @@ def check_facts(scan: Scan, where: str) -> None:
         DataError: on one.
     """
     try:
-        check_provenance(dict(scan.provenance))
+        check_provenance(dict(scan.provenance or {}))
         if scan.pose is not None:
             check_pose(scan.pose)
         if scan.domain not in (REAL, SYNTHETIC):

@@ -192,8 +192,8 @@ class MixedScans(Dataset[Any]):
 
         Example:
             >>> import torch
-            >>> from lidar_synth import Bank, MixedScans
-            >>> yours = [torch.rand(1000, 3) for _ in range(3)]  # any dataset: here its samples are points (N, 3)
+            >>> from lidar_synth import Bank, MixedScans, open_scans
+            >>> yours = [torch.from_numpy(scan.points) for scan in open_scans("demo_out/town")]  # any dataset
             >>> def to_sample(scan, rng):
             ...     return torch.from_numpy(scan.points)
             >>> train = MixedScans.wrap(yours, Bank("demo_out/bank"), ratio=0.25, to_sample=to_sample)
