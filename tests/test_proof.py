@@ -122,9 +122,9 @@ def test_a_short_time_has_fewer_iterations_which_a_resumed_comparison_keeps(tmp_
     """Iteration times are measured again by each call, so that the same minutes could give another number."""
     source = drives(2, 3)
     asked = replace(SMALL, iterations=10**5)
-    first = prove(source, tmp_path, asked, minutes=0.3, jobs=1, progress=False)
+    first = prove(source, tmp_path, asked, minutes=0.1, jobs=1, progress=False)
     assert 10 <= first.values["iterations"] < 10**5
-    again = prove(source, tmp_path, asked, minutes=0.2, jobs=1, progress=False)
+    again = prove(source, tmp_path, asked, minutes=0.05, jobs=1, progress=False)
     assert again.values["iterations"] == first.values["iterations"]
 
 
