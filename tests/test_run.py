@@ -314,20 +314,6 @@ def test_a_selection_of_other_settings_is_refused(
     assert (run / "config.yaml").read_bytes() == before
 
 
-def test_a_damaged_selection_is_made_again(scans: Path, teacher: Path, tmp_path: Path) -> None:
-    config = distilling(scans, tmp_path, teacher)
-    path = tmp_path / "run" / "selection.npz"
-    path.parent.mkdir()
-    for content in (b"", b"PK\x03\x04", b"no archive"):
-        path.write_bytes(content)
-        with pytest.warns(UserWarning, match="the timesteps are selected again"):
-            call("distill", config, f"output={path.parent}")
-        assert load_checkpoint(path.parent / "run.safetensors").header.time_grid[0] == 1
-        for other in path.parent.iterdir():
-            if other.is_file():
-                other.unlink()
-
-
 @pytest.mark.parametrize(
     ("override", "named"),
     [

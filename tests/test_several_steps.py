@@ -7,7 +7,7 @@ import pytest
 from test_run import call, distilling, one_thread, scans, teacher, write_config
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.generate.checkpoint import load_checkpoint, read_header
 from lidar_synth.generate.generator import load_generator
 
 __all__ = ["one_thread", "scans", "teacher"]  # fixtures
@@ -48,3 +48,17 @@ def test_a_student_is_not_distilled_on_the_town_in_place_of_the_teachers_scans(t
     with pytest.raises(ConfigError, match=r"data.town=3000 for teacher .*, which learnt from .*data.town=null"):
         call("distill", "town_pixel_student", *given)
     assert not (tmp_path / "run" / "cache").exists()
+
+
+def test_a_damaged_selection_is_made_again(scans: Path, teacher: Path, tmp_path: Path) -> None:
+    config = distilling(scans, tmp_path, teacher)
+    path = tmp_path / "run" / "selection.npz"
+    path.parent.mkdir()
+    for content in (b"", b"PK\x03\x04", b"no archive"):
+        path.write_bytes(content)
+        with pytest.warns(UserWarning, match="the timesteps are selected again"):
+            call("distill", config, f"output={path.parent}")
+        assert load_checkpoint(path.parent / "run.safetensors").header.time_grid[0] == 1
+        for other in path.parent.iterdir():
+            if other.is_file():
+                other.unlink()
