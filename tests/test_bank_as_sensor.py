@@ -83,7 +83,7 @@ def test_an_interrupted_run_resumes_and_damage_is_made_again(bank: Bank, tmp_pat
     assert Bank(out).index.shards == Bank(whole).index.shards
     with pytest.raises(ConfigError, match="was filled with"):
         turn_bank(bank, out, Transfer(THEIRS), progress=False)
-    with pytest.raises(ConfigError, match="holds a bank"):
+    with pytest.raises(ConfigError, match="holds another bank"):
         turn_bank(bank, Path(bank.root), TRANSFER, progress=False)
 
 

@@ -12,19 +12,14 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import sync_folder, write_bank_files
+from lidar_synth.bake.making import making
 from lidar_synth.bake.verify import check_scans
-from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
-from lidar_synth.errors import ConfigError
+from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.files.disk import part_of, sha256
-from lidar_synth.files.lock import alone
-from lidar_synth.formats.writer import claim
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.noise import keyed_rng
-
-CLAIM = ".as_sensor.json"
-"""File in the new bank's folder that names the bank and the sensor; a run holds a lock on it."""
 
 
 def turn_bank(bank: Bank, out: Path, transfer: Transfer, progress: bool = True) -> Index:
@@ -43,14 +38,7 @@ def turn_bank(bank: Bank, out: Path, transfer: Transfer, progress: bool = True) 
         ConfigError: on a folder that holds something else, or in which another process works.
         DataError, FileError: if a scan cannot be read, cast or written.
     """
-    if not (out / CLAIM).is_file() and ((out / INDEX).exists() or any(out.glob("*.h5"))):
-        raise ConfigError(f"{out} holds a bank", "an empty folder for the new one")
-    claim(out / CLAIM, {"bank": bank.identity, "as_sensor": transfer.identity})
-    with alone(out / CLAIM) as exclusive:
-        if not exclusive:
-            raise ConfigError(f"{out}, in which another process works", "a folder for this process alone")
-        for part in out.glob(".*.part"):
-            part.unlink(missing_ok=True)
+    with making(out, {"bank": bank.identity, "as_sensor": transfer.identity}):
         sources = tuple(_facts(facts, transfer) for facts in bank.index.sources)
         entries = []
         with tqdm(total=len(bank), unit="scan", disable=not progress) as bar:
