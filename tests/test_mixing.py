@@ -15,9 +15,9 @@ from mixtures import SENSOR, Endless, Scans, plain
 from torch.utils.data import DataLoader
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import DataError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
-from lidar_synth.mixing import MixedScans, Sources
+from lidar_synth.mixing import MixedScans, MixedStream, Sources
 from lidar_synth.mixing.state import make_state
 from lidar_synth.noise import keyed_rng
 
@@ -262,6 +262,18 @@ def test_a_batch_without_a_valid_label_is_refused() -> None:
     assert (synthetic_only(labels="ignore", unlabelled="allow")["label"] == IGNORE).all()
     assert (synthetic_only(labels="none")["label"] == IGNORE).all()
     assert (synthetic_only(labels="generated")["label"] != IGNORE).any()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("form", ["map", "stream"])
+def test_a_loader_without_collate_fn_is_told_which(form: str, workers: int) -> None:
+    """Scans differ in size; those of one size make a batch as torch makes it."""
+    train = MixedScans(Scans("r", 9), Endless(), 0.25)
+    dataset: Any = train if form == "map" else MixedStream(train, batch_size=2)
+    with pytest.raises(ConfigError, match=r"collate_fn=train\.collate"):
+        next(iter(DataLoader(dataset, 2, num_workers=workers)))
+    one = next(iter(DataLoader(dataset, 1, num_workers=workers)))
+    assert one["points"].shape == (1, *train[0]["points"].shape) and one["id"] == [train[0]["id"]]
 
 
 def test_forms_of_batches() -> None:

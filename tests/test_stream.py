@@ -306,3 +306,9 @@ def test_only_this_ranks_share_is_announced_to_a_source_that_works_ahead() -> No
     list(islice(stream, 8))
     mine = [2, 3, 6, 7, 10, 11]
     assert source.told == [[epoch[i] for i in mine if epoch[i] >= 0] for epoch in asked]
+
+
+def test_it_says_what_it_is() -> None:
+    first, second = repr(MixedStream(mixed(), batch_size=4)).splitlines()
+    assert first == "MixedStream: batches of 4, rank 0 of 1, endless"
+    assert second.strip() == "MixedScans: 15 samples in epoch 0, 6 of them synthetic; seed 0"

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
+from torch.utils.data import default_collate
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
@@ -81,6 +83,25 @@ class Collate:
                 "skip such batches in the training loop.",
             )
         return batch
+
+
+def collate_by_default(items: Sequence[Item], **options: Any) -> Any:
+    """What ``DataLoader`` does to items without a ``collate_fn``, which fails for scans of different sizes.
+
+    Raises:
+        ConfigError: on such scans.
+    """
+    try:
+        return default_collate([dict(item) for item in items])
+    except RuntimeError as error:
+        raise ConfigError(
+            "a DataLoader without collate_fn, whose scans differ in size",
+            "the collate_fn of the mixture",
+            "DataLoader(train, batch_size=4, collate_fn=train.collate)",
+        ) from error
+
+
+default_collate_fn_map[Item] = collate_by_default  # as torch's documentation of default_collate says
 
 
 def _offset_points(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Tensor]:

@@ -1,18 +1,17 @@
 """The plain PyTorch item, the default form of a sample."""
 
 from dataclasses import replace
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Scan
 
 
-class Item(TypedDict):
+class Item(dict[str, Any]):
     """One sample. All items have the same keys, and their tensors share no memory with the scan.
 
     Keys:
@@ -24,14 +23,6 @@ class Item(TypedDict):
         domain: 0 real, 1 synthetic.
         id: the scan's name.
     """
-
-    points: Tensor
-    label: Tensor
-    confidence: Tensor
-    boxes: Tensor
-    names: tuple[str, ...]
-    domain: int
-    id: str
 
 
 def copy_scan(scan: Scan) -> Scan:
@@ -66,12 +57,12 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
     own = scan.confidence
     confidence = (label != IGNORE).astype(np.float32) if own is None else np.array(own, np.float32)
     boxes: Any = np.empty((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()
-    return {
-        "points": torch.from_numpy(points),
-        "label": torch.from_numpy(label),
-        "confidence": torch.from_numpy(confidence),
-        "boxes": torch.from_numpy(boxes),
-        "names": () if scan.boxes is None else scan.boxes.names,
-        "domain": scan.domain,
-        "id": scan.id,
-    }
+    return Item(
+        points=torch.from_numpy(points),
+        label=torch.from_numpy(label),
+        confidence=torch.from_numpy(confidence),
+        boxes=torch.from_numpy(boxes),
+        names=() if scan.boxes is None else scan.boxes.names,
+        domain=scan.domain,
+        id=scan.id,
+    )

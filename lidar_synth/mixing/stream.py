@@ -75,6 +75,12 @@ class MixedStream(IterableDataset[Any]):
         self._resume: dict[str, Any] = {}  # the state from which the process that loaded it has to resume
         self._loaded_by = 0  # that process
 
+    def __repr__(self) -> str:
+        kind = "endless" if self.endless else "epoch by epoch"
+        place = f"batches of {self.batch_size}, rank {self.rank} of {self.world_size}"
+        mixture = repr(self.scans).partition("\n")[0]
+        return f"{type(self).__name__}: {place}, {kind}\n  {mixture}"
+
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch in which iterating begins."""
         self.scans.set_epoch(epoch)
