@@ -14,14 +14,15 @@ from lidar_synth.integrations.mmdet3d_lists import write_plane
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate.cache import scan_hash
+from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import write_file
 from lidar_synth.formats import KITTIObject
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA, KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
-from lidar_synth.formats.writer import Writer, claim
+from lidar_synth.formats.writer import Writer
 from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.evaluate.cache import scan_hash
 from lidar_synth.mixing import MixedScans
 
 COMPARED = 3

@@ -14,8 +14,9 @@ from typing import Any
 from torch.utils.data import DataLoader, Dataset
 
 from lidar_synth.errors import ConfigError, LibraryError
+from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry.scan import Source
-from lidar_synth.mixing import Collate, Generated, MixedBatches, MixedScans, to_item
+from lidar_synth.mixing import Collate, MixedBatches, MixedScans, to_item
 from lidar_synth.mixing.batches import CutSteps, cut_steps
 from lidar_synth.mixing.state import after_epoch, checked_state, make_state
 from lidar_synth.noise import keyed_rng

@@ -32,33 +32,33 @@ _HOME = {
     "NuScenes": "formats",
     "ObjectBank": "labels",
     "PandaSet": "formats",
-    "ProofSettings": "proof",
+    "ProofSettings": "lab.proof",
     "RangeImage": "geometry.scan",
     "RollingBank": "mixing.service",
     "Scan": "geometry.scan",
     "SemanticKITTI": "formats",
     "Sensor": "geometry.sensor",
-    "Skin": "town",
+    "Skin": "lab.town",
     "Source": "geometry.scan",
     "Sources": "mixing",
-    "SensorFit": "geometry.fitting",
-    "Town": "town",
-    "Trajectory": "geometry.fitting",
-    "adapt": "train.adaptation",
-    "assign_beams": "geometry.fitting",
-    "deskew": "geometry.fitting",
-    "fit_sensor": "geometry.fitting",
-    "fit_skin": "town",
+    "SensorFit": "lab.fitting",
+    "Town": "lab.town",
+    "Trajectory": "geometry.deskew",
+    "adapt": "lab.train.adaptation",
+    "assign_beams": "geometry.assign",
+    "deskew": "geometry.deskew",
+    "fit_sensor": "lab.fitting",
+    "fit_skin": "lab.town",
     "layout_of": "geometry.layout",
-    "load_generator": "generate.generator",
+    "load_generator": "generate.loading",
     "load_layout": "geometry.layout.files",
     "load_sensor": "geometry.sensor",
-    "load_skin": "town",
+    "load_skin": "lab.town",
     "make_policy": "labels",
     "open_scans": "formats",
     "project": "geometry.projection",
-    "prove": "proof",
-    "reskew": "geometry.fitting",
+    "prove": "lab.proof",
+    "reskew": "geometry.deskew",
     "unfold": "geometry.projection",
     "unproject": "geometry.projection",
 }
@@ -76,13 +76,11 @@ if TYPE_CHECKING:
     from lidar_synth.formats import SemanticKITTI as SemanticKITTI
     from lidar_synth.formats import open_scans as open_scans
     from lidar_synth.generate.generator import Generator as Generator
-    from lidar_synth.generate.generator import load_generator as load_generator
-    from lidar_synth.geometry.fitting import SensorFit as SensorFit
-    from lidar_synth.geometry.fitting import Trajectory as Trajectory
-    from lidar_synth.geometry.fitting import assign_beams as assign_beams
-    from lidar_synth.geometry.fitting import deskew as deskew
-    from lidar_synth.geometry.fitting import fit_sensor as fit_sensor
-    from lidar_synth.geometry.fitting import reskew as reskew
+    from lidar_synth.generate.loading import load_generator as load_generator
+    from lidar_synth.geometry.assign import assign_beams as assign_beams
+    from lidar_synth.geometry.deskew import Trajectory as Trajectory
+    from lidar_synth.geometry.deskew import deskew as deskew
+    from lidar_synth.geometry.deskew import reskew as reskew
     from lidar_synth.geometry.layout import Layout as Layout
     from lidar_synth.geometry.layout import layout_of as layout_of
     from lidar_synth.geometry.layout.files import load_layout as load_layout
@@ -95,6 +93,15 @@ if TYPE_CHECKING:
     from lidar_synth.geometry.scan import Source as Source
     from lidar_synth.geometry.sensor import Sensor as Sensor
     from lidar_synth.geometry.sensor import load_sensor as load_sensor
+    from lidar_synth.lab.fitting import SensorFit as SensorFit
+    from lidar_synth.lab.fitting import fit_sensor as fit_sensor
+    from lidar_synth.lab.proof import ProofSettings as ProofSettings
+    from lidar_synth.lab.proof import prove as prove
+    from lidar_synth.lab.town import Skin as Skin
+    from lidar_synth.lab.town import Town as Town
+    from lidar_synth.lab.town import fit_skin as fit_skin
+    from lidar_synth.lab.town import load_skin as load_skin
+    from lidar_synth.lab.train.adaptation import adapt as adapt
     from lidar_synth.labels import ObjectBank as ObjectBank
     from lidar_synth.labels import make_policy as make_policy
     from lidar_synth.mixing import Linear as Linear
@@ -103,13 +110,6 @@ if TYPE_CHECKING:
     from lidar_synth.mixing import Sources as Sources
     from lidar_synth.mixing.service import BatchMixer as BatchMixer
     from lidar_synth.mixing.service import RollingBank as RollingBank
-    from lidar_synth.proof import ProofSettings as ProofSettings
-    from lidar_synth.proof import prove as prove
-    from lidar_synth.town import Skin as Skin
-    from lidar_synth.town import Town as Town
-    from lidar_synth.town import fit_skin as fit_skin
-    from lidar_synth.town import load_skin as load_skin
-    from lidar_synth.train.adaptation import adapt as adapt
 
 
 def __getattr__(name: str) -> Any:

@@ -7,8 +7,11 @@ Every message states what was given, what was expected and what to type, in that
                     "copy the file again, or skip it with on_bad='skip'")
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
+from typing import TypeVar
+
+Choice = TypeVar("Choice")
 
 
 class LidarSynthError(Exception):
@@ -72,3 +75,15 @@ class LibraryError(LidarSynthError, OSError):
 
 class ProcessError(LidarSynthError, OSError):
     """A process of the package that died or did not answer in time."""
+
+
+def choose(kind: str, name: str, table: Mapping[str, Choice], hint: str = "") -> Choice:
+    """``table[name]``, or an error that lists the names.
+
+    Raises:
+        ConfigError: on a name that is not in the table.
+    """
+    if name not in table:
+        hint = f"{hint} {suggest(name, table)}".strip()
+        raise ConfigError(f"{kind} {name!r}", f"one of {', '.join(map(repr, table))}", hint)
+    return table[name]

@@ -74,7 +74,7 @@ def add_stray(path: Path) -> None:
 
 def write_golden_bank(root: Path) -> None:
     """Write the bank in tests/golden, and numbers.json with the expected statistics of its scans."""
-    from lidar_synth.town import Town
+    from lidar_synth.lab.town import Town
 
     sensor = load_sensor(Path(__file__).parents[1] / "configs" / "tiny_sensor.yaml")
     images = [project(scan) for scan in Town(0, sensor, 3)]

@@ -16,9 +16,9 @@ from lidar_synth.generate.checkpoint import (
     NetworkSpec,
     weights_hash,
 )
+from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import build_network
 
 SENSOR = Sensor("small", columns=32, range_min=1.0, range_max=80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 

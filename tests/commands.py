@@ -21,10 +21,10 @@ from project import PYPROJECT, ROOT
 
 from lidar_synth.bake import ENGINES, BakeJob
 from lidar_synth.cli import app
-from lidar_synth.evaluate import PROTOCOLS
 from lidar_synth.formats import WRITERS
-from lidar_synth.train import DistillConfig, TrainConfig, load_config, plan_model
-from lidar_synth.train.config import published_models, read_values, validated
+from lidar_synth.lab.evaluate import PROTOCOLS
+from lidar_synth.lab.train import DistillConfig, TrainConfig, load_config, plan_model
+from lidar_synth.lab.train.config import published_models, read_values, validated
 
 PLAIN = (
     ".", "apt-get", "cat", "cd", "cp", "docker", "export", "git", "ln", "ls", "mkdir", "printf", "source", "sudo",

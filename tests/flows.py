@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
-from lidar_synth.flow.path import per_sample
+from lidar_synth.generate.flow.path import per_sample
 
 MEAN, STD = 0.5, 0.1
 """Of the data of the Gaussian flow."""

@@ -10,12 +10,12 @@ from streets import SENSOR, street
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.proof import Job, Row
+from lidar_synth.lab.proof.command import write_scans
+from lidar_synth.lab.proof.pools import read_pool
+from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.objects import LABELS
-from lidar_synth.proof import Job, Row
-from lidar_synth.proof.command import write_scans
-from lidar_synth.proof.pools import read_pool
-from lidar_synth.town import STRETCH_FRAMES, Town
 
 TOWN_SENSOR = Sensor("small town", columns=512, range_min=1.0, range_max=80.0, rows=32, fov_up=3.0, fov_down=-25.0)
 

@@ -12,9 +12,9 @@ from lidar_synth.generate.checkpoint import (
     NetworkSpec,
     save_checkpoint,
 )
+from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import build_network
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 

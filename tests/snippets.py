@@ -14,7 +14,7 @@ from lidar_synth.bake import BakeJob
 from lidar_synth.errors import LibraryError
 from lidar_synth.geometry.layout.files import load_layout
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.train import DistillConfig, TrainConfig, load_config
+from lidar_synth.lab.train import DistillConfig, TrainConfig, load_config
 
 
 def check_python(code: str) -> None:

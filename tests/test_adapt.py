@@ -21,7 +21,6 @@ from small_models import write as write_pixel_model
 from lidar_synth import Town, adapt, load_generator, load_sensor, open_scans
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate.leakage import measured, overlap, seen_by, town
 from lidar_synth.formats import WRITERS, layout_of
 from lidar_synth.generate.checkpoint import (
     CODEC,
@@ -34,16 +33,17 @@ from lidar_synth.generate.checkpoint import (
     read_header,
     save_checkpoint,
 )
-from lidar_synth.generate.generator import find_model
+from lidar_synth.generate.loading import find_model
+from lidar_synth.generate.models import build_network
 from lidar_synth.generate.regrid import PLACED, fitting, regrid
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, sensor_yaml
-from lidar_synth.models import build_network
-from lidar_synth.train.adaptation import card
-from lidar_synth.train.adaptation.stages import TOWN_SEED
-from lidar_synth.train.held_out import read_history
+from lidar_synth.lab.evaluate.leakage import measured, overlap, seen_by, town
+from lidar_synth.lab.train.adaptation import card
+from lidar_synth.lab.train.adaptation.stages import TOWN_SEED
+from lidar_synth.lab.train.held_out import read_history
 
 TINY = load_sensor(Path(__file__).parent.parent / "configs" / "tiny_sensor.yaml")
 OWN = Sensor("own", 120, 1.0, 100.0, elevations=tuple(np.linspace(2, -24, 16) - np.linspace(-1, 1, 16) ** 2))

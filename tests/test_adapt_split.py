@@ -2,7 +2,7 @@
 
 import pytest
 
-from lidar_synth.train.adaptation.scans import split
+from lidar_synth.lab.train.adaptation.scans import split
 
 
 @pytest.mark.parametrize("count", [12, 16, 24, 200, 1000])

@@ -12,16 +12,16 @@ from torch.distributions import Laplace
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow.path import METRICS
 from lidar_synth.generate.codec import make_codec
+from lidar_synth.generate.flow.path import METRICS
+from lidar_synth.generate.models import build_network
+from lidar_synth.generate.models.town_codec.autoencoder import ROUGHNESS, Autoencoder
+from lidar_synth.generate.models.town_codec.multiscale import LATTICES, at_lattice
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import build_network
-from lidar_synth.models.town_codec.autoencoder import ROUGHNESS, Autoencoder
-from lidar_synth.models.town_codec.multiscale import LATTICES, at_lattice
-from lidar_synth.train import (
+from lidar_synth.lab.train import (
     Autoencoding,
     Batch,
     Batches,

@@ -32,10 +32,10 @@ from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.files.disk import sha256
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import ENCODER, VELOCITY, Header, NetworkSpec, save_checkpoint
-from lidar_synth.generate.generator import load_generator
+from lidar_synth.generate.loading import load_generator
+from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import NORMALISATIONS
-from lidar_synth.models import build_network
-from lidar_synth.train.config import read_values, validated
+from lidar_synth.lab.train.config import read_values, validated
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

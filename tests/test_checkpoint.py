@@ -28,7 +28,7 @@ from lidar_synth.generate.checkpoint import (
     save_checkpoint,
     weights_hash,
 )
-from lidar_synth.models import build_network
+from lidar_synth.generate.models import build_network
 
 
 @pytest.fixture

@@ -10,14 +10,14 @@ from conftest import random_scan
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow.path import METRICS
 from lidar_synth.generate.codec import Identity, Latent, expected, make_codec
+from lidar_synth.generate.flow.path import METRICS
+from lidar_synth.generate.models import build_network
+from lidar_synth.generate.models.lidm.vqvae import VQVAE
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import build_network
-from lidar_synth.models.lidm.vqvae import VQVAE
-from lidar_synth.train import (
+from lidar_synth.lab.train import (
     Autoencoding,
     Batches,
     Losses,

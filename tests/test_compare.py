@@ -14,9 +14,10 @@ from torch.utils.data import default_collate
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError
+from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry.scan import POINT_FIELDS, Scan
 from lidar_synth.geometry.sensor import presets
-from lidar_synth.mixing import Generated, MixedScans
+from lidar_synth.mixing import MixedScans
 from lidar_synth.mixing.compare import made_up
 
 

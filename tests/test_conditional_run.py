@@ -21,10 +21,10 @@ from lidar_synth.generate.checkpoint import (
     VELOCITY,
     load_checkpoint,
 )
-from lidar_synth.generate.generator import load_generator
-from lidar_synth.town import Town
-from lidar_synth.train.config import DistillConfig, load_config
-from lidar_synth.train.plan import make_plan, open_data
+from lidar_synth.generate.loading import load_generator
+from lidar_synth.lab.town import Town
+from lidar_synth.lab.train.config import DistillConfig, load_config
+from lidar_synth.lab.train.plan import make_plan, open_data
 
 TRANSFORMER = {"architecture": "hdit", "arguments": {
     "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2], "patch": [1, 1], "window": [3, 3],

@@ -17,18 +17,18 @@ from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
-from lidar_synth.flow.path import guided
 from lidar_synth.generate.conditions import CONDITIONS, batch_of, blank, bridged, one_view
+from lidar_synth.generate.flow.path import guided
+from lidar_synth.generate.models import NETWORKS, build_network, encoders_of
+from lidar_synth.generate.models.encoders.calibrated_camera import SightEncoder
+from lidar_synth.generate.models.encoders.camera_views import split_views
+from lidar_synth.generate.models.encoders.clip_views import CLIP_VARIABLE, CLIP_WIDTH, frozen_clip
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.models import NETWORKS, build_network, encoders_of
-from lidar_synth.models.encoders.calibrated_camera import SightEncoder
-from lidar_synth.models.encoders.camera_views import split_views
-from lidar_synth.models.encoders.clip_views import CLIP_VARIABLE, CLIP_WIDTH, frozen_clip
-from lidar_synth.town.camera import CAMERA
-from lidar_synth.train import Batches, Conditioning, Other, cache_scans
+from lidar_synth.lab.town.camera import CAMERA
+from lidar_synth.lab.train import Batches, Conditioning, Other, cache_scans
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 TOWN = load_sensor("town")

@@ -9,12 +9,12 @@ import torch
 import yaml
 
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.recipes import read_recipe
 from lidar_synth.generate.codec import make_codec
+from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.models import build_network
-from lidar_synth.town import Town
-from lidar_synth.train.config import DistillConfig, Run, TrainConfig, load_config, published
-from lidar_synth.train.config.recipes import read_recipe
+from lidar_synth.lab.town import Town
+from lidar_synth.lab.train.config import DistillConfig, Run, TrainConfig, load_config, published
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 RECIPES = {one.name: one for one in published()}

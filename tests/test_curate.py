@@ -13,15 +13,15 @@ from hypothesis import given, settings
 from layouts import write_all
 from test_verify import call, names_and_points
 
-import lidar_synth.bake.curate.duplicates as duplicates
-from lidar_synth.bake.curate import FILE, MEANINGS, read_scores, score, write_scores
-from lidar_synth.bake.curate.features import MEASURES, features
-from lidar_synth.bake.curate.scores import FARTHEST
+import lidar_synth.lab.curate.duplicates as duplicates
 from lidar_synth.bank import Bank
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.lab.curate import FILE, MEANINGS, read_scores, score, write_scores
+from lidar_synth.lab.curate.features import MEASURES, features
+from lidar_synth.lab.curate.scores import FARTHEST
 from lidar_synth.viz import histograms
 
 ALL = ("reflectance", "label", "confidence")

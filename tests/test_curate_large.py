@@ -19,18 +19,18 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 from test_curate import ALL, plain_image
 
-import lidar_synth.bake.curate.duplicates as duplicates
-import lidar_synth.bake.curate.neighbours as neighbours
-import lidar_synth.bake.curate.store as store_module
-from lidar_synth.bake.curate import FILE, kept_in, read_scores, score
-from lidar_synth.bake.curate.duplicates import compare_all, most_similar
-from lidar_synth.bake.curate.features import SIGNATURE
-from lidar_synth.bake.curate.neighbours import find_similar
-from lidar_synth.bake.curate.store import FOLDER, Store
+import lidar_synth.lab.curate.duplicates as duplicates
+import lidar_synth.lab.curate.neighbours as neighbours
+import lidar_synth.lab.curate.store as store_module
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry
-from lidar_synth.cli.curate import curate
 from lidar_synth.errors import DataError
+from lidar_synth.lab.cli.curate import curate
+from lidar_synth.lab.curate import FILE, kept_in, read_scores, score
+from lidar_synth.lab.curate.duplicates import compare_all, most_similar
+from lidar_synth.lab.curate.features import SIGNATURE
+from lidar_synth.lab.curate.neighbours import find_similar
+from lidar_synth.lab.curate.store import FOLDER, Store
 
 NAMES = ("empty",)
 

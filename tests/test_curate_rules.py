@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lidar_synth.bake.curate import matching
 from lidar_synth.errors import ConfigError
+from lidar_synth.lab.curate import matching
 
 SCORES = {"confidence": np.array([0.1, 0.5, 0.9]), "empty": np.array([0.3, 0.2, 0.1])}
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.generate.models import build_network
+from lidar_synth.generate.models.hdit.hdit import HDiT
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import build_network
-from lidar_synth.models.hdit.hdit import HDiT
 
 SENSOR = Sensor("small", 16, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 ARGUMENTS = {

@@ -19,7 +19,7 @@ from lidar_synth.formats.description import FORMAT, LINE, MARK, NAME, TOWN, Desc
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
-from lidar_synth.town import LAYOUTS, Town, export_town
+from lidar_synth.lab.town import LAYOUTS, Town, export_town
 
 SENSORS = {
     "preset": load_sensor("os1_128"),

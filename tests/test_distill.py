@@ -13,9 +13,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.flow.distill import STRATEGIES, adaptive_piecewise, every_piece, interval_of
-from lidar_synth.flow.path import interpolate, per_sample
-from lidar_synth.flow.solvers import solve, uniform_grid
+from lidar_synth.generate.flow.distill import STRATEGIES, adaptive_piecewise, every_piece, interval_of
+from lidar_synth.generate.flow.path import interpolate, per_sample
+from lidar_synth.generate.flow.solvers import solve, uniform_grid
 from lidar_synth.noise import gaussian, uniform
 
 COUNT = 64

@@ -23,7 +23,7 @@ from snippets import check_python, check_yaml
 
 from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.cli import COMMANDS, main
-from lidar_synth.town import Town, export_town
+from lidar_synth.lab.town import Town, export_town
 
 NAMES = (*COMMANDS, "bank", "merge", "split", "head", "sensor", "skin", "fit", "show", "metrics", "setup")
 FULL = os.environ.get("LIDAR_SYNTH_DOCS") == "full"

@@ -9,7 +9,7 @@ from project import ROOT
 
 import lidar_synth
 from lidar_synth.cli import COMMANDS
-from lidar_synth.train.config import published, published_models
+from lidar_synth.lab.train.config import published, published_models
 
 markdown = pytest.importorskip("markdown")
 pytest.importorskip("latex2mathml")

@@ -18,13 +18,13 @@ from typer.testing import CliRunner
 from lidar_synth.cli import app
 from lidar_synth.datasets.recordings import NOTE, frames_of
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate import PROTOCOLS, evaluate
-from lidar_synth.evaluate.leakage import measured, overlap, recordings_of, seen_by, town
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import Sensor, presets
-from lidar_synth.town.export import SETTINGS
+from lidar_synth.lab.evaluate import PROTOCOLS, evaluate
+from lidar_synth.lab.evaluate.leakage import measured, overlap, recordings_of, seen_by, town
+from lidar_synth.lab.town.export import SETTINGS
 
 
 @pytest.fixture(scope="module")

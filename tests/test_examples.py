@@ -14,13 +14,13 @@ from project import ROOT
 
 import lidar_synth
 from lidar_synth.bake import BakeJob, bake, make_plan
-from lidar_synth.town import Town, export_town
+from lidar_synth.lab.town import Town, export_town
 
 FURTHER = {
     "lidar_synth.datasets.classes": ("Taxonomy",),
-    "lidar_synth.evaluate": ("Metric", "evaluate"),
-    "lidar_synth.evaluate.segmentation": ("load_judge",),
-    "lidar_synth.flow.solvers": ("solve",),
+    "lidar_synth.lab.evaluate": ("Metric", "evaluate"),
+    "lidar_synth.lab.evaluate.segmentation": ("load_judge",),
+    "lidar_synth.generate.flow.solvers": ("solve",),
     "lidar_synth.geometry.normalize": ("Normalisation",),
     "lidar_synth.geometry.projection": ("fill_points", "locate", "project_batch"),
     "lidar_synth.geometry.transfer": ("Mount", "SeenAs", "Transfer"),
@@ -30,7 +30,7 @@ FURTHER = {
     "lidar_synth.labels.edit": ("insert", "measure", "move", "remove"),
     "lidar_synth.mixing": ("Generated", "MixedScans.batches", "MixedScans.domain", "MixedScans.wrap"),
     "lidar_synth.noise": ("gaussian",),
-    "lidar_synth.train": ("TrainConfig", "load_config", "plan_model", "run", "train_model"),
+    "lidar_synth.lab.train": ("TrainConfig", "load_config", "plan_model", "run", "train_model"),
     "lidar_synth.viz": ("write_view",),
 }
 """What the documents name besides ``lidar_synth.__all__``. Python keeps no docstring of a dictionary such as

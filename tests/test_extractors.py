@@ -21,17 +21,17 @@ from typer.testing import CliRunner
 
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError, LidarSynthError
-from lidar_synth.evaluate import frechet_distance
-from lidar_synth.evaluate.extractors import EXTRACTORS, load_extractor
-from lidar_synth.evaluate.extractors.archive import Archive
-from lidar_synth.evaluate.extractors.bonnetal import POOLS, load_lidm, read_segmenter
-from lidar_synth.evaluate.extractors.inputs import PREPARATIONS
-from lidar_synth.evaluate.extractors.liploc import picture
-from lidar_synth.evaluate.extractors.rangevit import build
-from lidar_synth.evaluate.street_judge import load_archive
 from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import presets
+from lidar_synth.lab.evaluate import frechet_distance
+from lidar_synth.lab.evaluate.extractors import EXTRACTORS, load_extractor
+from lidar_synth.lab.evaluate.extractors.archive import Archive
+from lidar_synth.lab.evaluate.extractors.bonnetal import POOLS, load_lidm, read_segmenter
+from lidar_synth.lab.evaluate.extractors.inputs import PREPARATIONS
+from lidar_synth.lab.evaluate.extractors.liploc import picture
+from lidar_synth.lab.evaluate.extractors.rangevit import build
+from lidar_synth.lab.evaluate.street_judge import load_archive
 
 ROOT = Path(__file__).parents[1]
 Of = Callable[[torch.Tensor], NDArray[np.floating]]

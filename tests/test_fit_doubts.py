@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from turns import BEAMS, turned
 
-from lidar_synth.geometry.fitting import SensorFit, assign_beams, fit_sensor
-from lidar_synth.geometry.fitting.doubts import name_vendor, vendors
+from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor, presets, sensor_yaml
-from lidar_synth.town import Town
+from lidar_synth.lab.fitting import SensorFit, fit_sensor
+from lidar_synth.lab.fitting.doubts import name_vendor, vendors
+from lidar_synth.lab.town import Town
 
 OFFSETS = tuple(np.tile([-3.0, -1.0, 1.0, 3.0], 4).tolist())
 

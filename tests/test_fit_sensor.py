@@ -13,11 +13,13 @@ from turns import BEAMS, compensated, driving, turned
 
 from lidar_synth.cli import main
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.fitting import SensorFit, Trajectory, assign_beams, deskew, fit_sensor, reskew
-from lidar_synth.geometry.fitting.search import tilt_of
+from lidar_synth.geometry.assign import assign_beams
+from lidar_synth.geometry.deskew import Trajectory, deskew, reskew
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor, sensor_yaml
-from lidar_synth.town import Town
+from lidar_synth.lab.fitting import SensorFit, fit_sensor
+from lidar_synth.lab.fitting.search import tilt_of
+from lidar_synth.lab.town import Town
 
 HEIGHTS = tuple([0.2] * 8 + [0.12] * 8)
 OFFSETS = tuple((np.tile([-3.0, -1.0, 1.0, 3.0], 4) + np.linspace(0, 0.5, 16)).tolist())

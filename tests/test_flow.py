@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lidar_synth.errors import DataError
-from lidar_synth.flow.path import (
+from lidar_synth.generate.flow.path import (
     METRICS,
     TIMESTEPS,
     autoguided,
@@ -25,7 +25,7 @@ from lidar_synth.flow.path import (
     u_shaped,
     velocity_loss,
 )
-from lidar_synth.flow.solvers import solve, uniform_grid
+from lidar_synth.generate.flow.solvers import solve, uniform_grid
 from lidar_synth.noise import gaussian, uniform
 
 

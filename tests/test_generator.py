@@ -19,7 +19,6 @@ from lidar_synth.bake.job import make_plan
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.flow.solvers import solve, uniform_grid
 from lidar_synth.generate.checkpoint import (
     CODEC,
     VELOCITY,
@@ -30,13 +29,15 @@ from lidar_synth.generate.checkpoint import (
     save_checkpoint,
 )
 from lidar_synth.generate.conditions import GAP, bridged
-from lidar_synth.generate.generator import Generator, load_generator, shipped_models
+from lidar_synth.generate.flow.solvers import solve, uniform_grid
+from lidar_synth.generate.generator import Generator
+from lidar_synth.generate.loading import load_generator, shipped_models
+from lidar_synth.generate.models import NETWORKS, build_network
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC
-from lidar_synth.models import NETWORKS, build_network
+from lidar_synth.lab.town import Town
 from lidar_synth.noise import gaussian
-from lidar_synth.town import Town
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
-from lidar_synth.generate.importers.lidm import codec_part, convert, unet_part
-from lidar_synth.generate.importers.lidm_names import COND_STAGE, UNET
-from lidar_synth.models.lidm.diffusion import DiffusionUNet
-from lidar_synth.models.lidm.vqvae import VQVAE
+from lidar_synth.generate.models.lidm.diffusion import DiffusionUNet
+from lidar_synth.generate.models.lidm.vqvae import VQVAE
+from lidar_synth.lab.importers.lidm import codec_part, convert, unet_part
+from lidar_synth.lab.importers.lidm_names import COND_STAGE, UNET
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

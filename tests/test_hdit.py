@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.models import NETWORKS, attention, build_network, layers
-from lidar_synth.models.attention import NeighbourhoodAttention
-from lidar_synth.models.hdit.hdit import HDiT
-from lidar_synth.models.hdit.transformer import from_patches, to_patches
-from lidar_synth.models.positions import POSITIONS
+from lidar_synth.generate.models import NETWORKS, attention, build_network, layers
+from lidar_synth.generate.models.attention import NeighbourhoodAttention
+from lidar_synth.generate.models.hdit.hdit import HDiT
+from lidar_synth.generate.models.hdit.transformer import from_patches, to_patches
+from lidar_synth.generate.models.positions import POSITIONS
 
 SMALL: dict[str, Any] = {"resolution": (8, 64), "width": 16, "time_width": 16, "depths": (1, 1, 1), "heads": (2, 4, 4)}
 

@@ -13,7 +13,7 @@ from limits import in_limits, needs_limits
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.train.config import TrainConfig, load_config
+from lidar_synth.lab.train.config import TrainConfig, load_config
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

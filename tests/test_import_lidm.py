@@ -19,11 +19,11 @@ from typer.testing import CliRunner
 
 from lidar_synth.errors import DataError, FileError, LidarSynthError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint
-from lidar_synth.generate.generator import load_generator
-from lidar_synth.generate.importers.lidm import read_lidm
-from lidar_synth.generate.importers.lidm_names import FIRST_STAGE, UNET, UNET_EMA, peer_names
-from lidar_synth.models import build_network
-from lidar_synth.models.lidm.diffusion import schedule_times
+from lidar_synth.generate.loading import load_generator
+from lidar_synth.generate.models import build_network
+from lidar_synth.generate.models.lidm.diffusion import schedule_times
+from lidar_synth.lab.importers.lidm import read_lidm
+from lidar_synth.lab.importers.lidm_names import FIRST_STAGE, UNET, UNET_EMA, peer_names
 
 DDCONFIG = {"double_z": False, "z_channels": 4, "in_channels": 1, "out_ch": 1, "ch": 8, "ch_mult": [1, 2],
             "strides": [[2, 2]], "num_res_blocks": 1, "attn_levels": [], "dropout": 0.0}  # fmt: skip
@@ -70,7 +70,7 @@ def schedule(start: float = 0.0015, end: float = 0.0195) -> dict[str, Tensor]:
 
 def random_weights(model: dict[str, Any], folder: Path) -> dict[str, Tensor]:
     """Random weights in LiDM's shapes; the projections of its attention are convolutions."""
-    from lidar_synth.generate.importers.lidm import _parts
+    from lidar_synth.lab.importers.lidm import _parts
 
     torch.manual_seed(0)
     parts = _parts(model, DATASET, {}, folder)[0]

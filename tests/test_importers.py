@@ -18,9 +18,9 @@ from typer.testing import CliRunner
 
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint
-from lidar_synth.generate.importers.r2flow import HARMONICS, block_names, convert, peer_names, read_r2flow
-from lidar_synth.models import build_network
-from lidar_synth.models.hdit.hdit import HDiT
+from lidar_synth.generate.models import build_network
+from lidar_synth.generate.models.hdit.hdit import HDiT
+from lidar_synth.lab.importers.r2flow import HARMONICS, block_names, convert, peer_names, read_r2flow
 
 DEPTHS = (1, 1, 1, 1)
 CFG: dict[str, Any] = {
@@ -174,7 +174,7 @@ def test_an_imported_checkpoint_gives_the_results_of_r2flow(golden: Golden, tmp_
 def run_import(path: Path, out: Path, *options: str) -> Any:
     import typer
 
-    from lidar_synth.cli.import_ import import_
+    from lidar_synth.lab.cli.import_ import import_
 
     app = typer.Typer()
     app.command()(import_)

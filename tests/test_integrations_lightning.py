@@ -16,7 +16,8 @@ from mixtures import Endless, Scans
 from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.mixing import Generated, MixedScans
+from lidar_synth.generate.generator import Generated
+from lidar_synth.mixing import MixedScans
 from lidar_synth.mixing.state import make_state
 
 REAL = 9

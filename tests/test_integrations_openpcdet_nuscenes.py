@@ -40,7 +40,7 @@ from pcdet.utils.common_utils import create_logger
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.scan import Boxes
-from lidar_synth.town import Town
+from lidar_synth.lab.town import Town
 
 VERSION, NAME, SWEEPS = "v1.0-mini", "MixedNuScenes", 10
 CENTERPOINT = ROOT / "tools" / "cfgs" / "nuscenes_models" / "cbgs_voxel01_res3d_centerpoint.yaml"

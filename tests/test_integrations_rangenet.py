@@ -30,8 +30,8 @@ from lidar_synth.integrations.rangenet import filled, gaps, make_parser
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.formats import open_scans
-from lidar_synth.generate.generator import load_generator
-from lidar_synth.mixing import Generated
+from lidar_synth.generate.generator import Generated
+from lidar_synth.generate.loading import load_generator
 
 REAL, EXTRA, BATCH = 6, 4, 2
 stock = import_module("dataset.kitti.parser" if CENET else "tasks.semantic.dataset.kitti.parser")

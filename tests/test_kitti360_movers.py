@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lidar_synth.formats.kitti360_accumulated import read_cloud, write_cloud
 from lidar_synth.formats.kitti360_boxes import WorldBoxes
-from lidar_synth.formats.kitti360_movers import Movers
 from lidar_synth.formats.kitti360_poses import fill_poses, undo_ego_motion
+from lidar_synth.lab.kitti360.accumulated import read_cloud, write_cloud
+from lidar_synth.lab.kitti360.movers import Movers
 
 
 def test_undoing_the_motion_of_the_sensor_is_exact_at_the_pose_and_half_a_turn_away() -> None:

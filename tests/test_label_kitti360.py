@@ -16,9 +16,7 @@ from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.formats import kitti360_labels
 from lidar_synth.formats.kitti360 import boxes_path, confidence_path, label_file, labels_folder, scans_folder
-from lidar_synth.formats.kitti360_accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
 from lidar_synth.formats.kitti360_boxes import read_boxes
-from lidar_synth.formats.kitti360_labels import label_scans, plan_labels
 from lidar_synth.formats.kitti360_poses import (
     ego_motion,
     imu_from_sensor,
@@ -26,10 +24,12 @@ from lidar_synth.formats.kitti360_poses import (
     read_poses,
     undo_ego_motion,
 )
-from lidar_synth.formats.label_report import LabelReport
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.town import Town, export_town
-from lidar_synth.town.accumulate import MOST, STEP, windows_of
+from lidar_synth.lab.kitti360.accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
+from lidar_synth.lab.kitti360.labels import label_scans, plan_labels
+from lidar_synth.lab.kitti360.report import LabelReport
+from lidar_synth.lab.town import Town, export_town
+from lidar_synth.lab.town.accumulate import MOST, STEP, windows_of
 
 DRIVE = "2013_05_28_drive_0004_sync"
 SCANS = 20

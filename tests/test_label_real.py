@@ -14,9 +14,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from lidar_synth.formats.kitti360_accumulated import REACH, write_cloud
-from lidar_synth.formats.kitti360_labels import label_scans
 from lidar_synth.formats.kitti360_poses import CAMERA, write_calibration, write_poses
+from lidar_synth.lab.kitti360.accumulated import REACH, write_cloud
+from lidar_synth.lab.kitti360.labels import label_scans
 
 DRIVE = "2013_05_28_drive_0004_sync"
 FRAMES = range(24, 56, 2)

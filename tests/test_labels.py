@@ -16,9 +16,9 @@ from lidar_synth.formats import KITTI360, KITTIObject, SemanticKITTI
 from lidar_synth.geometry.projection import locate, project, unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, Scan, Source
 from lidar_synth.geometry.sensor import presets
+from lidar_synth.lab.town import Town
 from lidar_synth.labels import KINDS, POLICIES, ObjectBank, make_policy, swap_bands, swap_sector, thinned
 from lidar_synth.noise import keyed_rng
-from lidar_synth.town import Town
 
 FIELDS = frozenset({"reflectance", "label", "confidence"})
 

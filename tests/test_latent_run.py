@@ -23,9 +23,9 @@ from lidar_synth.generate.checkpoint import (
     read_header,
     save_checkpoint,
 )
-from lidar_synth.generate.generator import load_generator
-from lidar_synth.train.config import DistillConfig, load_config
-from lidar_synth.train.teaching import target_flow
+from lidar_synth.generate.loading import load_generator
+from lidar_synth.lab.train.config import DistillConfig, load_config
+from lidar_synth.lab.train.teaching import target_flow
 
 STILL = ("stem", "encode", "merge", "to_latent", "shift", "scale")
 """Parts of names in an autoencoder that belong to its encoder, or to both sides."""

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from lidar_synth import Layout, Town, layout_of, load_layout, load_sensor
 from lidar_synth.datasets.classes import BOXED, LABELS
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate.layouts import layout_agreement, rays_of_boxes
 from lidar_synth.geometry.layout import CODES, Outline, known_boxes, layout_image
 from lidar_synth.geometry.layout.layout import overlaps
 from lidar_synth.geometry.layout.raster import depth_of
 from lidar_synth.geometry.scan import Boxes
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.evaluate.layouts import layout_agreement, rays_of_boxes
 from lidar_synth.labels.boxes import turned, widened
 
 SMALL = Sensor("small", 64, 1.45, 80.0, rows=16, fov_up=3.0, fov_down=-25.0)

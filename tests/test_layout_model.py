@@ -27,11 +27,11 @@ from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.boxed import with_boxes
 from lidar_synth.generate.conditions import CONDITIONS, batch_of
+from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry.layout import CODES, Outline, layout_image
 from lidar_synth.geometry.layout.raster import depth_of
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import Boxes, RangeImage
-from lidar_synth.mixing import Generated
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

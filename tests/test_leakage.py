@@ -13,12 +13,12 @@ from typer.testing import CliRunner
 from lidar_synth.cli import app
 from lidar_synth.datasets.recordings import MODELS, NOTE, whole
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate.leakage import content_of, contents, measured, overlap, recordings_of, seen_by_model_of
 from lidar_synth.formats import WRITERS, layout_of, open_scans
 from lidar_synth.formats.convert import convert
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import presets
-from lidar_synth.town.export import SETTINGS
+from lidar_synth.lab.evaluate.leakage import content_of, contents, measured, overlap, recordings_of, seen_by_model_of
+from lidar_synth.lab.town.export import SETTINGS
 
 MADE = {"made_by": "model", "model": "small", "checkpoint": "c" * 64, "seed": 1}
 
@@ -39,7 +39,7 @@ def test_a_scan_is_known_by_its_hash_in_every_layout(tmp_path: Path, to: str) ->
 
 def test_scans_are_not_read_for_a_model_without_hashes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_all("semantic_kitti", tmp_path, some(2))
-    monkeypatch.setattr("lidar_synth.evaluate.leakage.content_of", lambda scan: pytest.fail("a scan was hashed"))
+    monkeypatch.setattr("lidar_synth.lab.evaluate.leakage.content_of", lambda scan: pytest.fail("a scan was hashed"))
     measured(open_scans(tmp_path), "semantic_kitti", tmp_path, None, whole("KITTI-360", ["a drive"]))
 
 

@@ -9,7 +9,7 @@ from test_fit_sensor import run
 
 from lidar_synth import MixedScans, load_sensor, open_scans
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.town import Town
+from lidar_synth.lab.town import Town
 
 SCANS = 1
 

@@ -9,16 +9,16 @@ from scipy.spatial.distance import jensenshannon
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate.conditions import AGREEMENTS, obstacles, sight_agreement
-from lidar_synth.evaluate.detection import detect
-from lidar_synth.evaluate.labels import class_histogram, class_shares
-from lidar_synth.evaluate.measures import KINDS
-from lidar_synth.evaluate.ranges import range_histogram, step_histogram
-from lidar_synth.evaluate.segmentation import load_judge
-from lidar_synth.evaluate.sequences import chamfer_error, register, registration_error
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, presets
+from lidar_synth.lab.evaluate.conditions import AGREEMENTS, obstacles, sight_agreement
+from lidar_synth.lab.evaluate.detection import detect
+from lidar_synth.lab.evaluate.labels import class_histogram, class_shares
+from lidar_synth.lab.evaluate.measures import KINDS
+from lidar_synth.lab.evaluate.ranges import range_histogram, step_histogram
+from lidar_synth.lab.evaluate.segmentation import load_judge
+from lidar_synth.lab.evaluate.sequences import chamfer_error, register, registration_error
 
 SENSOR = presets()["hdl64e_kitti360"]
 SMALL = Sensor("small", 8, 1.0, 90.0, rows=3, fov_up=5.0, fov_down=-20.0)

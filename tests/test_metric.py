@@ -13,14 +13,14 @@ from conftest import random_scan
 from project import ROOT
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate import PROTOCOLS, Metric, Score, evaluate, lidm
-from lidar_synth.evaluate.cache import Cached, extract_all, scan_hash, weights_hash
-from lidar_synth.evaluate.extractors import EXTRACTORS
-from lidar_synth.evaluate.leaderboard import beside, leaderboard
-from lidar_synth.evaluate.measures import KINDS
-from lidar_synth.evaluate.protocols import FEATURES, alike, parse_protocol
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import presets
+from lidar_synth.lab.evaluate import PROTOCOLS, Metric, Score, evaluate, lidm
+from lidar_synth.lab.evaluate.cache import Cached, extract_all, scan_hash, weights_hash
+from lidar_synth.lab.evaluate.extractors import EXTRACTORS
+from lidar_synth.lab.evaluate.leaderboard import beside, leaderboard
+from lidar_synth.lab.evaluate.measures import KINDS
+from lidar_synth.lab.evaluate.protocols import FEATURES, alike, parse_protocol
 
 SENSOR = presets()["town"]
 REAL = [random_scan(SENSOR, 1500, seed) for seed in range(6)]

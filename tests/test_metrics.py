@@ -14,7 +14,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist, jensenshannon
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate import (
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor, presets
+from lidar_synth.lab.evaluate import (
     PROTOCOLS,
     Score,
     evaluate,
@@ -25,10 +27,8 @@ from lidar_synth.evaluate import (
     squared_mmd,
     statistics,
 )
-from lidar_synth.evaluate.measures import KINDS
-from lidar_synth.evaluate.protocols import FEATURES
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor, presets
+from lidar_synth.lab.evaluate.measures import KINDS
+from lidar_synth.lab.evaluate.protocols import FEATURES
 
 SENSOR = presets()["hdl64e_kitti360"]
 PAIRS = [("real", "fake", ""), ("real", "real", "_self"), ("dense_real", "dense_fake", "_dense")]

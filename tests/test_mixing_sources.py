@@ -17,13 +17,13 @@ from torch.utils.data import DataLoader
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import KITTI360, SemanticKITTI
-from lidar_synth.generate.generator import Generator, load_generator
-from lidar_synth.geometry.scan import SYNTHETIC
+from lidar_synth.generate.generator import Generated, Generator
+from lidar_synth.generate.loading import load_generator
+from lidar_synth.geometry.scan import SYNTHETIC, identity_of
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.geometry.transfer import Mount, SeenAs, Transfer
-from lidar_synth.mixing import Generated, MixedScans, Sources, make_synthetic
-from lidar_synth.mixing.sources import identity_of
-from lidar_synth.town import Town
+from lidar_synth.lab.town import Town
+from lidar_synth.mixing import MixedScans, Sources, make_synthetic
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 

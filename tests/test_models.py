@@ -18,12 +18,19 @@ from latent_runs import call, one_thread, scans, write_config  # noqa: F401 - fi
 from lidar_synth import load_generator
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.generate.checkpoint import load_checkpoint, read_header
-from lidar_synth.generate.generator import shipped_models
-from lidar_synth.train import DistillConfig, TrainConfig, models, plan_model, train_model
-from lidar_synth.train.config import find_model_file, find_recipe, load_config, load_model, published, published_models
-from lidar_synth.train.model_plan import LEAST
-from lidar_synth.train.schedules import PLATEAU
-from lidar_synth.train.staged import DONE, StagedRuns
+from lidar_synth.generate.loading import shipped_models
+from lidar_synth.lab.train import DistillConfig, TrainConfig, models, plan_model, train_model
+from lidar_synth.lab.train.config import (
+    find_model_file,
+    find_recipe,
+    load_config,
+    load_model,
+    published,
+    published_models,
+)
+from lidar_synth.lab.train.model_plan import LEAST
+from lidar_synth.lab.train.schedules import PLATEAU
+from lidar_synth.lab.train.staged import DONE, StagedRuns
 
 MODELS = {one.name: one for one in published_models()}
 RECIPES = {one.name: one for one in published()}

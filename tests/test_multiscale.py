@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidar_synth.models.town_codec.autoencoder import Autoencoder
-from lidar_synth.models.town_codec.multiscale import LATTICES, at_lattice
+from lidar_synth.generate.models.town_codec.autoencoder import Autoencoder
+from lidar_synth.generate.models.town_codec.multiscale import LATTICES, at_lattice
 
 SHAPE = 8, 32
 pytestmark = pytest.mark.usefixtures("one_thread")

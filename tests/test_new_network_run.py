@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint
-from lidar_synth.generate.generator import load_generator
-from lidar_synth.models import NETWORKS, encoders_of, network_class
-from lidar_synth.models.lidm.vqvae import Encoding
-from lidar_synth.models.network import Encoder, Network
+from lidar_synth.generate.loading import load_generator
+from lidar_synth.generate.models import NETWORKS, encoders_of, network_class
+from lidar_synth.generate.models.lidm.vqvae import Encoding
+from lidar_synth.generate.models.network import Encoder, Network
 
 
 class PointwiseFlow(Network):

@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.generate.models import network_class
 from lidar_synth.geometry.normalize import (
     CHANNELS,
     NORMALISATIONS,
@@ -25,7 +26,6 @@ from lidar_synth.geometry.normalize import (
 )
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import presets
-from lidar_synth.models import network_class
 
 
 @pytest.mark.parametrize("name", sorted(NORMALISATIONS))

@@ -16,10 +16,10 @@ from lidar_synth.errors import DataError, FileError
 from lidar_synth.formats import KITTIObject, SemanticKITTI
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import presets
+from lidar_synth.lab.town import Town
 from lidar_synth.labels import ObjectBank, instances_of, objects_of, paste
 from lidar_synth.labels.boxes import box_frame, grown, joined, overlapping, turned
 from lidar_synth.labels.ground import ground_under
-from lidar_synth.town import Town
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ import torch
 from torch import nn
 
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.models import build_network
-from lidar_synth.train import OPTIMIZERS
+from lidar_synth.generate.models import build_network
+from lidar_synth.lab.train import OPTIMIZERS
 
 
 def transformer() -> nn.Module:
@@ -35,7 +35,7 @@ def test_muon_computes_in_float32_where_bfloat16_is_slower(
     half: bool, error: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beside the polynomial of its five iterations (Jordan et al. 2024), applied to the singular values in float64."""
-    monkeypatch.setattr("lidar_synth.train.optimizers.faster_in_bfloat16", lambda: half)
+    monkeypatch.setattr("lidar_synth.lab.train.optimizers.faster_in_bfloat16", lambda: half)
     muon = OPTIMIZERS["muon"](transformer(), 0.1, (0.9, 0.99), 0.0)[0]
     weight = muon.param_groups[0]["params"][0]
     before = weight.detach().clone()

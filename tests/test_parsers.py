@@ -25,22 +25,21 @@ OUTSIDE = {
     "bank/chunks.py": {"h5py.File"},  # in memory
     "bank/writer.py": {"h5py.File"},  # writes
     "bank/index.py": {"json.loads"},
-    "bake/curate/store.py": {"np.load"},
-    "evaluate/extractors/archive.py": {"tarfile.open"},
+    "lab/curate/store.py": {"np.load"},
+    "lab/evaluate/extractors/archive.py": {"tarfile.open"},
     "formats/cloud.py": {"np.loadtxt"},
     "formats/kitti360_boxes.py": {"ElementTree.parse", "ElementTree.iterparse"},
     "formats/kitti_raw.py": {"ElementTree.fromstring"},
     "formats/webdataset.py": {"tarfile.open"},
     "generate/checkpoint.py": {"json.loads"},
-    "town/skin/skin.py": {"json.loads"},
+    "lab/town/skin/skin.py": {"json.loads"},
     # The package's own text.
     "bake/folder.py": {"json.loads"},
-    "evaluate/leaderboard.py": {"yaml.safe_load"},
-    "evaluate/protocols/__init__.py": {"yaml.safe_load"},
-    "evaluate/segmentation.py": {"json.loads"},
-    "formats/writer.py": {"json.loads"},
-    "train/cache.py": {"json.loads"},
-    "train/selection.py": {"json.loads"},
+    "lab/evaluate/leaderboard.py": {"yaml.safe_load"},
+    "lab/evaluate/protocols/__init__.py": {"yaml.safe_load"},
+    "lab/evaluate/segmentation.py": {"json.loads"},
+    "lab/train/cache.py": {"json.loads"},
+    "lab/train/selection.py": {"json.loads"},
 }
 """{module: its calls}; a new format is parsed in ``lidar_synth/files``."""
 

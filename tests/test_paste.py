@@ -10,14 +10,14 @@ from pasting import assert_nothing_shares_a_ray
 from worlds import CAR, HEIGHT, SENSOR, WALL, car, cast, wall
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.fitting import assign_beams
+from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.projection import locate, project
 from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import presets
+from lidar_synth.lab.town import Town
 from lidar_synth.labels import Object, objects_of, paste
 from lidar_synth.labels.merge import merged
 from lidar_synth.labels.pasting import LIFT
-from lidar_synth.town import Town
 
 places = st.tuples(st.floats(5, 30), st.floats(-180, 180), st.floats(-3.1, 3.1))
 

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from lidar_synth.models.town_codec.plane_fit import PlaneFit
+from lidar_synth.generate.models.town_codec.plane_fit import PlaneFit
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from lidar_synth.generate.models.town_codec.planes import SLOPES, Planes, RangeMixture, laplace_noise
 from lidar_synth.geometry.normalize import NORMALISATIONS
-from lidar_synth.models.town_codec.planes import SLOPES, Planes, RangeMixture, laplace_noise
 
 PATCH = (2, 4)
 

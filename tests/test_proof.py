@@ -19,12 +19,12 @@ from lidar_synth.cli import app
 from lidar_synth.datasets.classes import PANDASET
 from lidar_synth.datasets.recordings import frames_of
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate.leakage import content_of, contents
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, save_checkpoint
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.proof import ARMS, Job, Proof, pools
-from lidar_synth.proof.pools import PoolTask, make_pool, refuse_leaks
+from lidar_synth.lab.evaluate.leakage import content_of, contents
+from lidar_synth.lab.proof import ARMS, Job, Proof, pools
+from lidar_synth.lab.proof.pools import PoolTask, make_pool, refuse_leaks
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 

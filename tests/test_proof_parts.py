@@ -18,19 +18,17 @@ from scipy import stats
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError, ProcessError
-from lidar_synth.evaluate.segmentation import class_ious
 from lidar_synth.geometry.projection import project
-from lidar_synth.labels import ObjectBank
-from lidar_synth.labels.exchange import thinned
-from lidar_synth.models.segmenter import CircularConv, _Wrapped
-from lidar_synth.proof import ARMS, CommandTrainer, ProofSettings
-from lidar_synth.proof.arms import rows
-from lidar_synth.proof.budget import expected_minutes, within
-from lidar_synth.proof.command import describe
-from lidar_synth.proof.drawing import ticks
-from lidar_synth.proof.places import APART, SPLITS, choose, clusters, find_places
-from lidar_synth.proof.planning import make_plan
-from lidar_synth.proof.scores import (
+from lidar_synth.lab.evaluate.segmentation import class_ious
+from lidar_synth.lab.evaluate.segmenter import CircularConv, _Wrapped
+from lidar_synth.lab.proof import ARMS, CommandTrainer, ProofSettings
+from lidar_synth.lab.proof.arms import rows
+from lidar_synth.lab.proof.budget import expected_minutes, within
+from lidar_synth.lab.proof.command import describe
+from lidar_synth.lab.proof.drawing import ticks
+from lidar_synth.lab.proof.places import APART, SPLITS, choose, clusters, find_places
+from lidar_synth.lab.proof.planning import make_plan
+from lidar_synth.lab.proof.scores import (
     FEWEST_PLACES,
     GROUPS,
     group_ious,
@@ -39,7 +37,9 @@ from lidar_synth.proof.scores import (
     require_labels,
     t_quantile,
 )
-from lidar_synth.proof.trial import pretrain, pretraining_seconds, reference, turned
+from lidar_synth.lab.proof.trial import pretrain, pretraining_seconds, reference, turned
+from lidar_synth.labels import ObjectBank
+from lidar_synth.labels.exchange import thinned
 
 
 def test_wrapped_padding_is_circular_padding() -> None:

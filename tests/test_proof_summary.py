@@ -8,13 +8,13 @@ import pytest
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.proof.arms import rows
-from lidar_synth.proof.page import body
-from lidar_synth.proof.plan import ProofPlan
-from lidar_synth.proof.scores import groups_of
-from lidar_synth.proof.settings import ProofSettings
-from lidar_synth.proof.summary import summarise
-from lidar_synth.proof.trial import Outcome
+from lidar_synth.lab.proof.arms import rows
+from lidar_synth.lab.proof.page import body
+from lidar_synth.lab.proof.plan import ProofPlan
+from lidar_synth.lab.proof.scores import groups_of
+from lidar_synth.lab.proof.settings import ProofSettings
+from lidar_synth.lab.proof.summary import summarise
+from lidar_synth.lab.proof.trial import Outcome
 
 PERSON, ROAD = TRAIN_ID["person"], TRAIN_ID["road"]
 FOUND = {"real": 300, "exchange": 320, "town": 200, "pretrain": 600}

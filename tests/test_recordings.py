@@ -18,7 +18,7 @@ from lidar_synth.datasets.recordings import (
 )
 from lidar_synth.errors import DataError
 from lidar_synth.formats import semantic_kitti
-from lidar_synth.generate.importers import lidm
+from lidar_synth.lab.importers import lidm
 
 Held = dict[str, set[int] | None]
 DRIVES = st.dictionaries(

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidar_synth.models.town_codec.reflectance import BLANK, ZeroInflatedLogistic
+from lidar_synth.generate.models.town_codec.reflectance import BLANK, ZeroInflatedLogistic
 
 CASES = [(0.1, 0.15, 0.2), (-0.9, 0.2, 0.001), (0.8, 0.05, 0.9)]
 """Medians, scales, shares of a 0."""

@@ -22,15 +22,15 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from typer.testing import CliRunner
 
-import lidar_synth.train.plan as plan_module
-import lidar_synth.train.runs as module
+import lidar_synth.lab.train.plan as plan_module
+import lidar_synth.lab.train.runs as module
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.flow.path import Example
-from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.formats import WRITERS
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, read_header, save_checkpoint
-from lidar_synth.generate.generator import load_generator
+from lidar_synth.generate.flow.path import Example
+from lidar_synth.generate.flow.solvers import uniform_grid
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.sensor import Sensor
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from lidar_synth.datasets.recordings import NOTE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS, open_scans
-from lidar_synth.generate.generator import load_generator
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.scan import SYNTHETIC
 
 

@@ -19,10 +19,10 @@ from lidar_synth.files.lock import one_writer
 from lidar_synth.files.parsing import read_sealed, seal
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.proof.study import _is_there, read_outcome, to_values
-from lidar_synth.proof.trial import Outcome
-from lidar_synth.train import TrainConfig, cache_latents, cache_scans, load_config, run
-from lidar_synth.train.state import STATE, Recipe, Training, read_progress
+from lidar_synth.lab.proof.study import _is_there, read_outcome, to_values
+from lidar_synth.lab.proof.trial import Outcome
+from lidar_synth.lab.train import TrainConfig, cache_latents, cache_scans, load_config, run
+from lidar_synth.lab.train.state import STATE, Recipe, Training, read_progress
 
 SENSOR = Sensor("tiny", 32, 1.0, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 SCANS = [random_scan(SENSOR, 100, seed) for seed in range(130)]

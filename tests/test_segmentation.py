@@ -11,11 +11,11 @@ from conftest import random_scan
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.evaluate.segmentation import Images, Judge, class_ious, confusion, load_judge, mean_iou
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import presets
-from lidar_synth.models.segmenter import RangeSegmenter, segmenter_input
-from lidar_synth.train.segmentation import train_segmenter
+from lidar_synth.lab.evaluate.segmentation import Images, Judge, class_ious, confusion, load_judge, mean_iou
+from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
+from lidar_synth.lab.train.segmentation import train_segmenter
 
 HEIGHT = torch.linspace(0.05, -0.4, 16)[:, None].expand(16, 32)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lidar_synth.models.segmenter import ROW_BANDS, RangeSegmenter, segmenter_input
+from lidar_synth.lab.evaluate.segmenter import ROW_BANDS, RangeSegmenter, segmenter_input
 
 
 def test_shapes_and_that_columns_wrap() -> None:

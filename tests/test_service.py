@@ -17,7 +17,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import ConfigError, DataError, FileError, ProcessError
-from lidar_synth.generate.generator import Generator, load_generator
+from lidar_synth.generate.generator import Generator
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.mixing import MixedScans, Sources

@@ -11,8 +11,9 @@ from mixtures import Endless, Scans, as_is
 from lidar_synth.bank import Bank
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import open_scans
-from lidar_synth.generate.generator import load_generator
-from lidar_synth.mixing import Generated, MixedScans
+from lidar_synth.generate.generator import Generated
+from lidar_synth.generate.loading import load_generator
+from lidar_synth.mixing import MixedScans
 
 WRONG: dict[str, tuple[str, str]] = {
     "text for a seed": ("seed: '0'", r"seed='0'; expected an integer\. Write it without quotes"),

@@ -8,7 +8,7 @@ from test_run import call, distilling, one_thread, scans, teacher, write_config
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import load_checkpoint, read_header
-from lidar_synth.generate.generator import load_generator
+from lidar_synth.generate.loading import load_generator
 
 __all__ = ["one_thread", "scans", "teacher"]  # fixtures
 

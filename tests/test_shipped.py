@@ -20,14 +20,14 @@ from lidar_synth.bank.encoding import Encoding
 from lidar_synth.cli.bake import bake
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError
-from lidar_synth.evaluate.conditions import sight_agreement
 from lidar_synth.generate.checkpoint import read_header
-from lidar_synth.generate.generator import Generator, shipped_models
+from lidar_synth.generate.generator import Generated, Generator
+from lidar_synth.generate.loading import shipped_models
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
+from lidar_synth.lab.evaluate.conditions import sight_agreement
+from lidar_synth.lab.town import STRETCH_FRAMES
 from lidar_synth.labels import POLICIES
-from lidar_synth.mixing import Generated
-from lidar_synth.town import STRETCH_FRAMES
 
 SCANS = 3
 FIELDS = ("reflectance", "label", "confidence")

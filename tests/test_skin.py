@@ -14,11 +14,11 @@ from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin, returns
-from lidar_synth.town.returns import Noise
-from lidar_synth.town.skin.features import features
-from lidar_synth.town.skin.skin import BOXED, LONGEST, SOFT, shapes
-from lidar_synth.town.skin.tables import grouped_quantiles, lookup
+from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin, returns
+from lidar_synth.lab.town.returns import Noise
+from lidar_synth.lab.town.skin.features import features
+from lidar_synth.lab.town.skin.skin import BOXED, LONGEST, SOFT, shapes
+from lidar_synth.lab.town.skin.tables import grouped_quantiles, lookup
 
 SENSOR = Sensor("small", columns=900, range_min=1.0, range_max=80.0, rows=32, fov_up=3.0, fov_down=-25.0)
 STREETS = 5

@@ -12,8 +12,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.flow.path import per_sample
-from lidar_synth.flow.solvers import SOLVERS, solve, towards, trajectory, uniform_grid
+from lidar_synth.generate.flow.path import per_sample
+from lidar_synth.generate.flow.solvers import SOLVERS, solve, towards, trajectory, uniform_grid
 from lidar_synth.noise import gaussian
 
 NOISE = gaussian(0, range(4), (2, 5), dtype=torch.float64)

@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lidar_synth.errors import DataError
-from lidar_synth.evaluate.extractors.pooling import mean_over_bands, mean_over_rings
-from lidar_synth.evaluate.extractors.sparse import convolve, interpolate, keys, mean_in, neighbours, pyramid
-from lidar_synth.evaluate.extractors.voxel_networks import voxelise
+from lidar_synth.lab.evaluate.extractors.pooling import mean_over_bands, mean_over_rings
+from lidar_synth.lab.evaluate.extractors.sparse import convolve, interpolate, keys, mean_in, neighbours, pyramid
+from lidar_synth.lab.evaluate.extractors.voxel_networks import voxelise
 
 SIDE = 12
 

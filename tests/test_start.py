@@ -8,11 +8,11 @@ from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.evaluate.leakage import overlap, seen_by, town
 from lidar_synth.generate.checkpoint import load_checkpoint
-from lidar_synth.generate.generator import find_model
-from lidar_synth.train import TrainConfig, load_config, precision, run
-from lidar_synth.train.start import start_networks
+from lidar_synth.generate.loading import find_model
+from lidar_synth.lab.evaluate.leakage import overlap, seen_by, town
+from lidar_synth.lab.train import TrainConfig, load_config, precision, run
+from lidar_synth.lab.train.start import start_networks
 
 
 def test_a_shipped_model_is_a_start_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

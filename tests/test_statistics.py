@@ -9,11 +9,11 @@ from scipy.linalg import sqrtm
 from scipy.spatial.distance import cdist, jensenshannon
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.evaluate import frechet_distance
-from lidar_synth.evaluate.intervals import bootstrap, extrapolated_frechet
-from lidar_synth.evaluate.measures import normalised_rows, total_variation
-from lidar_synth.evaluate.neighbours import manifold, nearest_training
-from lidar_synth.evaluate.statistics import (
+from lidar_synth.lab.evaluate import frechet_distance
+from lidar_synth.lab.evaluate.intervals import bootstrap, extrapolated_frechet
+from lidar_synth.lab.evaluate.measures import normalised_rows, total_variation
+from lidar_synth.lab.evaluate.neighbours import manifold, nearest_training
+from lidar_synth.lab.evaluate.statistics import (
     Statistic,
     frechet,
     gaussian_mmd,

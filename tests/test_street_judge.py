@@ -17,12 +17,12 @@ from lidar_synth import open_scans
 from lidar_synth.cli import app
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
-from lidar_synth.evaluate.extractors.bonnetal import PARTS
-from lidar_synth.evaluate.extractors.squeezeseg import SqueezeSeg
-from lidar_synth.evaluate.recognition import Recognition, as_text, compare, recognise
-from lidar_synth.evaluate.street_judge import StreetJudge, load_archive
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import presets
+from lidar_synth.lab.evaluate.extractors.bonnetal import PARTS
+from lidar_synth.lab.evaluate.extractors.squeezeseg import SqueezeSeg
+from lidar_synth.lab.evaluate.recognition import Recognition, as_text, compare, recognise
+from lidar_synth.lab.evaluate.street_judge import StreetJudge, load_archive
 
 RAW = [0, 10, 11, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81]
 ARCHITECTURE = {

@@ -11,20 +11,15 @@ from torch import Tensor
 
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow.path import METRICS
 from lidar_synth.generate.checkpoint import CODEC, VELOCITY
 from lidar_synth.generate.codec import Latent
-from lidar_synth.generate.generator import _compile
-from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES, DEPTH_STEP
-from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import RangeImage
-from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models.surface_codec.autoencoder import SurfaceAutoencoder
-from lidar_synth.models.surface_codec.blocks import PATCH, from_patches, split, to_patches
-from lidar_synth.models.surface_codec.measure_noise import PLANTS, measure_noise
-from lidar_synth.models.surface_codec.relief import SPANS, correlation, relief_fields
-from lidar_synth.models.surface_codec.surfaces import (
+from lidar_synth.generate.flow.path import METRICS
+from lidar_synth.generate.loading import _compile
+from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
+from lidar_synth.generate.models.surface_codec.blocks import PATCH, from_patches, split, to_patches
+from lidar_synth.generate.models.surface_codec.measure_noise import PLANTS, measure_noise
+from lidar_synth.generate.models.surface_codec.relief import SPANS, correlation, relief_fields
+from lidar_synth.generate.models.surface_codec.surfaces import (
     DRAWS,
     NUMBERS,
     PER_CELL,
@@ -32,10 +27,15 @@ from lidar_synth.models.surface_codec.surfaces import (
     Surfaces,
     surfaces_of,
 )
-from lidar_synth.models.town_codec.reflectance import ZeroInflatedLogistic
+from lidar_synth.generate.models.town_codec.reflectance import ZeroInflatedLogistic
+from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES, DEPTH_STEP
+from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.town import Town
+from lidar_synth.lab.train.autoencoder import Autoencoding, Losses
 from lidar_synth.noise import uniform
-from lidar_synth.town import Town
-from lidar_synth.train.autoencoder import Autoencoding, Losses
 
 K, LABELS, CELLS = 3, 20, PATCH[0] * PATCH[1]
 SCALE = NORMALISATIONS["r2flow"]

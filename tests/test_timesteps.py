@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow.path import METRICS, per_sample
-from lidar_synth.flow.solvers import uniform_grid
-from lidar_synth.flow.timesteps import best_path, cost_matrix, path_cost, select_timesteps
+from lidar_synth.generate.flow.path import METRICS, per_sample
+from lidar_synth.generate.flow.solvers import uniform_grid
+from lidar_synth.generate.flow.timesteps import best_path, cost_matrix, path_cost, select_timesteps
 from lidar_synth.noise import gaussian
 
 SHAPE = (2, 3, 8)

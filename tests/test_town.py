@@ -14,19 +14,19 @@ from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.geometry.projection import project, ring_numbers
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
-from lidar_synth.town import STRETCH_FRAMES, Town
-from lidar_synth.town.boxes import boxes_of
-from lidar_synth.town.camera import CAMERA, pixel_rays
-from lidar_synth.town.cast import Snapshot, trace
-from lidar_synth.town.ego import free_rays
-from lidar_synth.town.materials import MATERIALS
-from lidar_synth.town.movers import ego_place
-from lidar_synth.town.prototype import Prototype
-from lidar_synth.town.returns import LEVELS
-from lidar_synth.town.scene import PlacedObject
-from lidar_synth.town.shading import camera_hits
-from lidar_synth.town.solid import Solid
-from lidar_synth.town.vehicles import vehicles
+from lidar_synth.lab.town import STRETCH_FRAMES, Town
+from lidar_synth.lab.town.boxes import boxes_of
+from lidar_synth.lab.town.camera import CAMERA, pixel_rays
+from lidar_synth.lab.town.cast import Snapshot, trace
+from lidar_synth.lab.town.ego import free_rays
+from lidar_synth.lab.town.materials import MATERIALS
+from lidar_synth.lab.town.movers import ego_place
+from lidar_synth.lab.town.prototype import Prototype
+from lidar_synth.lab.town.returns import LEVELS
+from lidar_synth.lab.town.scene import PlacedObject
+from lidar_synth.lab.town.shading import camera_hits
+from lidar_synth.lab.town.solid import Solid
+from lidar_synth.lab.town.vehicles import vehicles
 
 INDICES = (4, 5, 26, 144, 164)
 """Scans of four stretches; the first two are neighbours."""

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidar_synth.cli.town import town as command
 from lidar_synth.cli.view import view
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.formats import KITTI360, KITTIObject, SemanticKITTI, open_scans
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.lab.cli.town import town as command
+from lidar_synth.lab.town import LAYOUTS, Town, export_town, load_skin
+from lidar_synth.lab.town.export import _groups
+from lidar_synth.lab.town.returns import Noise
 from lidar_synth.mixing import MixedScans
-from lidar_synth.town import LAYOUTS, Town, export_town, load_skin
-from lidar_synth.town.export import _groups
-from lidar_synth.town.returns import Noise
 
 COUNT = 3
 

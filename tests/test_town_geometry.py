@@ -7,19 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidar_synth.town.bodywork import GLASS
-from lidar_synth.town.course import Course, Relief
-from lidar_synth.town.ground import KINDS, NAMES, Ground
-from lidar_synth.town.materials import MATERIALS, Finish, Surfaces
-from lidar_synth.town.meshes import Mesh, ball, boxes, loft, merge, prism, tube
-from lidar_synth.town.people import PHASES, cyclist, motorcyclist, sitter, walker
-from lidar_synth.town.plants import CORE, LEAF, SPECIES, VARIANTS, coarse_plant, plant
-from lidar_synth.town.returns import Noise, cell_noise, laser_gains
-from lidar_synth.town.solid import Solid
-from lidar_synth.town.street import KINDS as STREETS
-from lidar_synth.town.street import LEFT, RIGHT, SHARES, sample_street
-from lidar_synth.town.vehicles import vehicles
-from lidar_synth.town.world import STRETCH_FRAMES, WORLD, build_world, rng_for
+from lidar_synth.lab.town.bodywork import GLASS
+from lidar_synth.lab.town.course import Course, Relief
+from lidar_synth.lab.town.ground import KINDS, NAMES, Ground
+from lidar_synth.lab.town.materials import MATERIALS, Finish, Surfaces
+from lidar_synth.lab.town.meshes import Mesh, ball, boxes, loft, merge, prism, tube
+from lidar_synth.lab.town.people import PHASES, cyclist, motorcyclist, sitter, walker
+from lidar_synth.lab.town.plants import CORE, LEAF, SPECIES, VARIANTS, coarse_plant, plant
+from lidar_synth.lab.town.returns import Noise, cell_noise, laser_gains
+from lidar_synth.lab.town.solid import Solid
+from lidar_synth.lab.town.street import KINDS as STREETS
+from lidar_synth.lab.town.street import LEFT, RIGHT, SHARES, sample_street
+from lidar_synth.lab.town.vehicles import vehicles
+from lidar_synth.lab.town.world import STRETCH_FRAMES, WORLD, build_world, rng_for
 
 UP = np.array((0.0, 0.0, 1.0))
 

@@ -16,15 +16,15 @@ from hypothesis import given
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.flow.distill import STRATEGIES
-from lidar_synth.flow.path import METRICS, Example
-from lidar_synth.flow.solvers import uniform_grid
+from lidar_synth.generate.flow.distill import STRATEGIES
+from lidar_synth.generate.flow.path import METRICS, Example
+from lidar_synth.generate.flow.solvers import uniform_grid
+from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import build_network
-from lidar_synth.train import (
+from lidar_synth.lab.train import (
     OPTIMIZERS,
     SCHEDULES,
     Batch,
@@ -38,7 +38,7 @@ from lidar_synth.train import (
     student_task,
     teacher_task,
 )
-from lidar_synth.train.data import InTurns
+from lidar_synth.lab.train.data import InTurns
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 TENSORS = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow"])

@@ -12,11 +12,11 @@ from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.train import TrainConfig, cache_scans, load_config, run, runs
-from lidar_synth.train.schedules import PLATEAU
-from lidar_synth.train.staged import train_for
-from lidar_synth.train.start import start_networks
-from lidar_synth.train.state import read_progress
+from lidar_synth.lab.train import TrainConfig, cache_scans, load_config, run, runs
+from lidar_synth.lab.train.schedules import PLATEAU
+from lidar_synth.lab.train.staged import train_for
+from lidar_synth.lab.train.start import start_networks
+from lidar_synth.lab.train.state import read_progress
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 SHORT = ("recipe.batch=1", "data.town=2", "samples.every=0", "recipe.warmup=1", "save_every=2")

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow.path import Velocity
-from lidar_synth.flow.solvers import solve, uniform_grid
-from lidar_synth.models import build_network
-from lidar_synth.models.convolution import WrapConv, fold, unfold
-from lidar_synth.models.lidm.diffusion import DiffusionUNet, schedule_times, step_of
-from lidar_synth.models.lidm.unet import UNet
+from lidar_synth.generate.flow.path import Velocity
+from lidar_synth.generate.flow.solvers import solve, uniform_grid
+from lidar_synth.generate.models import build_network
+from lidar_synth.generate.models.convolution import WrapConv, fold, unfold
+from lidar_synth.generate.models.lidm.diffusion import DiffusionUNet, schedule_times, step_of
+from lidar_synth.generate.models.lidm.unet import UNet
 
 SMALL: dict[str, Any] = {
     "resolution": (8, 32), "channels": 3, "width": 16, "multipliers": (1, 2), "blocks": 1, "attention": (1,),

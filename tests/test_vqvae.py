@@ -7,9 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.models import build_network
-from lidar_synth.models.codebook import CODEBOOKS
-from lidar_synth.models.lidm.vqvae import VQVAE
+from lidar_synth.generate.models import build_network
+from lidar_synth.generate.models.codebook import CODEBOOKS
+from lidar_synth.generate.models.lidm.vqvae import VQVAE
 
 SMALL: dict[str, Any] = {
     "resolution": (8, 32), "channels": 2, "latent_channels": 4, "codes": 16, "width": 8, "multipliers": (1, 2),

@@ -12,11 +12,11 @@ from layouts import some_scan, write_tars
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.evaluate.extractors.archive import Archive
 from lidar_synth.formats import WebDataset, open_scans
 from lidar_synth.formats.convert import SETTINGS, Report, convert
 from lidar_synth.formats.webdataset import WebDatasetWriter
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.lab.evaluate.extractors.archive import Archive
 
 
 def samples(path: Path) -> dict[str, dict[str, bytes]]:

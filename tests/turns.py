@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidar_synth.geometry.fitting import Trajectory, deskew
+from lidar_synth.geometry.deskew import Trajectory, deskew
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
 

@@ -29,14 +29,15 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from lidar_synth import Scan
-from lidar_synth.evaluate.segmentation import load_judge
-from lidar_synth.flow.distill import STRATEGIES
-from lidar_synth.flow.solvers import solve, uniform_grid
-from lidar_synth.flow.timesteps import best_path, select_timesteps
-from lidar_synth.generate.generator import Generator, load_generator
+from lidar_synth.generate.flow.distill import STRATEGIES
+from lidar_synth.generate.flow.solvers import solve, uniform_grid
+from lidar_synth.generate.flow.timesteps import best_path, select_timesteps
+from lidar_synth.generate.generator import Generator
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.train.optimizers import muon
-from lidar_synth.train.precision import faster_in_bfloat16
+from lidar_synth.lab.evaluate.segmentation import load_judge
+from lidar_synth.lab.train.optimizers import muon
+from lidar_synth.lab.train.precision import faster_in_bfloat16
 
 STEPS = (4, 2, 1)
 EULER = 24

@@ -27,19 +27,19 @@ from tqdm import tqdm
 
 from lidar_synth import load_generator, load_sensor, open_scans
 from lidar_synth.datasets.classes import IGNORE, NAMES, PANDASET
-from lidar_synth.evaluate.distances import frechet_distance
-from lidar_synth.evaluate.neighbours import nearest_training
-from lidar_synth.evaluate.segmentation import class_ious, load_judge
-from lidar_synth.evaluate.street_judge import load_archive
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats import WRITERS
 from lidar_synth.generate.checkpoint import CODEC, load_checkpoint
 from lidar_synth.generate.codec import Latent
-from lidar_synth.generate.generator import find_model
+from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.regrid import regrid
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.evaluate.distances import frechet_distance
+from lidar_synth.lab.evaluate.neighbours import nearest_training
+from lidar_synth.lab.evaluate.segmentation import class_ious, load_judge
+from lidar_synth.lab.evaluate.street_judge import load_archive
 from lidar_synth.noise import uniform
 
 LAST_LEARNT, FIRST_TESTED = 30, 60

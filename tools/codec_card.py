@@ -19,7 +19,7 @@ from tqdm import tqdm
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import RangeImage
-from lidar_synth.train import reconstruct
+from lidar_synth.lab.train import reconstruct
 
 SEED = 7
 """Seed of the town."""

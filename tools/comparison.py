@@ -19,10 +19,10 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from lidar_synth import MixedScans, Scan
-from lidar_synth.evaluate.segmentation import class_ious, confusion, mean_iou
+from lidar_synth.lab.evaluate.segmentation import class_ious, confusion, mean_iou
+from lidar_synth.lab.evaluate.segmenter import RangeSegmenter
+from lidar_synth.lab.train.segmentation import endless_batches, train_segmenter
 from lidar_synth.labels.augment import compose, flip_y, scale, yaw
-from lidar_synth.models.segmenter import RangeSegmenter
-from lidar_synth.train.segmentation import endless_batches, train_segmenter
 
 AUGMENT = compose([yaw, flip_y, scale])
 AUGMENTATION = "rotation about the vertical axis, mirroring and scaling, of real and synthetic scans alike"

@@ -27,11 +27,11 @@ from PIL import Image
 from tqdm import tqdm
 
 from lidar_synth import Scan, Town, load_generator, open_scans
-from lidar_synth.evaluate.conditions import AGREEMENTS
-from lidar_synth.evaluate.segmentation import Judge, load_judge
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.town import STRETCH_FRAMES
+from lidar_synth.lab.evaluate.conditions import AGREEMENTS
+from lidar_synth.lab.evaluate.segmentation import Judge, load_judge
+from lidar_synth.lab.town import STRETCH_FRAMES
 from lidar_synth.viz import picture, render
 
 SHOWN = 8

@@ -29,10 +29,10 @@ from tqdm import tqdm
 
 from lidar_synth import MixedScans, ObjectBank, Source, load_generator, make_policy
 from lidar_synth.files.disk import write_file
+from lidar_synth.lab.proof.machine import machine
+from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels.augment import Augmentation, compose, flip_x, flip_y, scale, yaw
 from lidar_synth.mixing import Sources
-from lidar_synth.proof.machine import machine
-from lidar_synth.train.segmentation import endless_batches
 
 LABELLED, TRAIN_TOWN = 30, 7
 TESTED, TEST_TOWNS = 40, (8, 9)

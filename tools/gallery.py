@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lidar_synth import Scan, load_generator, project
+from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.labels import ObjectBank, make_policy
-from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.viz import Orbit, picture, render, write_view
 
 Picture = NDArray[np.uint8]

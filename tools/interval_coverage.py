@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.evaluate.distances import frechet_of_moments, jensen_shannon_distance
-from lidar_synth.evaluate.intervals import bootstrap
-from lidar_synth.evaluate.measures import normalised_rows
-from lidar_synth.evaluate.statistics import Statistic, frechet, gaussian_mmd, histogram_distance, polynomial_mmd
+from lidar_synth.lab.evaluate.distances import frechet_of_moments, jensen_shannon_distance
+from lidar_synth.lab.evaluate.intervals import bootstrap
+from lidar_synth.lab.evaluate.measures import normalised_rows
+from lidar_synth.lab.evaluate.statistics import Statistic, frechet, gaussian_mmd, histogram_distance, polynomial_mmd
 
 WIDTH, BINS, LARGE = 8, 50, 4000
 

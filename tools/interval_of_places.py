@@ -10,7 +10,7 @@ import argparse
 
 import numpy as np
 
-from lidar_synth.proof.scores import interval
+from lidar_synth.lab.proof.scores import interval
 
 
 def coverage(places: int, seeds: int, between: float, within: float, trials: int) -> float:

@@ -17,9 +17,9 @@ from tqdm import tqdm
 
 from lidar_synth import Scan, open_scans
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.evaluate.street_judge import StreetJudge, load_archive
 from lidar_synth.geometry.projection import project
-from lidar_synth.town import Town
+from lidar_synth.lab.evaluate.street_judge import StreetJudge, load_archive
+from lidar_synth.lab.town import Town
 from lidar_synth.viz.images import picture
 
 

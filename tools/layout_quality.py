@@ -21,10 +21,10 @@ from model_card import SEED, Comparison, Measured, needs_images, shrink, table, 
 from tqdm import tqdm
 
 from lidar_synth import Scan, Town, layout_of, load_generator
-from lidar_synth.evaluate.layouts import LayoutAgreement, layout_agreement
-from lidar_synth.evaluate.segmentation import load_judge
 from lidar_synth.geometry.layout import Layout
-from lidar_synth.town import STRETCH_FRAMES
+from lidar_synth.lab.evaluate.layouts import LayoutAgreement, layout_agreement
+from lidar_synth.lab.evaluate.segmentation import load_judge
+from lidar_synth.lab.town import STRETCH_FRAMES
 from lidar_synth.viz import render
 
 SHOWN = 6

@@ -14,11 +14,11 @@ import numpy as np
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.town import STRETCH_FRAMES, Town, fit_skin, load_skin
-from lidar_synth.town.returns import LEVELS, Noise
-from lidar_synth.town.skin.domains import Domain, returns_of
+from lidar_synth.lab.town import STRETCH_FRAMES, Town, fit_skin, load_skin
+from lidar_synth.lab.town.returns import LEVELS, Noise
+from lidar_synth.lab.town.skin.domains import Domain, returns_of
 
-OUT = Path("lidar_synth/town/skin/pandar64.skin")
+OUT = Path("lidar_synth/lab/town/skin/pandar64.skin")
 LAST_LEARNT, FIRST_MEASURED = 30, 60
 LICENCE = (
     "CC BY 4.0 with the PandaSet Dataset Terms: attribution to Scale AI and Hesai; no use of their names or marks "
@@ -44,7 +44,7 @@ def distances(real: Domain, town: Domain) -> list[float]:
     """Wasserstein distances of reflectance, its residual and the range's residual (mm), weighted by range and kind."""
     from scipy.stats import wasserstein_distance
 
-    from lidar_synth.town.skin.features import BAND, STRATUM_KIND
+    from lidar_synth.lab.town.skin.features import BAND, STRATUM_KIND
 
     def values(domain: Domain) -> tuple[np.ndarray, list[np.ndarray]]:
         stratum = np.concatenate(domain.strata)

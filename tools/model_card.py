@@ -35,19 +35,19 @@ from tqdm import tqdm
 
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError
-from lidar_synth.evaluate import Metric, Score, bootstrap
-from lidar_synth.evaluate.segmentation import Judge, class_ious, load_judge, mean_iou
-from lidar_synth.evaluate.statistics import Counts, Statistic
-from lidar_synth.flow.path import autoguided
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import CODEC, load_checkpoint
 from lidar_synth.generate.codec import Latent
-from lidar_synth.generate.generator import find_model, load_generator
+from lidar_synth.generate.flow.path import autoguided
+from lidar_synth.generate.loading import find_model, load_generator
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.lab.evaluate import Metric, Score, bootstrap
+from lidar_synth.lab.evaluate.segmentation import Judge, class_ious, load_judge, mean_iou
+from lidar_synth.lab.evaluate.statistics import Counts, Statistic
+from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.noise import uniform
-from lidar_synth.town import STRETCH_FRAMES, Town
 from lidar_synth.viz import write_view
 
 REFERENCE, OTHER = 1, 2

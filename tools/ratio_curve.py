@@ -18,11 +18,11 @@ from tqdm import tqdm
 from train_segmenter import fit, town
 
 from lidar_synth import MixedScans, Scan, Source, load_generator, open_scans
-from lidar_synth.evaluate.segmentation import class_ious, mean_iou
 from lidar_synth.files.disk import write_file
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer import Transfer
+from lidar_synth.lab.evaluate.segmentation import class_ious, mean_iou
 from lidar_synth.noise import keyed_rng
 
 RATIOS = (0.0, 0.1, 0.25, 0.5)

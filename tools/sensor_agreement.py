@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lidar_synth.formats import KITTI360, KITTIObject, KITTIRaw, NuScenes, SemanticKITTI
 from lidar_synth.geometry.agreement import MOST_OUTSIDE, Agreement, agreement
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.town import Town
+from lidar_synth.lab.town import Town
 
 REAL, LABELLED = (Path(os.environ[f"LIDAR_SYNTH_{name}_SCANS"]) for name in ("REAL", "LABELLED"))
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from lidar_synth import Scan, Town, fit_sensor, load_sensor, open_scans
 from lidar_synth.formats.points import read_points
-from lidar_synth.geometry.fitting import SensorFit
+from lidar_synth.lab.fitting import SensorFit
 
 SENSOR = load_sensor("town")
 FRAMES = (0, 20, 40, 60, 70)

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lidar_synth.evaluate.distances import frechet_distance
-from lidar_synth.evaluate.recognition import Recognition
-from lidar_synth.evaluate.street_judge import StreetJudge, load_archive
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
-from lidar_synth.town.returns import Noise
+from lidar_synth.lab.evaluate.distances import frechet_distance
+from lidar_synth.lab.evaluate.recognition import Recognition
+from lidar_synth.lab.evaluate.street_judge import StreetJudge, load_archive
+from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
+from lidar_synth.lab.town.returns import Noise
 
 SHOWN = ("car", "road", "sidewalk", "building", "fence", "vegetation", "terrain", "trunk", "pole")
 PARTS = ("mean", "residual", "range", "offset", "missing")

@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import LidarSynthError
-from lidar_synth.generate.generator import load_generator
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.mixing.service import RollingBank
 

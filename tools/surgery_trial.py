@@ -27,12 +27,12 @@ from tqdm import tqdm
 from lidar_synth import Boxes, Scan, Source, Town, load_generator, open_scans
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.projection import locate, project
+from lidar_synth.lab.town.world import World
 from lidar_synth.labels.boxes import turned
 from lidar_synth.labels.edit.removal import returns_of, without
 from lidar_synth.labels.ground import ground_under
 from lidar_synth.labels.objects import instances_of
 from lidar_synth.noise import keyed_rng
-from lidar_synth.town.world import World
 
 PATCH = 24, 32
 FOLDS = 5

@@ -23,15 +23,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import TRAIN_ID
-from lidar_synth.evaluate.distances import frechet_distance
-from lidar_synth.evaluate.recognition import Recognition
-from lidar_synth.evaluate.street_judge import StreetJudge, load_archive
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.town import STRETCH_FRAMES, Town, returns
-from lidar_synth.town.materials import INDEX
-from lidar_synth.town.returns import Noise
+from lidar_synth.lab.evaluate.distances import frechet_distance
+from lidar_synth.lab.evaluate.recognition import Recognition
+from lidar_synth.lab.evaluate.street_judge import StreetJudge, load_archive
+from lidar_synth.lab.town import STRETCH_FRAMES, Town, returns
+from lidar_synth.lab.town.materials import INDEX
+from lidar_synth.lab.town.returns import Noise
 
 SHOWN = ("car", "road", "sidewalk", "parking", "building", "fence", "vegetation", "terrain", "trunk", "pole")
 SOFT = ("leaf", "foliage", "grass", "soil", "gravel")

@@ -11,10 +11,10 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from lidar_synth.town import STRETCH_FRAMES, Town
-from lidar_synth.town.shading import sample_light, shade, tone_map
-from lidar_synth.town.street import KINDS
-from lidar_synth.town.world import LIGHT, rng_for
+from lidar_synth.lab.town import STRETCH_FRAMES, Town
+from lidar_synth.lab.town.shading import sample_light, shade, tone_map
+from lidar_synth.lab.town.street import KINDS
+from lidar_synth.lab.town.world import LIGHT, rng_for
 from lidar_synth.viz import write_view
 
 SIZE = (510, 330)

@@ -19,7 +19,7 @@ from lidar_synth.formats import open_scans
 from lidar_synth.geometry.projection import project, ring_numbers
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.town import STRETCH_FRAMES, Town
+from lidar_synth.lab.town import STRETCH_FRAMES, Town
 
 GROUPS = [(0, 4), (4, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 40), (40, 48), (48, 56), (56, 64)]
 """Rows that one line of the table takes together, 0 = highest."""

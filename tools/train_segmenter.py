@@ -4,7 +4,7 @@
         [--steps 400] [--batch 4] [--workers 0] [--seed 0] [--save FILE.safetensors]
 
 Without ROOT, scans of the town take the place of real ones, and scans of another town are held out. ROOT is any dataset
-with labels per scan, SemanticKITTI for instance. The training loop is in lidar_synth/train/segmentation.py.
+with labels per scan, SemanticKITTI for instance. The training loop is in lidar_synth/lab/train/segmentation.py.
 """
 
 import argparse
@@ -17,9 +17,9 @@ from tqdm import tqdm
 
 from lidar_synth import MixedScans, Scan, Source, Town, load_generator, open_scans
 from lidar_synth.datasets.classes import NAMES
-from lidar_synth.evaluate.segmentation import Judge, class_ious, confusion, mean_iou
-from lidar_synth.models.segmenter import RangeSegmenter
-from lidar_synth.train.segmentation import endless_batches, train_segmenter
+from lidar_synth.lab.evaluate.segmentation import Judge, class_ious, confusion, mean_iou
+from lidar_synth.lab.evaluate.segmenter import RangeSegmenter
+from lidar_synth.lab.train.segmentation import endless_batches, train_segmenter
 
 
 def town(seed: int, count: int) -> list[Scan]:

@@ -25,12 +25,12 @@ from tqdm import tqdm
 
 from lidar_synth import Scan, load_sensor, open_scans, unfold
 from lidar_synth.datasets.classes import IGNORE, NAMES, TRAIN_ID
-from lidar_synth.evaluate.segmentation import class_ious, confusion, mean_iou
 from lidar_synth.geometry.transfer import Measurement, Mount, Response, Transfer
-from lidar_synth.models.segmenter import RangeSegmenter
+from lidar_synth.lab.evaluate.segmentation import class_ious, confusion, mean_iou
+from lidar_synth.lab.evaluate.segmenter import RangeSegmenter
+from lidar_synth.lab.train.precision import faster_in_bfloat16
+from lidar_synth.lab.train.segmentation import train_segmenter
 from lidar_synth.noise import keyed_rng
-from lidar_synth.train.precision import faster_in_bfloat16
-from lidar_synth.train.segmentation import train_segmenter
 
 COLUMNS, BATCH = 512, 4
 WIDTHS = (8, 16, 32, 48)

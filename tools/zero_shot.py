@@ -20,13 +20,13 @@ from tqdm import tqdm
 
 from lidar_synth import open_scans
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
-from lidar_synth.evaluate.segmentation import class_ious, confusion
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models.segmenter import RangeSegmenter
-from lidar_synth.town import STRETCH_FRAMES, Town
-from lidar_synth.train.segmentation import train_segmenter
+from lidar_synth.lab.evaluate.segmentation import class_ious, confusion
+from lidar_synth.lab.evaluate.segmenter import RangeSegmenter
+from lidar_synth.lab.town import STRETCH_FRAMES, Town
+from lidar_synth.lab.train.segmentation import train_segmenter
 
 GRID = Sensor("64 x 512", 512, range_min=1.0, range_max=80.0, rows=64, fov_up=3.0, fov_down=-25.0)
 CHANNELS = ("reflectance", "label")

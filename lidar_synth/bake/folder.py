@@ -22,9 +22,10 @@ from lidar_synth.bake.job import BakePlan, settings_of
 from lidar_synth.bank import INDEX, Entry, Index
 from lidar_synth.bank.card import CARD, CROISSANT, card_files
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import read_file, sha256, write_file
 from lidar_synth.files.lock import alone, shared
-from lidar_synth.formats.writer import NOTES, claim
+from lidar_synth.formats.writer import NOTES
 
 SETTINGS = ".bake.json"
 """File in the bank's folder with the settings of the bake; runs that fill the folder hold a lock on it."""

@@ -21,10 +21,10 @@ from lidar_synth.bake.conditions import conditions_for, fingerprint
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
-from lidar_synth.errors import ConfigError
-from lidar_synth.flow.solvers import SOLVERS
-from lidar_synth.formats.source import choose
-from lidar_synth.generate.generator import BATCH, load_generator
+from lidar_synth.errors import ConfigError, choose
+from lidar_synth.generate.flow.solvers import SOLVERS
+from lidar_synth.generate.generator import BATCH
+from lidar_synth.generate.loading import load_generator
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 """Data types of the network's computation, by name."""

@@ -7,8 +7,8 @@ from typing import Any
 
 from lidar_synth.bake.folder import refuse_others
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.claims import claim
 from lidar_synth.files.lock import alone
-from lidar_synth.formats.writer import claim
 
 NOTE = ".made.json"
 """File in the bank's folder with the settings of the call that makes it; a run holds a lock on it."""

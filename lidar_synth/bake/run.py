@@ -22,8 +22,7 @@ from lidar_synth.bake.shard import Progress
 from lidar_synth.bake.slurm import bake_on_slurm
 from lidar_synth.bake.torchrun import bake_under_torchrun
 from lidar_synth.bank import Index
-from lidar_synth.errors import ConfigError
-from lidar_synth.formats.source import choose
+from lidar_synth.errors import ConfigError, choose
 
 Engine = Callable[[BakePlan, Sequence[int], Resources, Progress], None]
 

@@ -17,7 +17,8 @@ from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import part_of
-from lidar_synth.generate.generator import BATCH, Generator, load_generator
+from lidar_synth.generate.generator import BATCH, Generator
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.scan import RangeImage
 
 _PACKED = 0.6  # highest ratio of compressed to plain size, for scans that models generate

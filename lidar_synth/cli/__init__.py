@@ -6,58 +6,50 @@ prints one message.
 
 import sys
 from collections.abc import Callable
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
 
 from lidar_synth import __version__
-from lidar_synth.cli.adapt import adapt
 from lidar_synth.cli.bake import bake
 from lidar_synth.cli.bank import bank, info, repair, verify
 from lidar_synth.cli.check_mix import check_mix
 from lidar_synth.cli.convert import convert
-from lidar_synth.cli.curate import curate
 from lidar_synth.cli.doctor import doctor
 from lidar_synth.cli.edit import edit
-from lidar_synth.cli.evaluate import evaluate
-from lidar_synth.cli.import_ import import_
-from lidar_synth.cli.label import label
-from lidar_synth.cli.metrics import metrics
-from lidar_synth.cli.prove import prove
-from lidar_synth.cli.recipes import recipes
 from lidar_synth.cli.sample import sample
-from lidar_synth.cli.sensor import sensor
-from lidar_synth.cli.skin import skin
-from lidar_synth.cli.town import town
-from lidar_synth.cli.train import distill, train
 from lidar_synth.cli.view import view
 from lidar_synth.errors import ConfigError, LidarSynthError
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as of a program that a shell saw end by SIGINT; typer exits with it, without a message."""
 
-COMMANDS: dict[str, Callable[..., None]] = {
-    "town": town,
+COMMANDS: dict[str, Callable[..., None] | str] = {
+    "town": "town",
     "convert": convert,
-    "label": label,
+    "label": "label",
     "view": view,
     "sample": sample,
     "bake": bake,
     "verify": verify,
     "repair": repair,
     "info": info,
-    "curate": curate,
-    "recipes": recipes,
-    "train": train,
-    "distill": distill,
-    "evaluate": evaluate,
-    "prove": prove,
-    "adapt": adapt,
+    "curate": "curate",
+    "recipes": "recipes",
+    "train": "train",
+    "distill": "train",
+    "evaluate": "evaluate",
+    "prove": "prove",
+    "adapt": "adapt",
     "check-mix": check_mix,
-    "import": import_,
+    "import": "import_",
     "doctor": doctor,
 }
-"""Commands by name, in the order of the help text."""
+"""Commands by name, in the order of the help text; of the laboratory's, the module of ``lidar_synth.lab.cli``."""
+
+GROUPS: list[typer.Typer | str] = [bank, edit, "sensor", "skin", "metrics"]
+"""Commands with commands of their own; the laboratory's by name."""
 
 app = typer.Typer(
     name="lidar-synth",
@@ -79,13 +71,16 @@ def _options(
         raise typer.Exit
 
 
+def _load(module: str, name: str) -> Any:
+    return getattr(import_module(f"lidar_synth.lab.cli.{module}"), name)
+
+
 for _name, _command in COMMANDS.items():
+    if isinstance(_command, str):
+        _command = _load(_command, "import_" if _name == "import" else _name)
     app.command(_name)(_command)
-app.add_typer(bank)
-app.add_typer(edit)
-app.add_typer(sensor)
-app.add_typer(skin)
-app.add_typer(metrics)
+for _group in GROUPS:
+    app.add_typer(_load(_group, _group) if isinstance(_group, str) else _group)
 
 
 def main() -> None:

@@ -76,9 +76,9 @@ def convert(
 
       lidar-synth convert clouds out --to kitti --reflectance-max 255 --on-bad drop-points
     """
+    from lidar_synth.errors import choose
     from lidar_synth.formats import WRITERS, open_scans
     from lidar_synth.formats.convert import convert as run
-    from lidar_synth.formats.source import choose
 
     writer = choose("--to", to, WRITERS)(out)
     scans = open_scans(source, sensor=sensor, **only_given(reading))

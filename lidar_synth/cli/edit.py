@@ -132,8 +132,8 @@ def _edit_one(source: Path, out: Path, number: int, to: str, change: Any) -> Non
 
 
 def _writer(out: Path, to: str) -> Any:
+    from lidar_synth.errors import choose
     from lidar_synth.formats import WRITERS
-    from lidar_synth.formats.source import choose
 
     return choose("--to", to, WRITERS)(out)
 

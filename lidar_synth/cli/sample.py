@@ -1,5 +1,6 @@
 """``lidar-synth sample``: generates scans with a model."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
@@ -50,12 +51,12 @@ def sample(
     from tqdm import tqdm
 
     from lidar_synth.bake.conditions import conditions, conditions_for
-    from lidar_synth.evaluate.leakage import seen_by
+    from lidar_synth.errors import choose
+    from lidar_synth.files.claims import claimed
     from lidar_synth.formats import WRITERS
-    from lidar_synth.formats.source import choose
-    from lidar_synth.formats.writer import claimed
-    from lidar_synth.generate.generator import load_generator
+    from lidar_synth.generate.loading import load_generator
 
+    leakage = import_module("lidar_synth.lab.evaluate.leakage")
     writer = choose("--to", to, WRITERS)(out)
     precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
     generator = load_generator(model, device=device, dtype=precision, batch=batch, columns=columns)
@@ -66,7 +67,7 @@ def sample(
         "guidance": guidance, **({} if columns is None else {"columns": columns}),
     }  # fmt: skip
     provenance = generator.header.provenance
-    trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}
+    trained = {"trained_on": provenance["data"], "seen": leakage.seen_by(provenance).to_list()}
     with claimed(writer.root / NOTE, settings | trained):
         missing = [i for i in range(count) if not writer.complete(i)]
         with tqdm(total=len(missing), desc="scans", unit="scan") as bar:

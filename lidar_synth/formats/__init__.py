@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.bank import is_bank, is_url
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, choose
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.bank import BankScans
 from lidar_synth.formats.calibration import Calibration
@@ -23,7 +23,7 @@ from lidar_synth.formats.pandaset import FRAMES, PandaSet
 from lidar_synth.formats.png import PNGWriter, RangePNG
 from lidar_synth.formats.range_images import RangeImages, RangeWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
-from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.webdataset import SUFFIX as TAR
 from lidar_synth.formats.webdataset import WebDataset, WebDatasetWriter
 from lidar_synth.formats.writer import Writer

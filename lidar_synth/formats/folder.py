@@ -30,7 +30,7 @@ from lidar_synth.formats.point_labels import encode_labels, read_labels, write_l
 from lidar_synth.formats.points import check_scan, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import DETAILS, LABELS, FileWriter, Picture
-from lidar_synth.geometry.fitting.assign import assign_beams
+from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 

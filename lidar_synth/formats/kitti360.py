@@ -30,14 +30,14 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import KITTI360 as CLASSES
 from lidar_synth.datasets.recordings import KITTI360_SPLITS
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import list_files, read_file, read_values
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES, MOST_INSTANCE, WorldBoxes, read_boxes, write_boxes
 from lidar_synth.formats.kitti360_poses import CAMERA, read_calibration, read_poses, write_calibration, write_poses
 from lidar_synth.formats.point_labels import decode_labels, encode_labels, mismatch, write_labels
 from lidar_synth.formats.points import read_points
-from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import LABELS, Picture, Writer, clear_notes, read_notes, write_image, write_note
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor

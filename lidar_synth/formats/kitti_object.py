@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import (
     list_files,
     naming,
@@ -31,7 +31,7 @@ from lidar_synth.files.disk import (
 from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
 from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
 from lidar_synth.formats.points import read_points
-from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import Picture, Writer, write_image
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, choose
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.folder import scan_paths
@@ -29,7 +29,7 @@ from lidar_synth.formats.npz import (
 )
 from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
-from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import DETAILS, FileWriter, Picture, projected
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan

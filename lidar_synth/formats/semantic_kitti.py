@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI, Taxonomy
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, choose
 from lidar_synth.files.disk import (
     list_files,
     naming,
@@ -35,7 +35,7 @@ from lidar_synth.files.disk import (
 from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneous, ideal_camera
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import read_points
-from lidar_synth.formats.source import OnBad, ScanFiles, choose
+from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import LABELS, Picture, Writer, clear_notes, read_notes, write_image, write_note
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor

@@ -2,12 +2,12 @@
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar, get_args
+from typing import Any, ClassVar, Literal, get_args
 
-from lidar_synth.errors import ConfigError, DataError, FileError, suggest
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import FORMAT, NAME, read_description, same_grid
 from lidar_synth.formats.points import bad_points_kept, without_bad_points
@@ -18,8 +18,6 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor
 OnBad = Literal["error", "skip", "drop-points"]
 """The handling of bad scans: raise an error on a scan that cannot be read, skip it with a warning, or drop points that
 are NaN or infinite and count them."""
-
-Choice = TypeVar("Choice")
 
 _TRIED = 8  # scans of which the first readable one is compared with the sensor
 _NAME_IT = (
@@ -198,15 +196,3 @@ class ScanFiles(ABC):
             # Loader workers have their own copy of ``skipped``, but their warnings reach the user.
             warnings.warn(f"skipped scan {name}: {error}", stacklevel=3)
             return None
-
-
-def choose(kind: str, name: str, table: Mapping[str, Choice], hint: str = "") -> Choice:
-    """``table[name]``, or an error that lists the names.
-
-    Raises:
-        ConfigError: on a name that is not in the table.
-    """
-    if name not in table:
-        hint = f"{hint} {suggest(name, table)}".strip()
-        raise ConfigError(f"{kind} {name!r}", f"one of {', '.join(map(repr, table))}", hint)
-    return table[name]

@@ -8,8 +8,6 @@ boxes, lists of frames) are noted beside each scan and gathered by ``finish``, w
 import json
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import DataError
 from lidar_synth.files.disk import inside, list_files, read_file, read_text, refuse_links, write_file
-from lidar_synth.files.lock import alone, shared
 from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import (
@@ -228,77 +225,6 @@ def write_image(path: Path, picture: Picture) -> None:
 
     opened = read_picture(picture) if isinstance(picture, Path) else pillow.fromarray(picture)
     write_file(path, lambda file: opened.convert("RGB").save(file, "PNG"))
-
-
-def claim(path: Path, settings: dict[str, Any]) -> None:
-    """Record the settings of an output folder in a file, and refuse a folder with other settings.
-
-    Otherwise a rerun with other settings would keep old scans and present them as new ones.
-
-    Args:
-        path: the file, in the output folder.
-        settings: plain values that determine what is written.
-
-    Raises:
-        ConfigError: if the folder was filled with other settings.
-        DataError: if the file is damaged.
-        FileError: if it cannot be read or written.
-    """
-    wanted = json.loads(json.dumps(settings))
-    if not path.is_file():
-        # Another process may create it at the same time.
-        write_file(path, json.dumps(wanted, indent=1).encode(), overwrite=False)
-    existing = parse_json(read_text(path), f"{path}, which is damaged,", "the settings that this package wrote")
-    if not isinstance(existing, dict):
-        raise DataError(f"{path} is damaged (it holds {type(existing).__name__})", hint="Choose another output folder.")
-    other = {name: existing[name] for name, value in wanted.items() if existing.get(name, value) != value}
-    if other:
-        raise ConfigError(
-            f"{path.parent} was filled with {other}",
-            f"{ {name: wanted[name] for name in other} }",
-            "Use the same options to resume, or choose another folder.",
-        )
-
-
-@contextmanager
-def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
-    """``claim`` a folder for the block, and take the claim back if the block has written nothing, so that the corrected
-    call may use the folder.
-
-    A claim that was there before is left alone: it may be that of a process that has not written its first file yet.
-
-    Raises:
-        ConfigError, DataError, FileError: as ``claim``.
-    """
-    first = not path.is_file()
-    claim(path, settings)
-    try:
-        with writing(path):
-            yield
-        if not _alone(path):
-            claim(path, settings)  # again: the process that came first may have written nothing and taken it back
-    finally:
-        if first and _alone(path):
-            path.unlink(missing_ok=True)
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Write into a claimed folder; the last of several runs removes the temporary files that killed ones left.
-
-    Args:
-        path: the file of the claim.
-    """
-    with shared(path):
-        yield
-    with alone(path) as exclusive:
-        for part in path.parent.rglob(".*.part") if exclusive else ():
-            part.unlink(missing_ok=True)
-
-
-def _alone(path: Path) -> bool:
-    """Whether there is no other file in the folder of a file, and below."""
-    return not any(other.is_file() and other != path for other in path.parent.rglob("*"))
 
 
 def write_note(folder: Path, frame: int, facts: dict[str, Any]) -> None:

@@ -38,12 +38,12 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import write_file
-from lidar_synth.flow.solvers import uniform_grid
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned
 from lidar_synth.generate.devices import checked_device
+from lidar_synth.generate.flow.solvers import uniform_grid
+from lidar_synth.generate.models import assemble
 from lidar_synth.geometry.normalize import LABEL_BITS, Normalisation, TensorFormat
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import assemble
 
 FORMAT = "lidar-synth-checkpoint/2"
 WITHOUT_CHECKSUM = "lidar-synth-checkpoint/1"

@@ -1,6 +1,7 @@
 """The devices that torch can compute on."""
 
 import torch
+from torch.utils.data import get_worker_info
 
 from lidar_synth.errors import ConfigError
 
@@ -36,3 +37,14 @@ def checked_device(device: str | torch.device) -> torch.device:
 def _missing(device: object, available: list[str]) -> ConfigError:
     hint = "A GPU needs its driver and a build of torch that supports it; `lidar-synth doctor` shows what is installed."
     return ConfigError(f"device {str(device)!r}", f"an available one: {', '.join(available)}", hint)
+
+
+def refuse_worker(device: torch.device | str) -> None:
+    """Refuse CUDA in DataLoader workers: a forked process cannot use it, and each spawned one would need a context."""
+    if str(device).startswith("cuda") and get_worker_info() is not None:
+        raise ConfigError(
+            "a generator on the GPU inside a DataLoader worker",
+            "one of three ways: (A) bake a bank first and read it in the workers, (B) a rolling bank that one spawned "
+            "process fills, (C) mix in the main process, on the training device",
+            "On the CPU, load_generator(..., device='cpu') works in workers too.",
+        )

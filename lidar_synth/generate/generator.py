@@ -4,40 +4,33 @@ A scan is a function of (checkpoint, condition, time grid and solver, seed, inde
 their order and the device change only float rounding.
 """
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import files
-from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.data import get_worker_info
 from typing_extensions import Unpack
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError, suggest
-from lidar_synth.flow.path import Velocity, guided
-from lidar_synth.flow.solvers import solve, towards
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate import boxed
-from lidar_synth.generate.checkpoint import CODEC, VELOCITY, Header, has_checksum, join, load_checkpoint, read_header
+from lidar_synth.generate.checkpoint import Header
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, blank
-from lidar_synth.generate.devices import checked_device
+from lidar_synth.generate.devices import refuse_worker
+from lidar_synth.generate.flow.path import Velocity, guided
+from lidar_synth.generate.flow.solvers import solve, towards
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, made_by_model
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, identity_of, made_by_model
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.noise import gaussian, uniform
 
 BATCH = {"cpu": 1, "cuda": 16}
 """Default batch size by device: few enough for a CPU's cache, enough to fill a GPU."""
-
-SHIPPED = {
-    "town": "2d8d08119dc4a1c0002040ff47e66dea71bf87c7ae82d667c0ccfff15778202b",
-}
-"""Hashes of shipped checkpoints whose older format has no checksum of the header."""
 
 
 class SamplingOptions(TypedDict, total=False):
@@ -138,6 +131,10 @@ class Generator:
         """The device of the network."""
         return next(self.network.parameters()).device
 
+    def as_synthetic(self, seed: int = 0) -> "Generated":
+        """The scans of a seed by number, made when they are read."""
+        return Generated(self, seed)
+
     def range_images(
         self, seed: int, indices: Sequence[int], condition: Any = None, **options: Unpack[SamplingOptions]
     ) -> list[RangeImage]:
@@ -206,7 +203,7 @@ class Generator:
 
         Arguments and errors are those of ``range_images``.
         """
-        _refuse_worker(self.device)
+        refuse_worker(self.device)
         given = self._condition(condition, len(indices))
         codec = self.codec
         noise_shape = (codec.draws, *self.sensor.shape)
@@ -253,97 +250,89 @@ class Generator:
         return batch_of(self.condition, given, count, self.header.sensor, shape, options).to(self.device)
 
 
-def load_generator(
-    model: str | Path,
-    *,
-    device: str | torch.device = "cpu",
-    dtype: torch.dtype = torch.float32,
-    compile: bool = False,
-    batch: int | None = None,
-    columns: int | None = None,
-) -> Generator:
-    """Load a generator from a shipped model or a checkpoint file.
+class Generated:
+    """Scans that a generator makes on access, in the process that accesses them.
 
     Args:
-        model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
-        device: an available device such as "cpu", "cuda" or "cuda:1"; see ``available_devices``.
-        dtype: dtype of the network's computations; states stay float32.
-        compile: whether to compile the velocity network and the decoder of a latent model with ``torch.compile``; the
-            first scan then takes long.
-        batch: number of scans computed at a time; by default it depends on the device.
-        columns: of the scans; a dense model generates half of its columns at about half of the decoder's cost.
+        generator: the model. On the CPU it also works in DataLoader workers. On a GPU it works in the main process
+            only; in a worker it raises an error that names the three ways to use a GPU's scans.
+        seed: of the scans; the number of a scan is its index.
+        condition: for a conditional model, an indexable source of conditions, such as the real scans. Scan n is
+            conditioned on entry n modulo the source's length; ``Generator.range_images`` lists the kinds of entries.
+        cache: number of latest scans that each process keeps in memory (about 1 MB each at 64 x 1024), which saves
+            time if a process accesses a scan again: with ``reuse``, an epoch later.
+        sampling: steps, solver and guidance, as for ``Generator.scans``.
 
     Raises:
-        ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, or a number of columns that
-            the model cannot generate.
-        FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
+        ConfigError: on a negative cache, a conditional model without conditions, or conditions for an unconditional
+            model.
 
     Example:
-        >>> from lidar_synth import load_generator
-        >>> generator = load_generator("town")
-        >>> first, second = generator.scans(seed=0, indices=[0, 1])
-        >>> second.id, sorted(second.fields())
-        ('town/0/1', ['confidence', 'label', 'reflectance'])
+        >>> from lidar_synth import load_generator, open_scans
+        >>> from lidar_synth.generate.generator import Generated
+        >>> real = open_scans("demo_out/town")
+        >>> synth = Generated(load_generator("town-semantic"), condition=real)  # for MixedScans(real, synth, ...)
+        >>> sorted(synth[0].fields())
+        ['confidence', 'label', 'reflectance']
     """
-    _refuse_worker(device)
-    device = checked_device(device)
-    path = find_model(model)
-    checkpoint = load_checkpoint(path, device)
-    if VELOCITY not in checkpoint.networks:
-        raise DataError(f"{path} is an autoencoder", "a model that generates", f"Train one with codec={path}.")
-    for network in checkpoint.networks.values():
-        network.to(dtype).requires_grad_(False)
-    if compile:
-        _compile(checkpoint.networks)
-    flow, autoencoder = join(checkpoint.networks), checkpoint.networks.get(CODEC)
-    size = batch or BATCH.get(device.type, 1)
-    return Generator(path.stem, flow, checkpoint.header, checkpoint.hash, size, autoencoder, columns)
 
+    length: None = None
+    on_demand = True
+    """Reading the first scan would start the network."""
 
-def _compile(networks: dict[str, nn.Module]) -> None:
-    """Compile the velocity network and the decoder, in place."""
-    networks[VELOCITY].compile()
-    if (autoencoder := networks.get(CODEC)) is not None:
-        # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``. Compiled for two widths at once,
-        # it gives infinite values (torch 2.13).
-        codec: Any = autoencoder
-        codec.decode = torch.compile(codec.decode, dynamic=False)
-
-
-def shipped_models() -> dict[str, Path]:
-    """The checkpoints that ship with the package: {name: path}."""
-    folder = Path(str(files("lidar_synth"))) / "weights"
-    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
-
-
-def find_model(model: str | Path) -> Path:
-    """The checkpoint file of a shipped model, or the given path itself.
-
-    Raises:
-        ConfigError: on an unknown name.
-        FileError, DataError: if the shipped file cannot be read or is damaged.
-    """
-    shipped = shipped_models()
-    if (name := str(model)) in shipped:
-        if not has_checksum(shipped[name]) and read_header(shipped[name])[1] != SHIPPED.get(name):
-            raise DataError(
-                f"{shipped[name]} is not the {name!r} of this version", "an intact file", "Install it again."
+    def __init__(
+        self, generator: Generator, seed: int = 0, *, condition: Any = None, cache: int = 0, **sampling: Any
+    ) -> None:
+        if cache < 0:
+            raise ConfigError(f"cache={cache}", "a number of scans")
+        if (condition is None) != (generator.condition is None):
+            raise ConfigError(
+                f"{'no conditions' if condition is None else 'conditions'} for {generator.name!r}",
+                f"a source of conditions ({generator.condition})" if generator.condition else "none",
+                "Generated(generator, condition=real) conditions it on the scans of a source.",
             )
-        return shipped[name]
-    path = Path(model)
-    if path.suffix != ".safetensors":
-        names = ", ".join(shipped) or "none in this installation"
-        expected = f"a shipped one ({names}) or a .safetensors file"
-        raise ConfigError(f"model {str(model)!r}", expected, suggest(model, shipped))
-    return path
+        self.generator, self.seed, self.condition = generator, seed, condition
+        self._sampling, self._cache_size = sampling, cache
+        self._cached: OrderedDict[int, Scan] = OrderedDict()
 
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor of the generator."""
+        return self.generator.sensor
 
-def _refuse_worker(device: torch.device | str) -> None:
-    """Refuse CUDA in DataLoader workers: a forked process cannot use it, and each spawned one would need a context."""
-    if str(device).startswith("cuda") and get_worker_info() is not None:
-        raise ConfigError(
-            "a generator on the GPU inside a DataLoader worker",
-            "one of three ways: (A) bake a bank first and read it in the workers, (B) a rolling bank that one spawned "
-            "process fills, (C) mix in the main process, on the training device",
-            "On the CPU, load_generator(..., device='cpu') works in workers too.",
-        )
+    @property
+    def fields(self) -> frozenset[str]:
+        """The fields that the scans have besides their points."""
+        return self.generator.fields | {"reflectance"}
+
+    @property
+    def identity(self) -> str:
+        """The checkpoint, the seed, the sampling options and the conditions as one text."""
+        model = self.generator.hash or self.generator.name
+        options = {k: v for k, v in sorted(self._sampling.items()) if v is not None}
+        conditions = "" if self.condition is None else identity_of(self.condition)
+        return f"generated:{model}:{self.seed}:{options}:{conditions}{self.generator.variant}"
+
+    def __getitem__(self, number: int) -> Scan:
+        if number in self._cached:
+            self._cached.move_to_end(number)
+            return self._cached[number]
+        [scan] = self.scans([number])
+        if self._cache_size:
+            self._cached[number] = scan
+            if len(self._cached) > self._cache_size:
+                self._cached.popitem(last=False)
+        return scan
+
+    def scans(self, numbers: Sequence[int]) -> list[Scan]:
+        """Several scans at once, which is faster on a GPU."""
+        condition = None if self.condition is None else [self.condition[n % len(self.condition)] for n in numbers]
+        return self.generator.scans(self.seed, numbers, condition, **self._sampling)
+
+    def __repr__(self) -> str:
+        fields = ", ".join(sorted(self.fields))
+        made_by = f"Generated by {self.generator.name!r}, seed {self.seed}"
+        return f"{made_by}\n  sensor {self.sensor.grid_text()}; {fields}"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_cached": OrderedDict()}

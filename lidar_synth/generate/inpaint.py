@@ -16,7 +16,7 @@ from torch.nn.functional import adaptive_max_pool2d
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.flow.solvers import solve, towards
+from lidar_synth.generate.flow.solvers import solve, towards
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.normalize import CHANNELS
 from lidar_synth.geometry.scan import RangeImage

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Checkpoint, Header, NetworkSpec
 from lidar_synth.generate.codec import make_codec
+from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.models import build_network
 
 ANGLES = "angles.cells"
 """Ray angles of the cells of the state, which are replaced."""

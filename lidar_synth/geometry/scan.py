@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.files.disk import hash_of_names
 from lidar_synth.geometry.sensor import Sensor
 
 REAL, SYNTHETIC = 0, 1
@@ -284,3 +285,11 @@ class Source(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int, /) -> Scan: ...
+
+
+def identity_of(source: Any) -> str:
+    """A text that identifies a source: its ``identity``, or its class, its length and a hash of its scans' names."""
+    if own := getattr(source, "identity", ""):
+        return str(own)
+    names = hash_of_names(map(str, getattr(source, "ids", ())))
+    return f"{type(source).__name__}:{len(source)}:{names[:16]}"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.geometry.fitting import assign_beams
+from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import joined

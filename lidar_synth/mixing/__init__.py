@@ -3,6 +3,7 @@
 The plan of an epoch (plan.py) is a pure function of seed and epoch; datasets, batch sampler and stream follow it.
 """
 
+from lidar_synth.generate.generator import Generated
 from lidar_synth.mixing.batches import MixedBatches
 from lidar_synth.mixing.collate import Collate
 from lidar_synth.mixing.items import Item, to_item
@@ -12,7 +13,7 @@ from lidar_synth.mixing.scans import MixedScans
 from lidar_synth.mixing.schedules import Linear, make_schedule
 from lidar_synth.mixing.sources import Sources
 from lidar_synth.mixing.stream import MixedStream
-from lidar_synth.mixing.synthetic import Generated, Held, Synthetic, make_synthetic
+from lidar_synth.mixing.synthetic import Held, Synthetic, make_synthetic
 
 __all__ = [
     "Collate",

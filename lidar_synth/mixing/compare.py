@@ -23,7 +23,7 @@ from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing.meaning import Contradiction, Table, contradictions, measure_tables, spread
-from lidar_synth.mixing.synthetic import Generated, Synthetic
+from lidar_synth.mixing.synthetic import Synthetic
 from lidar_synth.noise import keyed_rng
 
 log = logging.getLogger(__name__)
@@ -296,7 +296,7 @@ def _scan_of(source: Synthetic) -> Scan:
 
 def _is_on_demand(source: Synthetic) -> bool:
     """Whether a source would have to start first: a generator or a rolling bank."""
-    return isinstance(source, Generated) or hasattr(source, "expect")
+    return getattr(source, "on_demand", False) or hasattr(source, "expect")
 
 
 def made_up(sensor: Sensor, fields: frozenset[str]) -> Scan:

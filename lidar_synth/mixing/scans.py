@@ -11,7 +11,7 @@ import numpy as np
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, identity_of
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels import LabelPolicy, make_policy
@@ -25,7 +25,7 @@ from lidar_synth.mixing.notices import Notices, report_repeats
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
 from lidar_synth.mixing.schedules import Schedule, make_schedule, to_integer
-from lidar_synth.mixing.sources import check_together, each, identity_of
+from lidar_synth.mixing.sources import check_together, each
 from lidar_synth.mixing.synthetic import make_synthetic
 from lidar_synth.noise import keyed_rng
 

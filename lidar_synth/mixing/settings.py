@@ -13,7 +13,6 @@ from lidar_synth.errors import ConfigError, shorten
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.as_sensor import read_transfer
-from lidar_synth.generate.generator import load_generator
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing.scans import MixedScans
 
@@ -50,6 +49,8 @@ def open_synthetic(where: Any) -> Any:
     if is_url(where):
         return Bank(where)
     if not os.path.isdir(where):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
+        from lidar_synth.generate.loading import load_generator  # loads networks: only where a model is named
+
         return load_generator(where)
     if is_bank(where):
         return Bank(where)

@@ -7,7 +7,6 @@ import numpy as np
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError
-from lidar_synth.files.disk import hash_of_names
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -61,14 +60,6 @@ def each(source: Any) -> tuple[tuple[Any, float | None], ...]:
     if isinstance(source, Sources):
         return tuple(zip(source.sources, source.weights, strict=True))
     return ((source, None),)
-
-
-def identity_of(source: Any) -> str:
-    """A text that identifies a source: its ``identity``, or its class, its length and a hash of its scans' names."""
-    if own := getattr(source, "identity", ""):
-        return str(own)
-    names = hash_of_names(map(str, getattr(source, "ids", ())))
-    return f"{type(source).__name__}:{len(source)}:{names[:16]}"
 
 
 def sensor_of(source: Any) -> Sensor:

@@ -15,7 +15,6 @@ from lidar_synth.viz.images import picture
 from lidar_synth.viz.page import html_page
 from lidar_synth.viz.panels import classes_panel, mixture_panel, scores_panel, verdict
 from lidar_synth.viz.render import Camera, Orbit, bird, render
-from lidar_synth.viz.sensor_fit import fit_figure
 from lidar_synth.viz.sheet import contact_sheet, histograms, sheet
 from lidar_synth.viz.window import show
 
@@ -26,7 +25,6 @@ __all__ = [
     "bird",
     "classes_panel",
     "contact_sheet",
-    "fit_figure",
     "histograms",
     "html_page",
     "mixture_panel",

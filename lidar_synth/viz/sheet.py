@@ -23,7 +23,7 @@ from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, scales
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Camera, bird, render
 
-_BACK, _INK, _DIM = tuple(EMPTY / 255), "#e8eaf0", "#9aa0ad"
+BACK, INK, DIM = tuple(EMPTY / 255), "#e8eaf0", "#9aa0ad"
 _DPI = 100
 
 
@@ -43,7 +43,7 @@ def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: flo
     by = "label" if view.scan.label is not None else "height"
     legend = 0.5 if by == "label" else 0.1
     heights = [6.2, *[1.45] * len(view.channels), legend]
-    figure = _figure(17.0, sum(heights) + 0.7)
+    figure = new_figure(17.0, sum(heights) + 0.7)
     grid = figure.add_gridspec(
         len(heights), 2, width_ratios=[2, 1], height_ratios=heights, hspace=0.34, wspace=0.1,
         left=0.045, right=0.945, bottom=0.01, top=1 - 0.75 / (sum(heights) + 0.7),
@@ -52,7 +52,7 @@ def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: flo
         0.045,
         1 - 0.28 / figure.get_figheight(),
         caption(view.scan),
-        color=_INK,
+        color=INK,
         fontsize=15,
         va="center",
         parse_math=False,
@@ -93,7 +93,7 @@ def contact_sheet(
     legend = 0.25 + 0.22 * -(-(len(NAMES) + 1) // _per_row(width)) if by == "label" else 0.1
     strips = ("range", "label") if by == "label" else ("range",)
     height = (3.2 + 0.6 * len(strips)) * rows + 0.5 + legend
-    figure = _figure(width, height)
+    figure = new_figure(width, height)
     grid = figure.add_gridspec(
         rows, columns, hspace=0.11, wspace=0.03, left=0.01, right=0.99, bottom=legend / height, top=1 - 0.72 / height
     )
@@ -104,7 +104,7 @@ def contact_sheet(
         _show_pixels(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
         for axes, channel in zip(below, strips, strict=True):
             _show_pixels(axes, picture(view.image, channel, colours[channel]))
-        above.set_title(caption(view.scan, short=True), color=_DIM, fontsize=9, loc="left", pad=3, parse_math=False)
+        above.set_title(caption(view.scan, short=True), color=DIM, fontsize=9, loc="left", pad=3, parse_math=False)
     if by == "label":
         _legend(figure, all_views, colours[by].table)
     return figure
@@ -124,7 +124,7 @@ def histograms(
     columns = min(len(values), 4)
     rows = -(-len(values) // columns)
     height = 3.1 * rows + 0.6
-    figure = _figure(4.6 * columns, height)
+    figure = new_figure(4.6 * columns, height)
     grid = figure.add_gridspec(
         rows,
         columns,
@@ -137,11 +137,11 @@ def histograms(
     )
     _write_head(figure, title, 0.01, 1 - 0.3 / height)
     for place, (name, numbers) in enumerate(values.items()):
-        axes = figure.add_subplot(grid[place], facecolor=_BACK)
+        axes = figure.add_subplot(grid[place], facecolor=BACK)
         colours = [tuple((np.array(colour) / 255).tolist()) for colour in DOMAINS.values()]
         axes.hist([numbers[~marked], numbers[marked]], bins=60, stacked=True, color=colours)
         axes.set_yscale("symlog", linthresh=1)  # keeps a single scan among thousands visible
-        _style_axes(axes, name, "\n".join(wrap(meanings[name], 52)), "" if place % columns else "scans")
+        style_axes(axes, name, "\n".join(wrap(meanings[name], 52)), "" if place % columns else "scans")
     return figure
 
 
@@ -153,15 +153,15 @@ def caption(scan: Scan, short: bool = False) -> str:
     return f"{scan.id or 'scan'}   ·   {scan.sensor.name}   ·   {domain}   ·   {len(scan):,} points"
 
 
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor=_BACK)
+def new_figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor=BACK)
     FigureCanvasAgg(figure)
     return figure
 
 
 def _write_head(figure: Figure, text: str, x: float, y: float) -> None:
     """Write a heading; names of scans may hold "$", which is no formula."""
-    figure.text(x, y, text, color=_INK, fontsize=15, va="center", parse_math=False)
+    figure.text(x, y, text, color=INK, fontsize=15, va="center", parse_math=False)
 
 
 def _show_pixels(axes: Any, pixels: Any) -> None:
@@ -169,11 +169,11 @@ def _show_pixels(axes: Any, pixels: Any) -> None:
     axes.set_axis_off()
 
 
-def _style_axes(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
-    axes.set_title(title, color=_INK, fontsize=11, loc="left")
-    axes.set_xlabel(xlabel, color=_DIM, fontsize=9)
-    axes.set_ylabel(ylabel, color=_DIM, fontsize=9)
-    axes.tick_params(colors=_DIM, labelsize=8, length=3)
+def style_axes(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
+    axes.set_title(title, color=INK, fontsize=11, loc="left")
+    axes.set_xlabel(xlabel, color=DIM, fontsize=9)
+    axes.set_ylabel(ylabel, color=DIM, fontsize=9)
+    axes.tick_params(colors=DIM, labelsize=8, length=3)
     for spine in axes.spines.values():
         spine.set_color("#3a3f4b")
 
@@ -182,19 +182,19 @@ def _colour_bar(axes: Any, scale: Scale) -> None:
     """A colour bar at the right edge of the axes."""
     values = ScalarMappable(PowerNorm(scale.gamma, scale.low, scale.high), ListedColormap(scale.table / 255))
     bar = axes.figure.colorbar(values, cax=axes.inset_axes((1.008, 0, 0.011, 1), transform=axes.transAxes))
-    bar.ax.tick_params(colors=_DIM, labelsize=8, length=2)
+    bar.ax.tick_params(colors=DIM, labelsize=8, length=2)
     bar.outline.set_edgecolor("#3a3f4b")
 
 
 def _perspective(axes: Any, view: View, by: str, scale: Scale, camera: Camera | None) -> None:
     _show_pixels(axes, render(view.scan, by, camera=camera, size=(1020, 620), scale=scale))
-    axes.set_title(f"3-D, coloured by {scale.title}; circles every 10 m", color=_INK, fontsize=11, loc="left")
+    axes.set_title(f"3-D, coloured by {scale.title}; circles every 10 m", color=INK, fontsize=11, loc="left")
 
 
 def _from_above(axes: Any, view: View, scale: Scale, extent: float) -> None:
     pixels = render(view.scan, "height", camera=bird(extent), size=(600, 600), scale=scale)
     axes.imshow(pixels, extent=(extent, -extent, -extent, extent), interpolation="antialiased")
-    _style_axes(axes, f"from above, coloured by {scale.title}", "y, to the left (m)", "x, ahead (m)")
+    style_axes(axes, f"from above, coloured by {scale.title}", "y, to the left (m)", "x, ahead (m)")
     _colour_bar(axes, scale)
 
 
@@ -204,7 +204,7 @@ def _image(axes: Any, view: View, channel: str, scale: Scale) -> None:
         picture(view.image, channel, scale), aspect="auto", interpolation="nearest",
         extent=(-180, 180, sensor.shape[0], 0),
     )  # fmt: skip
-    _style_axes(axes, scale.title, "", "row")
+    style_axes(axes, scale.title, "", "row")
     names = ["behind", "-135°", "left", "-45°", "ahead", "45°", "right", "135°", "behind"]
     axes.set_xticks(range(-180, 181, 45), names)
     if not scale.classes:
@@ -220,7 +220,7 @@ def _legend(figure: Figure, all_views: Sequence[View], table: Rgb) -> None:
         if count
     ]
     columns = min(max(1, len(entries)), _per_row(figure.get_figwidth()))
-    figure.legend(handles=entries, loc="lower center", ncols=columns, frameon=False, labelcolor=_INK, fontsize=9)
+    figure.legend(handles=entries, loc="lower center", ncols=columns, frameon=False, labelcolor=INK, fontsize=9)
 
 
 def _per_row(width: float) -> int:

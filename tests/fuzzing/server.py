@@ -4,7 +4,8 @@ from multiprocessing import get_context
 from multiprocessing.context import ForkServerContext
 
 PRELOADED = [
-    "lidar_synth.formats.convert", "lidar_synth.generate.checkpoint", "lidar_synth.models", "lidar_synth.train.config",
+    "lidar_synth.formats.convert", "lidar_synth.generate.checkpoint", "lidar_synth.generate.models",
+    "lidar_synth.lab.train.config",
     "h5py", "hypothesis", "numba", "pytest", "yaml",
 ]  # fmt: skip
 """One list for all: a process has one server, which imports what was asked for when it started."""

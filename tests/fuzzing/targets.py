@@ -30,10 +30,10 @@ from lidar_synth.generate.checkpoint import (
     save_checkpoint,
     weights_hash,
 )
+from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.models import build_network
 
 SCANS = 8
 """A reader of a dataset reads this many of its scans at most."""

@@ -34,11 +34,11 @@ from lidar_synth.bank import Bank, Encoding, Entry, Facts, Index, ShardWriter
 from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
 from lidar_synth.files.disk import sha256
 from lidar_synth.formats.points import read_points
-from lidar_synth.generate.generator import load_generator
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.town import Town
+from lidar_synth.lab.town import Town
 
 SHARD, LARGE = 64, 1024
 """Scans of a shard: of banks of the town, and of the tree of files."""

@@ -19,9 +19,9 @@ from networks import EVALUATION, GRID, full_network
 from timing import machine
 from tqdm import tqdm
 
-from lidar_synth.flow.solvers import solve
 from lidar_synth.generate.devices import checked_device
-from lidar_synth.generate.generator import load_generator
+from lidar_synth.generate.flow.solvers import solve
+from lidar_synth.generate.loading import load_generator
 
 Call = Callable[[], object]
 

@@ -3,8 +3,8 @@
     python tools/bench/label.py [--scans 200] [--seed 3] [--interval 0.4] [--points 10000000]
 
 Right: a town is exported with accumulated clouds, which hold every second frame and have errors of the poses
-(lidar_synth/town/accumulate.py); labels are recovered and compared with the known ones, for frames that the clouds hold
-and for frames that they do not hold. The target is 97 % of the labelled points and 90 % of moving cars.
+(lidar_synth/lab/town/accumulate.py); labels are recovered and compared with the known ones, for frames that the
+clouds hold and for frames that they do not hold. The target is 97 % of the labelled points and 90 % of moving cars.
 
 Speed: processor time of the whole run, with reading and writing. The target is 20 scans per second on 2 cores. Windows
 of KITTI-360 have about 10 million points, those of the town 300,000; so a window is filled up to ``--points`` by copies
@@ -26,11 +26,11 @@ from timing import machine
 
 from lidar_synth import KITTI360
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.formats.kitti360_accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
-from lidar_synth.formats.kitti360_labels import label_scans
-from lidar_synth.formats.label_report import LabelReport
-from lidar_synth.town import Town, export_town
-from lidar_synth.town.accumulate import STEP
+from lidar_synth.lab.kitti360.accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
+from lidar_synth.lab.kitti360.labels import label_scans
+from lidar_synth.lab.kitti360.report import LabelReport
+from lidar_synth.lab.town import Town, export_town
+from lidar_synth.lab.town.accumulate import STEP
 
 COPY = 0.04
 """Standard deviation, metres, by which the copies of a point are moved."""

@@ -15,8 +15,8 @@ import torch
 from timing import print_table, time_in_turns
 from torch import nn
 
-from lidar_synth.generate.generator import load_generator
-from lidar_synth.models import assemble, build_network
+from lidar_synth.generate.loading import load_generator
+from lidar_synth.generate.models import assemble, build_network
 
 
 def network(architecture: str, **arguments: Any) -> Any:

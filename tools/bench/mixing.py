@@ -26,9 +26,9 @@ from lidar_synth.files.disk import sha256
 from lidar_synth.formats import WRITERS, SemanticKITTI
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.town import Town
 from lidar_synth.mixing import MixedScans, to_item
 from lidar_synth.noise import keyed_rng
-from lidar_synth.town import Town
 
 BATCH = 4
 

@@ -24,11 +24,11 @@ from torch import Tensor, nn
 from torch.profiler import ProfilerActivity, profile
 from tqdm import tqdm
 
-from lidar_synth.flow.solvers import solve
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint
+from lidar_synth.generate.flow.solvers import solve
+from lidar_synth.generate.models.hdit.hdit import HDiT
 from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.models.hdit.hdit import HDiT
 
 EVALUATION = 156.4e9
 """Floating point operations of one evaluation: 153.1e9 in linear layers, the rest in attention."""

@@ -18,9 +18,9 @@ from dataclasses import replace
 import numpy as np
 from timing import machine
 
-from lidar_synth.town import STRETCH_FRAMES, Town, load_skin
-from lidar_synth.town.solid import Solid
-from lidar_synth.town.world import build_world
+from lidar_synth.lab.town import STRETCH_FRAMES, Town, load_skin
+from lidar_synth.lab.town.solid import Solid
+from lidar_synth.lab.town.world import build_world
 
 
 def make(stretches: list[int]) -> tuple[float, float]:

@@ -45,7 +45,7 @@ def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
 
     from lidar_synth.formats import WRITERS
     from lidar_synth.formats.convert import convert
-    from lidar_synth.town import Town, export_town
+    from lidar_synth.lab.town import Town, export_town
 
     export_town(Town(seed=1, scans=SCANS), root / "real", "semantic_kitti", camera=False, progress=False)
     convert(Town(seed=2, scans=SCANS), WRITERS["npz"](root / "synthetic"), progress=False)

@@ -5,9 +5,9 @@ from pathlib import Path
 import torch
 
 from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec, save_checkpoint
+from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.models import build_network
 
 
 def write_untrained(path: Path) -> Path:

@@ -15,7 +15,7 @@ from detector.bev import CHANNELS, REGRESSED, Found, Target, decode, targets, vi
 from detector.classes import CLASSES
 from detector.pools import classes_of, detected
 from lidar_synth import Scan
-from lidar_synth.train.precision import faster_in_bfloat16
+from lidar_synth.lab.train.precision import faster_in_bfloat16
 
 PIXEL = 0.8
 """Side of a pixel of the output, metres."""

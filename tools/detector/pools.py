@@ -10,8 +10,8 @@ from tqdm import tqdm
 from detector.classes import CLASS_OF, LEAST
 from lidar_synth import Boxes, Scan, Source, Town, load_generator, open_scans
 from lidar_synth.formats.npz import write_scan
+from lidar_synth.lab.town import STRETCH_FRAMES
 from lidar_synth.labels.edit import closed
-from lidar_synth.town import STRETCH_FRAMES
 
 SENSOR = "hdl64e_lasers"
 FRAMES = (4, 10, 16)

@@ -14,7 +14,7 @@ from detector.bev import REACH, Found
 from detector.classes import LEAST
 from detector.pools import classes_of, detected, points_in
 from lidar_synth import Boxes, Scan
-from lidar_synth.evaluate.detection import average_precision
+from lidar_synth.lab.evaluate.detection import average_precision
 
 OVERLAP = (0.5, 0.25, 0.25)
 """Minimum intersection over union of the footprints of cars, pedestrians and cyclists."""

@@ -16,8 +16,8 @@ from typer.main import get_command
 
 import lidar_synth
 from lidar_synth.cli import COMMANDS, app
-from lidar_synth.train.autoencoder import Losses
-from lidar_synth.train.config import (
+from lidar_synth.lab.train.autoencoder import Losses
+from lidar_synth.lab.train.config import (
     Condition,
     Data,
     DistillConfig,
@@ -31,7 +31,7 @@ from lidar_synth.train.config import (
     published,
     published_models,
 )
-from lidar_synth.train.state import Recipe
+from lidar_synth.lab.train.state import Recipe
 
 TOPICS = {
     "geometry": "Scans and range images",
@@ -40,9 +40,10 @@ TOPICS = {
     "generate": "Generating",
     "mixing": "Mixing",
     "labels": "Labels",
-    "train": "Training",
-    "proof": "Proof",
-    "town": "The town",
+    "lab.fitting": "Sensors from scans",
+    "lab.train": "Training",
+    "lab.proof": "Proof",
+    "lab.town": "The town",
     "errors": "Errors",
 }
 """Headings of the API by the package's folder in which a name lies."""
@@ -54,7 +55,7 @@ FURTHER = (
     "lidar_synth.geometry.transfer.mount.Mount",
     "lidar_synth.geometry.transfer.returns.Measurement",
     "lidar_synth.geometry.transfer.response.Response",
-    "lidar_synth.mixing.synthetic.Generated",
+    "lidar_synth.generate.generator.Generated",
     "lidar_synth.mixing.items.to_item",
     "lidar_synth.mixing.collate.Collate",
     "lidar_synth.labels.augment",
@@ -64,13 +65,13 @@ FURTHER = (
     "lidar_synth.labels.edit.unboxed.measure",
     "lidar_synth.labels.edit.unboxed.closed",
     "lidar_synth.datasets.classes.Taxonomy",
-    "lidar_synth.evaluate.metric.Metric",
-    "lidar_synth.evaluate.comparison.evaluate",
-    "lidar_synth.evaluate.segmentation.load_judge",
-    "lidar_synth.train.runs.run",
-    "lidar_synth.train.config.load.load_config",
-    "lidar_synth.train.model_plan.plan_model",
-    "lidar_synth.train.models.train_model",
+    "lidar_synth.lab.evaluate.metric.Metric",
+    "lidar_synth.lab.evaluate.comparison.evaluate",
+    "lidar_synth.lab.evaluate.segmentation.load_judge",
+    "lidar_synth.lab.train.runs.run",
+    "lidar_synth.lab.train.config.load.load_config",
+    "lidar_synth.lab.train.model_plan.plan_model",
+    "lidar_synth.lab.train.models.train_model",
     "lidar_synth.viz.write_view",
 )
 """Names that pages use besides those of ``lidar_synth``."""
@@ -92,12 +93,17 @@ SECTIONS: dict[str, tuple[type, ...]] = {
 "models" = those of a model of several stages."""
 
 
+def topic_of(home: str) -> str:
+    """The heading of a module."""
+    return next(topic for folder, topic in TOPICS.items() if f"{home}.".startswith(f"{folder}."))
+
+
 def api() -> str:
     """Every public name under the heading of its topic."""
     topics: dict[str, list[str]] = {heading: [] for heading in TOPICS.values()}
     for name, home in lidar_synth._HOME.items():
         given = getattr(lidar_synth, name)
-        topics[TOPICS[home.partition(".")[0]]].append(f"{given.__module__}.{given.__qualname__}")
+        topics[topic_of(home)].append(f"{given.__module__}.{given.__qualname__}")
     topics["Further names"] = list(FURTHER)
     return "\n".join(f"## {topic}\n\n" + "\n".join(f"::: {n}\n" for n in names) for topic, names in topics.items())
 

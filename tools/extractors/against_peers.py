@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from random_archives import WRITERS, write
 from random_inputs import PER_SET, random_image, random_points, reduced, two_sets
 
-from lidar_synth.evaluate.distances import frechet_distance
-from lidar_synth.evaluate.extractors import EXTRACTORS, load_extractor
 from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import presets
+from lidar_synth.lab.evaluate.distances import frechet_distance
+from lidar_synth.lab.evaluate.extractors import EXTRACTORS, load_extractor
 
 Points = NDArray[np.float32]
 

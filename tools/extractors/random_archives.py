@@ -10,12 +10,12 @@ import torch
 import yaml
 from torch import nn
 
-from lidar_synth.evaluate.extractors.darknet import RangeNet
-from lidar_synth.evaluate.extractors.liploc import PREFIX
-from lidar_synth.evaluate.extractors.pointnet import PointNet
-from lidar_synth.evaluate.extractors.rangevit import build
-from lidar_synth.evaluate.extractors.squeezeseg import SqueezeSeg
-from lidar_synth.evaluate.extractors.voxel_networks import SPVCNN, MinkowskiNet
+from lidar_synth.lab.evaluate.extractors.darknet import RangeNet
+from lidar_synth.lab.evaluate.extractors.liploc import PREFIX
+from lidar_synth.lab.evaluate.extractors.pointnet import PointNet
+from lidar_synth.lab.evaluate.extractors.rangevit import build
+from lidar_synth.lab.evaluate.extractors.squeezeseg import SqueezeSeg
+from lidar_synth.lab.evaluate.extractors.voxel_networks import SPVCNN, MinkowskiNet
 
 MEANS, DEVIATIONS = [12.12, 10.88, 0.23, -1.04, 0.21], [12.32, 11.47, 6.91, 0.86, 0.16]
 RAW = [0, 10, 11, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81]

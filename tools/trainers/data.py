@@ -12,8 +12,8 @@ import sys
 from functools import cached_property
 from pathlib import Path
 
+from lidar_synth.lab.town import STRETCH_FRAMES, Town, export_town
 from lidar_synth.labels import ObjectBank
-from lidar_synth.town import STRETCH_FRAMES, Town, export_town
 
 TRAINING = tuple(f"{number:02d}" for number in (0, 1, 2, 3, 4, 5, 6, 7, 9, 10))
 VALIDATION = "08"

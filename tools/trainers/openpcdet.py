@@ -9,7 +9,7 @@ import yaml
 
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.convert import convert
-from lidar_synth.town import Town
+from lidar_synth.lab.town import Town
 from trainers.trial import Failed, Row, Trial
 
 TITLE = "OpenPCDet 0.6"

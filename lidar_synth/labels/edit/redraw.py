@@ -38,7 +38,7 @@ def open_model(model: "Generator | str | Path | None") -> Model:
 
 @lru_cache(maxsize=2)
 def _load(model: str) -> "Generator":
-    from lidar_synth.generate.generator import load_generator
+    from lidar_synth.generate.loading import load_generator
 
     return load_generator(model)
 

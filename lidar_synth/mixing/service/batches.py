@@ -15,8 +15,9 @@ import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.mixing import Generated, MixedScans
+from lidar_synth.mixing import MixedScans
 
 
 class Place(NamedTuple):

@@ -24,7 +24,8 @@ import numpy as np
 import torch
 
 from lidar_synth.errors import LidarSynthError
-from lidar_synth.generate.generator import Generator, load_generator
+from lidar_synth.generate.generator import Generator
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.mixing.service.ledger import Ledger, Slot, Starved
 from lidar_synth.mixing.service.slots import Slots
 

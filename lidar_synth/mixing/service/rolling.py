@@ -20,7 +20,7 @@ from typing_extensions import Self
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import read_header
-from lidar_synth.generate.generator import find_model
+from lidar_synth.generate.loading import find_model
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.mixing.service.client import Client

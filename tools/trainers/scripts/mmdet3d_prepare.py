@@ -26,8 +26,8 @@ from mmengine.config import Config
 
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.formats.convert import convert
+from lidar_synth.lab.town import Town
 from lidar_synth.labels import ObjectBank
-from lidar_synth.town import Town
 
 CONFIGS = Path(__file__).parents[3] / "configs" / "mmdet3d"
 MIX = {"ratio": 0.5, "seed": 0}

@@ -17,8 +17,8 @@ from PIL import Image
 from pyquaternion import Quaternion
 
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.town import Town
-from lidar_synth.town.world import STRETCH_FRAMES
+from lidar_synth.lab.town import Town
+from lidar_synth.lab.town.world import STRETCH_FRAMES
 
 VERSION = "v1.0-mini"
 SCENES = ("scene-0061", "scene-0103")

@@ -1,0 +1,87 @@
+"""Work in several processes, with results in order, which Ctrl-C stops without a traceback of a worker."""
+
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_work: Callable[[Any], Any] | None = None
+_busy = _stopped = False
+
+
+def _start(work: Callable[[Any], Any]) -> None:
+    """Pass the function to a worker once, instead of with every item, and let Ctrl-C reach it from now on."""
+    global _work
+    _work = work
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupted)
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _interrupted(number: int, frame: Any) -> None:
+    """End a worker's items at Ctrl-C, which a terminal sends to every process. While it waits for items, an exception
+    would end it with a traceback; the main process ends it."""
+    global _stopped
+    _stopped = True
+    if _busy:
+        raise KeyboardInterrupt
+
+
+def _next(item: Any) -> Any:
+    global _busy
+    assert _work is not None, "a worker that was not started by in_processes"
+    _busy = True
+    try:
+        if _stopped:
+            raise KeyboardInterrupt
+        return _work(item)
+    finally:
+        _busy = False
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Defer Ctrl-C to the end of the block; processes that it starts do not get it before they ask for it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def in_processes(
+    work: Callable[[Item], Result], items: Sequence[Item], jobs: int, chunk: int = 1
+) -> Iterator[Iterator[Result]]:
+    """Map ``work`` over items in several processes, with results in order.
+
+    Args:
+        work: a function that can be pickled.
+        items: its arguments.
+        jobs: number of processes; 1 = this process.
+        chunk: number of items that a worker takes at a time.
+    """
+    if jobs == 1 or len(items) < 2:
+        yield map(work, items)
+        return
+    # Spawned, not forked: a fork would break threads of the parent (numba, torch). With one process per core, threads
+    # inside numpy would only compete for the cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
+        try:
+            with _without_interrupts():  # map starts the workers
+                results = pool.map(_next, items, chunksize=chunk)
+            yield results
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise

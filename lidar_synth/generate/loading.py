@@ -1,0 +1,103 @@
+"""Loading of generators: shipped models by name, checkpoints by path."""
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from lidar_synth.errors import ConfigError, DataError, suggest
+from lidar_synth.generate.checkpoint import CODEC, VELOCITY, has_checksum, join, load_checkpoint, read_header
+from lidar_synth.generate.devices import checked_device, refuse_worker
+from lidar_synth.generate.generator import BATCH, Generator
+
+SHIPPED = {
+    "town": "2d8d08119dc4a1c0002040ff47e66dea71bf87c7ae82d667c0ccfff15778202b",
+}
+"""Hashes of shipped checkpoints whose older format has no checksum of the header."""
+
+
+def load_generator(
+    model: str | Path,
+    *,
+    device: str | torch.device = "cpu",
+    dtype: torch.dtype = torch.float32,
+    compile: bool = False,
+    batch: int | None = None,
+    columns: int | None = None,
+) -> Generator:
+    """Load a generator from a shipped model or a checkpoint file.
+
+    Args:
+        model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
+        device: an available device such as "cpu", "cuda" or "cuda:1"; see ``available_devices``.
+        dtype: dtype of the network's computations; states stay float32.
+        compile: whether to compile the velocity network and the decoder of a latent model with ``torch.compile``; the
+            first scan then takes long.
+        batch: number of scans computed at a time; by default it depends on the device.
+        columns: of the scans; a dense model generates half of its columns at about half of the decoder's cost.
+
+    Raises:
+        ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, or a number of columns that
+            the model cannot generate.
+        FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
+
+    Example:
+        >>> from lidar_synth import load_generator
+        >>> generator = load_generator("town")
+        >>> first, second = generator.scans(seed=0, indices=[0, 1])
+        >>> second.id, sorted(second.fields())
+        ('town/0/1', ['confidence', 'label', 'reflectance'])
+    """
+    refuse_worker(device)
+    device = checked_device(device)
+    path = find_model(model)
+    checkpoint = load_checkpoint(path, device)
+    if VELOCITY not in checkpoint.networks:
+        raise DataError(f"{path} is an autoencoder", "a model that generates", f"Train one with codec={path}.")
+    for network in checkpoint.networks.values():
+        network.to(dtype).requires_grad_(False)
+    if compile:
+        _compile(checkpoint.networks)
+    flow, autoencoder = join(checkpoint.networks), checkpoint.networks.get(CODEC)
+    size = batch or BATCH.get(device.type, 1)
+    return Generator(path.stem, flow, checkpoint.header, checkpoint.hash, size, autoencoder, columns)
+
+
+def _compile(networks: dict[str, nn.Module]) -> None:
+    """Compile the velocity network and the decoder, in place."""
+    networks[VELOCITY].compile()
+    if (autoencoder := networks.get(CODEC)) is not None:
+        # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``. Compiled for two widths at once,
+        # it gives infinite values (torch 2.13).
+        codec: Any = autoencoder
+        codec.decode = torch.compile(codec.decode, dynamic=False)
+
+
+def shipped_models() -> dict[str, Path]:
+    """The checkpoints that ship with the package: {name: path}."""
+    folder = Path(str(files("lidar_synth"))) / "weights"
+    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+
+
+def find_model(model: str | Path) -> Path:
+    """The checkpoint file of a shipped model, or the given path itself.
+
+    Raises:
+        ConfigError: on an unknown name.
+        FileError, DataError: if the shipped file cannot be read or is damaged.
+    """
+    shipped = shipped_models()
+    if (name := str(model)) in shipped:
+        if not has_checksum(shipped[name]) and read_header(shipped[name])[1] != SHIPPED.get(name):
+            raise DataError(
+                f"{shipped[name]} is not the {name!r} of this version", "an intact file", "Install it again."
+            )
+        return shipped[name]
+    path = Path(model)
+    if path.suffix != ".safetensors":
+        names = ", ".join(shipped) or "none in this installation"
+        expected = f"a shipped one ({names}) or a .safetensors file"
+        raise ConfigError(f"model {str(model)!r}", expected, suggest(model, shipped))
+    return path

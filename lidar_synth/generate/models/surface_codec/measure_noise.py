@@ -1,0 +1,115 @@
+"""How the noise of a codec's cells is divided: what differs from cell to cell, and what the cells of a patch share.
+
+The decoder predicts the distribution of every cell by itself. Neighbouring cells of a wall have the same error of the
+range and similar reflectances, leaves do not. Both follow from pairs of neighbouring cells of real images that show one
+surface: of Laplace distributed errors e, mean |e1 - e2| = 1.5 b, where b is the scale of what differs; the correlation
+of reflectances is that of their normal scores. The relief of plants follows from the correlation of errors at two
+distances along a row: at the longer one, only the wider field is correlated.
+"""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from lidar_synth.datasets.classes import TRAIN_ID
+from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
+from lidar_synth.generate.models.surface_codec.blocks import PATCH, from_patches, to_patches
+from lidar_synth.generate.models.surface_codec.relief import SPANS, correlation, to_normal
+from lidar_synth.generate.models.surface_codec.surfaces import Surfaces, normalised
+
+LEAST = 200
+"""Pairs of cells that a class needs; others keep the mean of all classes."""
+PLANTS = TRAIN_ID["vegetation"], TRAIN_ID["terrain"]
+"""Classes with relief: what does not fit a plane is part of them. Walls have doubt in its place."""
+LAGS = SPANS[0] // 2, SPANS[1] // 2
+"""Columns between the pairs of cells by which relief is measured."""
+_LARGEST = 4.0  # error of a range in scales: beyond it, the cell shows another surface
+_SURE = 1e-4
+
+
+@torch.no_grad()
+def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Tensor]], noise: float = 0.03) -> None:
+    """Set the noise of a codec from images.
+
+    Args:
+        network: the codec; its buffers are changed.
+        images: (1, C, H, W) tensors and their codes (1, H, W), int64.
+        noise: standard deviation of the noise on latents, as in training.
+    """
+    codes = len(network.roughness)
+    sums = torch.zeros(codes, 4, dtype=torch.float64)  # pairs, |e1 - e2|, products and squares of scores
+    relief = torch.zeros(codes, 1 + len(LAGS), 2, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    for x, code in images:
+        z = network.squeeze(x)
+        surfaces = network.describe(z + noise * torch.randn(z.shape, generator=generator))
+        distance, value = to_patches(x[:, :2], PATCH).unbind(1)
+        kinds = to_patches(code[:, None], PATCH)[:, 0]
+        error, score, surface = _scores(surfaces, distance, value, kinds, network, generator)
+        left, right = (
+            [part.view(-1, *PATCH)[..., some] for part in (error, score, surface, kinds, distance)]
+            for some in (slice(0, -1), slice(1, None))
+        )
+        same = (left[2] == right[2]) & (left[3] == right[3]) & (left[4] > -1) & (right[4] > -1)
+        terms = [torch.ones_like(left[0]), (left[0] - right[0]).abs(), left[1] * right[1], left[1] ** 2]
+        for column, term in enumerate(terms):
+            sums[:, column] += torch.bincount(left[3][same], term[same].double(), codes)
+        whole = from_patches(torch.stack([error, kinds.float(), distance], 1), PATCH, network.resolution)
+        relief += _products(whole[:, 0], whole[:, 1], whole[:, 2], codes)
+    total, known = sums.sum(0), sums[:, 0] >= LEAST
+    network.roughness.copy_(torch.where(known, sums[:, 1] / sums[:, 0], total[1] / total[0]) / 1.5)
+    network.alike.copy_(torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95))
+    network.relief.copy_(_relief(relief))
+
+
+def _scores(
+    surfaces: Surfaces,
+    distance: Tensor,
+    value: Tensor,
+    kinds: Tensor,
+    network: SurfaceAutoencoder,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(N, P) errors of ranges in scales, normal scores of reflectances, and the surface that each cell shows."""
+    far = normalised(surfaces.inverse, network.normalisation)
+    fit = surfaces.weights - (distance[:, None] - far).abs() / surfaces.scale - surfaces.scale.log()
+    fit = fit + surfaces.classes.gather(2, kinds[:, None].expand(-1, far.shape[1], -1))
+    shown = fit.argmax(1)
+
+    def pick(part: Tensor) -> Tensor:
+        return part.expand(far.shape).gather(1, shown[:, None])[:, 0]
+
+    error = ((distance - pick(far)) / pick(surfaces.scale)).clamp(-_LARGEST, _LARGEST)
+    middle, spread, blank = (pick(part) for part in surfaces.reflectance)
+    zero = blank.sigmoid()
+    below = zero + (1 - zero) * torch.sigmoid((value - middle) / spread.exp())
+    some = torch.rand(value.shape, generator=generator)
+    return error, _normal(torch.where(value <= -1, below * some, below)), shown
+
+
+def _products(error: Tensor, kinds: Tensor, distance: Tensor, codes: int) -> Tensor:
+    """(C, 1 + lags, 2) sums of products of the errors (B, H, W) of two cells of a row that show one class, and their
+    number; the first lag is 0."""
+    sums = []
+    inside = (error.abs() < _LARGEST) & (distance > -1)
+    for lag in (0, *LAGS):
+        same = inside & inside.roll(-lag, -1) & (kinds == kinds.roll(-lag, -1))
+        products, of = (error * error.roll(-lag, -1))[same].double(), kinds[same].long()
+        sums.append(torch.stack([torch.bincount(of, products, codes), torch.bincount(of, minlength=codes)], 1))
+    return torch.stack(sums, 1)
+
+
+def _relief(sums: Tensor) -> Tensor:
+    """(C, 2) factors of the fields, from the sums of ``_products``."""
+    square, near, far = (sums[..., 0] / sums[..., 1].clamp_min(1)).unbind(1)
+    wide = torch.minimum((far / correlation(SPANS[1], LAGS[1])).clamp_min(0), square)
+    narrow = (near - wide * correlation(SPANS[1], LAGS[0])) / correlation(SPANS[0], LAGS[0])
+    factors = torch.stack([torch.minimum(narrow.clamp_min(0), square - wide), wide], 1).sqrt()
+    plants = torch.zeros(len(factors), 1, dtype=torch.float64)
+    plants[list(PLANTS)] = 1
+    return factors * plants * (sums[:, :1, 1] >= LEAST)
+
+
+def _normal(share: Tensor) -> Tensor:
+    return to_normal(share.clamp(_SURE, 1 - _SURE))

@@ -1,0 +1,92 @@
+"""``lidar-synth sensor``: sensors fitted to scans."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lidar_synth.cli.options import Reading, only_given, options_from
+
+if TYPE_CHECKING:
+    from lidar_synth.lab.fitting import SensorFit
+
+
+@options_from(Reading, after="scans")
+def fit_from_scans(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="file, folder or root of a dataset with scans")],
+    out: Annotated[Path, typer.Option(help="YAML file to write, for --sensor of any command")],
+    scans: Annotated[int, typer.Option(min=1, max=20, help="number of scans to use, evenly spaced")] = 8,
+    columns: Annotated[int | None, typer.Option(help="columns of the range images [from the firings]")] = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG file to write with a plot of the fit")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    **reading: Any,
+) -> None:
+    """Fits a sensor to scans: elevation and azimuth offset of each beam, firings, range limits, quantisation.
+
+    The points may be raw or motion compensated, complete or cropped, in the frame of the sensor or of the vehicle. If
+    they lie on no beams, the fit fails (exit status 1) and writes nothing.
+
+    \b
+    Examples:
+      lidar-synth sensor fit my_scans --out my.yaml
+      lidar-synth sensor fit my_scans --out my.yaml --scans 20 --picture fit.png
+      lidar-synth sensor fit logs --out my.yaml --reflectance-max 255 --on-bad drop-points
+      lidar-synth town streets --sensor my.yaml --scans 10 --no-camera
+    """
+    import json
+
+    import numpy as np
+
+    from lidar_synth.errors import ConfigError
+    from lidar_synth.files.disk import write_file
+    from lidar_synth.formats import open_scans
+    from lidar_synth.geometry.sensor import sensor_yaml
+    from lidar_synth.lab.fitting import fit_sensor
+
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"--out {out}", "a file that ends in .yaml")
+    if picture is not None and picture.suffix != ".png":
+        raise ConfigError(f"--picture {picture}", "a file that ends in .png")
+    source = open_scans(path, **only_given(reading))
+    source.skip_sensor_check()
+    chosen = np.unique(np.linspace(0, len(source) - 1, min(scans, len(source))).round().astype(int))
+    found = fit_sensor([source[int(index)] for index in chosen], name=out.stem, columns=columns)
+    write_file(out, sensor_yaml(found.sensor).encode())
+    if picture is not None:
+        from lidar_synth.lab.fitting.picture import fit_figure
+
+        figure = fit_figure(found)
+        write_file(picture, lambda file: figure.savefig(file, format="png"))
+    if as_json:
+        typer.echo(json.dumps({**_values(found), "sensor": found.sensor.to_dict()}, indent=1))
+        return
+    for name, value in _values(found).items():
+        typer.echo(f"{name:<22}{value}")
+    typer.echo(f"{out}: written")
+
+
+def _values(found: "SensorFit") -> dict[str, object]:
+    """What the fit found, and how sure it is, as plain values."""
+    import numpy as np
+
+    sensor, (x, y, z) = found.sensor, found.mount[:3, 3]
+    elevations = sensor.elevations or ()
+    tilt = float(np.degrees(np.arccos(np.clip(found.mount[2, 2], -1, 1))))
+    return {
+        "beams": f"{len(elevations)}, from {elevations[0]:.2f} to {elevations[-1]:.2f} degrees",
+        "looks like": found.vendor or "no sensor of the table of vendors",
+        "rings from": found.source,
+        "points on a beam": f"{found.share:.1%} within 0.05 degrees; the worst beam {found.within.min():.1%}",
+        "spread of a beam": f"{np.median(found.spread):.4f} degrees (median)",
+        "place of the sensor": f"{x:.3f}, {y:.3f}, {z:.3f} m in the frame of the points, tilted {tilt:.2f} degrees",
+        "firings per turn": f"{sensor.firings or 'not known'}",
+        "azimuth offsets": f"known by {found.azimuths.known}" if found.azimuths.known else "not known",
+        "ranges": f"{found.nearest:.2f} to {found.farthest:.2f} m"
+        + (f", in steps of {1000 * sensor.range_step:.0f} mm" if sensor.range_step else ""),
+        "reflectance": f"{sensor.reflectance_levels} levels" if sensor.reflectance_levels else "not in equal steps",
+        "uncertain": " ".join(found.uncertain) or "nothing",
+    }
+
+
+sensor = typer.Typer(name="sensor", help="Fits a sensor to scans.", no_args_is_help=True)
+sensor.command("fit")(fit_from_scans)

@@ -1,0 +1,67 @@
+"""``lidar-synth skin``: learn the look of a sensor's returns from real scans, and describe it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+skin = typer.Typer(
+    name="skin", help="The look of a real sensor's returns, for the town: fit, show.", no_args_is_help=True
+)
+
+
+@skin.command("fit")
+def fit_from_scans(
+    scans: Annotated[
+        Path, typer.Argument(metavar="SCANS", help="real scans of one sensor, in any layout that is read")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="file to write; its name ends in .skin")],
+    licence: Annotated[str, typer.Option(help="licence of the scans, which the file states")],
+    sensor: Annotated[str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")] = None,
+    most: Annotated[int, typer.Option(min=5, help="number of scans to learn from, evenly spaced")] = 100,
+    streets: Annotated[int, typer.Option(min=1, help="streets of the town that they are compared with")] = 32,
+    lasers: Annotated[bool, typer.Option(help="give each laser its own offset of reflectance")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the town that they are compared with")] = 0,
+) -> None:
+    """Learns a skin from 20 to 100 real scans, in some minutes; labels are not used.
+
+    \b
+    Example:
+      lidar-synth skin fit my_scans --out my.skin --licence "CC BY 4.0"
+    """
+    from lidar_synth.errors import ConfigError
+    from lidar_synth.formats import open_scans
+    from lidar_synth.lab.town import fit_skin
+
+    if out.suffix != ".skin":
+        raise ConfigError(f"--out {out}", "a name that ends in .skin")
+    source = open_scans(scans, sensor=sensor)
+    count = min(most, len(source))
+    picked = [source[i * len(source) // count] for i in range(count)]
+    learnt = fit_skin(picked, licence=licence, source=scans.name, seed=seed, streets=streets, lasers=lasers)
+    learnt.save(out)
+    print(f"{out}: learnt from {count} scans of {learnt.sensor.name}")
+
+
+@skin.command("show")
+def show(
+    file: Annotated[str, typer.Argument(metavar="SKIN", help="a shipped skin by name, or a file")],
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+) -> None:
+    """Describes a skin: sensor, scans, licence, and what it changes.
+
+    \b
+    Examples:
+      lidar-synth skin show pandar64
+      lidar-synth skin show my.skin --json
+    """
+    import json
+
+    from lidar_synth.lab.town import load_skin
+
+    values = load_skin(file).summary()
+    if as_json:
+        print(json.dumps(values, indent=1))
+        return
+    for name, value in values.items():
+        print(f"{name:<32}{value}")

@@ -1,0 +1,111 @@
+"""Two sets of scans compared by a named protocol, and by the features of any extractor."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+from tqdm import tqdm
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.evaluate.cache import extract_all
+from lidar_synth.lab.evaluate.features import Extractor, find_weights, published
+from lidar_synth.lab.evaluate.metric import Metric, Score, choice
+from lidar_synth.lab.evaluate.protocols import Protocol, find_protocol
+
+
+def evaluate(
+    real: Source,
+    generated: Source,
+    protocol: str | Protocol,
+    extractors: Mapping[str, Extractor] | None = None,
+    batch: int = 16,
+    progress: bool = True,
+    *,
+    weights: Path | None = None,
+    replicates: int = 0,
+    extended: bool = False,
+    any_sensor: bool = False,
+    cache: Path | None = None,
+    processes: int = 1,
+    left_out: dict[str, str] | None = None,
+) -> list[Score]:
+    """Compare two sets of scans.
+
+    Args:
+        real: real scans.
+        generated: generated scans.
+        protocol: a name of ``PROTOCOLS``, or a protocol.
+        extractors: feature extractors by name; each adds a Frechet distance and a squared maximum mean discrepancy.
+        batch: number of scans that extractors process at a time.
+        progress: whether to show a progress bar.
+        weights: folder with the published weights of the protocol's extractors; by default the one that
+            LIDAR_SYNTH_METRICS names. Measures without weights are left out.
+        replicates: resamples for a 95 % interval of each value; 0 = no intervals.
+        extended: add unbiased forms, precision, recall, density and coverage of all features.
+        any_sensor: whether to compare scans of sensors that differ.
+        cache: folder in which features of published weights are kept, by the hash of scan and weights.
+        processes: number of processes that extract these features; more than one need a ``cache``.
+        left_out: filled with {measure: why it was left out}.
+
+    Raises:
+        ConfigError: on an unknown protocol, or several processes without a cache.
+        DataError: on an empty set, a scan without returns in the protocol's area, or sensors that differ.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.lab.evaluate import evaluate
+        >>> scores = evaluate(Town(1, scans=2), Town(2, scans=2), "town", progress=False)
+        >>> [score.metric for score in scores]
+        ['BEV Jensen-Shannon distance', 'BEV maximum mean discrepancy']
+    """
+    rules = find_protocol(protocol)
+    if processes > 1:
+        _fill(rules, (real, generated), weights, cache, processes, batch)
+    metric = Metric(rules, extractors, weights, replicates, extended, any_sensor, batch, cache)
+    indices: Sequence[int] = range(len(real))
+    if not extractors and not metric.uses_weights and rules.limit is not None and len(real) > rules.limit:
+        indices = choice(len(real), rules.limit)
+    metric.update(_read(real, indices, "real", progress), real=True)
+    metric.update(_read(generated, range(len(generated)), "generated", progress), real=False)
+    scores = metric.scores()
+    if left_out is not None:
+        left_out |= metric.left_out
+    return scores
+
+
+def check_counts(protocol: Protocol, real: int, generated: int) -> None:
+    """Refuse sets that are smaller than those of the protocol's paper.
+
+    Raises:
+        DataError: with fewer scans.
+    """
+    for name, count, least in (("real", real, protocol.needs.real), ("generated", generated, protocol.needs.generated)):
+        if least is not None and count < least:
+            raise DataError(
+                f"{count} {name} scans", f"{least}, as the {protocol.name} protocol compares them",
+                "--anyway measures them; the figures do not stand beside the paper's.",
+            )  # fmt: skip
+
+
+def _fill(
+    protocol: Protocol,
+    sets: tuple[Source, Source],
+    weights: Path | None,
+    cache: Path | None,
+    processes: int,
+    batch: int,
+) -> None:
+    """Extract the features of both sets into the cache by several processes."""
+    if cache is None:
+        raise ConfigError(f"{processes} processes without a cache", "a folder that they share", "Add --cache FOLDER.")
+    for measure in protocol.measures.values():
+        path = find_weights(measure.extractor, weights) if measure.extractor else None
+        if path is not None:
+            for source, generated in zip(sets, (False, True), strict=True):
+                extract_all(partial(published, measure, path, cache), source, processes, batch, (generated,))
+
+
+def _read(source: Source, indices: Sequence[int], name: str, progress: bool) -> Iterator[Scan]:
+    for i in tqdm(indices, desc=f"{name} scans", disable=not progress):
+        yield source[i]

@@ -1,0 +1,176 @@
+"""Detection of data leakage: the recordings a model was trained on, and their overlap with evaluation data.
+
+A checkpoint's provenance lists under ``seen`` all recordings that influenced its weights: its own training data and
+those of its teacher, its initial weights and its autoencoder. Provenances of version 0.1.0 have no ``seen`` but a split
+or a path; a split with known drives is replaced by these drives, a path is kept as a path.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.bank import Bank
+from lidar_synth.datasets.recordings import (
+    CONTENT,
+    FILES,
+    KITTI,
+    KITTI360,
+    KITTI360_SPLITS,
+    KITTI_OBJECT,
+    PLACES,
+    TOWN,
+    Recordings,
+    frames_of,
+    whole,
+)
+from lidar_synth.files.parsing import read_facts
+from lidar_synth.formats import BankScans
+from lidar_synth.formats.models import models_of
+from lidar_synth.formats.semantic_kitti import SPLITS as SEMANTIC_KITTI_SPLITS
+from lidar_synth.formats.source import ScanFiles
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.lab.importers import lidm
+from lidar_synth.lab.town.export import SETTINGS
+
+
+def seen_by(provenance: Mapping[str, Any]) -> Recordings:
+    """All recordings that influenced weights, also through teachers, initial weights and autoencoders.
+
+    Raises:
+        DataError: on invalid recordings.
+    """
+    own = Recordings.from_list(provenance["seen"]) if "seen" in provenance else _older(provenance)
+    return own | inherited(provenance)
+
+
+def inherited(provenance: Mapping[str, Any]) -> Recordings:
+    """The recordings behind the checkpoints from which weights were made; raises as ``seen_by``."""
+    seen = Recordings()
+    for key, value in provenance.items():
+        if key.endswith("_provenance") and isinstance(value, Mapping):
+            seen |= seen_by(value)
+    return seen
+
+
+def seen_by_model_of(path: Path, source: ScanFiles | None = None) -> Recordings | None:
+    """The training data of the model that generated scans; empty if it is not known, None if no model did.
+
+    Args:
+        path: a folder of ``lidar-synth sample``, a bank, or a folder into which such scans were converted.
+        source: its scans; the first one may say that a model made it, where nothing beside the scans does.
+
+    Raises:
+        FileError, DataError: if what stands beside them is damaged.
+    """
+    if models := models_of(path):
+        return _of_models(models)
+    by_model = source is not None and next(iter(source)).provenance.get("made_by") == "model"
+    return Recordings() if by_model else None
+
+
+def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recordings:
+    """The recordings in a source on disk.
+
+    Args:
+        source: the result of ``open_scans``.
+        layout: its layout, a name of ``READERS``.
+        path: its path as given by the user; represents scans of an unknown dataset.
+
+    Raises:
+        FileError, DataError: if the settings of an exported town are damaged.
+    """
+    settings = Path(os.path.expandvars(path)) / SETTINGS
+    if settings.is_file():  # a town has the layout and the names of a dataset
+        return town(read_facts(settings, "the settings of a town").get("seed", 0))
+    made = next(iter(source)).provenance  # of all scans, or of the first one
+    if made.get("made_by") == "town":  # converted to another format
+        return town(made.get("seed", 0))
+    if isinstance(source, BankScans):  # includes the training data of its model
+        return whole(FILES, [str(path)]) | _of_bank(source.bank)
+    return frames_of(layout, source.ids) if layout in PLACES else whole(FILES, [str(path)])
+
+
+def measured(
+    source: ScanFiles, layout: str, path: Path, split: str | None, seen: Recordings | None = None
+) -> Recordings:
+    """The recordings of a reference, and its path: data on which an evaluated model must not have been trained.
+
+    The scans are read and hashed if the model has ``seen`` scans that only their hashes identify: these may lie in the
+    layout of any dataset now.
+    """
+    found = recordings_of(source, layout, path) | whole(FILES, [str(path)] + ([f"{path}#{split}"] if split else []))
+    hashed = seen is not None and any(dataset == CONTENT for dataset, _ in seen.drives)
+    return found | contents(map(content_of, source)) if hashed else found
+
+
+def content_of(scan: Scan) -> str:
+    """Hash of the points and the reflectance of a scan, which identifies it in any folder."""
+    digest = hashlib.sha256(np.ascontiguousarray(scan.points, np.float32).tobytes())
+    digest.update(np.ascontiguousarray(scan.reflectance, np.float32).tobytes())
+    return digest.hexdigest()[:32]
+
+
+def contents(hashes: Iterable[str]) -> Recordings:
+    """Scans that their hashes identify, see ``content_of``."""
+    return whole(CONTENT, hashes)
+
+
+def overlap(seen: Recordings, reference: Recordings) -> Recordings:
+    """The recordings of a reference on which a model was trained; paths are resolved before comparison."""
+    return _resolved(seen) & _resolved(reference)
+
+
+def undecided(seen: Recordings, reference: Recordings) -> bool:
+    """Whether one is from KITTI's object set and the other from the raw drives from which that was sampled."""
+    some, others = ({dataset for dataset, _ in part.drives} for part in (seen, reference))
+    return (KITTI in some and KITTI_OBJECT in others) or (KITTI_OBJECT in some and KITTI in others)
+
+
+def town(seed: int) -> Recordings:
+    """The town of a seed; the streets of its scans are the same in every layout."""
+    return whole(TOWN, [f"seed {seed}"])
+
+
+def _of_bank(bank: Bank) -> Recordings:
+    return _of_models(facts.provenance for facts in bank.index.sources)
+
+
+def _of_models(provenances: Iterable[Mapping[str, Any]]) -> Recordings:
+    seen = Recordings()
+    for provenance in provenances:
+        seen |= seen_by(provenance)
+    return seen
+
+
+def _older(provenance: Mapping[str, Any]) -> Recordings:
+    """The recordings of a provenance without ``seen``, from its split, town or path."""
+    if provenance.get("source") == lidm.SOURCE:
+        return lidm.seen(str(provenance.get("data")), generates=True)
+    data, split = provenance.get("data"), provenance.get("split")
+    layout, path = None, None
+    if isinstance(data, Mapping):
+        if data.get("town") is not None:
+            return town(data.get("seed", 0))
+        layout, path, split = data.get("layout"), data.get("path"), data.get("split")
+    elif data == "KITTI-360":
+        layout = "kitti360"
+    if layout in (None, "kitti360") and (drives := KITTI360_SPLITS.get(str(split))):
+        return whole(KITTI360, drives)
+    if layout == "semantic_kitti" and (drives := SEMANTIC_KITTI_SPLITS.get(str(split))):
+        return frames_of(layout, drives)
+    return whole(FILES, [f"{path}#{split}" if split else str(path)] if path else [])
+
+
+def _resolved(recordings: Recordings) -> Recordings:
+    """The recordings with resolved paths."""
+    result = Recordings()
+    for (dataset, drive), frames in recordings.drives.items():
+        if dataset == FILES:
+            path, mark, split = drive.partition("#")
+            drive = f"{Path(os.path.expandvars(path)).resolve()}{mark}{split}"
+        result |= Recordings({(dataset, drive): frames})
+    return result

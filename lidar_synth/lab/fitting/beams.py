@@ -1,0 +1,397 @@
+"""From points to beams: rings from the file, from the order of the points, or from peaks of the elevations."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.lines import CAP, Cloud, Model, nearest_beams, refine, residuals
+from lidar_synth.geometry.projection.rings import fault_of, ring_numbers
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.fitting.peaks import beam_peaks
+from lidar_synth.lab.fitting.search import REACH, find_motion, find_mount
+
+Floats = NDArray[np.float64]
+
+POINTS = 120_000
+"""Number of points that a fit uses; a choice between models uses a third of them."""
+
+NEAREST = 0.5
+"""Points nearer than this to the vertical axis are left out of the fit, metres."""
+
+WIDTHS = np.radians([0.02, 0.01, 0.04, 0.08])
+"""Smoothing widths that are tried to find the peaks."""
+
+GAIN = {"motion": 0.9, "mount": 0.9, "heights": 0.75}
+"""A part of the model is kept if it reduces the mean residual to less than this share."""
+
+GOOD = 0.9
+"""Quality above which no other mounting is looked for."""
+
+DOUBLE = np.radians(0.02)
+"""Two beams nearer than this are one."""
+
+POOR = 0.6
+"""Quality below which the mounting is not known well enough to look for the start of the turn."""
+
+SETTLING = 8
+"""Largest number of times that the steps of the last fit are repeated while they raise the quality."""
+
+GOOD_ENOUGH = 0.995
+"""Quality above which they are not."""
+
+STRAY = np.radians(0.06)
+"""Points farther than this from all beams may be those of a lost one."""
+
+WINDOW = np.radians(0.025)
+"""The points of a lost beam lie within this distance of it."""
+
+LOST = 15
+"""A lost beam has at least as many points."""
+
+ROUNDS = 3
+"""Number of times that peaks are looked for, each time with what is known of mounting and motion."""
+
+ONE_TURN = (0.7, 1.3)
+"""Turns by which the azimuth changes from the first to the last point of a file in the order of time."""
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Fitted beams with what they rest on.
+
+    Args:
+        model: beams, mounting and motion.
+        source: where the rings come from: "ring field", "order of the points" or "elevations".
+        parts: the parts of the model besides the elevations, of ``GAIN``.
+    """
+
+    model: Model
+    source: str
+    parts: frozenset[str]
+
+
+def gather(scans: Sequence[Scan]) -> Cloud:
+    """The points of all scans, without rings; scans without ``time`` get the fraction of the turn instead.
+
+    Raises:
+        DataError: without points, or with points that are not finite.
+    """
+    if not scans:
+        raise DataError("no scans", "at least one scan to fit a sensor to")
+    points = np.concatenate([scan.points for scan in scans]).astype(np.float64)
+    if not np.isfinite(points).all():
+        bad = next(scan.id for scan in scans if not np.isfinite(scan.points).all())
+        raise DataError(
+            f"scan {bad!r} with NaN or infinite points", "finite metres", "Read it with on_bad='drop-points'."
+        )
+    number = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
+    if all(scan.time is not None for scan in scans):
+        time = np.concatenate([np.asarray(scan.time, np.float64) for scan in scans])
+    else:
+        time = np.concatenate([turn_fraction(scan.points) for scan in scans])
+    return Cloud(points, number, time, np.full(len(points), -1))
+
+
+def turn_fraction(points: NDArray[np.float32]) -> Floats:
+    """(N,) fraction of the turn at which each point was measured, about -0.5 to 0.5.
+
+    The turn starts where the file does, if its points are in the order of time; otherwise behind the sensor.
+    """
+    if in_order_of_time(points):
+        unwrapped = _unwrapped(points)
+        return np.asarray(unwrapped - unwrapped.mean())
+    return np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / (2 * np.pi)
+
+
+def in_order_of_time(points: NDArray[np.float32]) -> bool:
+    """Whether the azimuth follows the order of the points around one turn."""
+    if not len(points):
+        return False
+    unwrapped = _unwrapped(points)
+    return bool(ONE_TURN[0] < abs(unwrapped[-1]) and np.ptp(unwrapped) < ONE_TURN[1])
+
+
+def _unwrapped(points: NDArray[np.float32]) -> Floats:
+    """(N,) turns from the first point, following the order of the points."""
+    azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / (2 * np.pi)
+    step = np.diff(azimuth, prepend=azimuth[0])
+    return np.asarray(np.cumsum(step - np.round(step)))
+
+
+def rings_of_file(scans: Sequence[Scan]) -> tuple[str, NDArray[np.int64] | None]:
+    """(N,) rings that the scans have, or that follow from their order; None if there are none."""
+    if all(scan.ring is not None for scan in scans):
+        return "ring field", np.concatenate([np.asarray(scan.ring, np.int64) for scan in scans])
+    found = [rings_in_order(scan.points) for scan in scans]
+    most = max((int(ring.max()) + 1 for ring in found if ring is not None and len(ring)), default=0)
+    # A scan with fewer rings is a crop; its rings have other numbers.
+    complete = [ring if ring is not None and len(ring) and ring.max() + 1 == most else None for ring in found]
+    if sum(ring is not None for ring in complete) <= len(scans) / 2:
+        return "elevations", None
+    given = [np.full(len(scan), -1) if ring is None else ring for scan, ring in zip(scans, complete, strict=True)]
+    return "order of the points", np.concatenate(given).astype(np.int64)
+
+
+def rings_in_order(points: NDArray[np.float32]) -> NDArray[np.int16] | None:
+    """(N,) rings of a scan in KITTI's order of points; None if it is in another order."""
+    ring = ring_numbers(points)
+    count = int(ring[-1]) + 1 if len(ring) else 0
+    if not 4 <= count <= 512:
+        return None
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).astype(np.float64))
+    bounds = np.flatnonzero(np.diff(ring)) + 1
+    middle = np.sort([np.median(part) for part in np.split(elevation, bounds)])[::-1]
+    try:
+        lasers = Sensor("rings", 2, 0.0, 1.0, elevations=tuple(middle))
+    except ConfigError:  # two rings with the same elevation
+        return None
+    return None if fault_of(points, ring, lasers) else ring
+
+
+def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud]:
+    """Fit beams, mounting and motion to scans.
+
+    Args:
+        scans: of one sensor.
+        seed: of the choice of points.
+
+    Returns:
+        The beams, None if there are fewer than two; and all points with their rings of the file, if there are any.
+
+    Raises:
+        DataError: without points, or with points that are not finite.
+    """
+    cloud = gather(scans)
+    source, ring = rings_of_file(scans)
+    cloud = replace(cloud, ring=cloud.ring if ring is None else ring, kept=ring is not None)
+    part = _without_gaps(_some_points(cloud, POINTS, seed))
+    still = Model(np.zeros(1), np.zeros(1), np.zeros(3), np.eye(3), np.zeros((len(scans), 6)))
+    best, quality = _attempt(part, still, seed)
+    if quality < GOOD:
+        offset, turn = find_mount([cloud.points[cloud.scan == scan] for scan in range(len(scans))], seed)
+        moved, better = _attempt(part, replace(still, offset=offset, turn=turn), seed, frozenset({"mount"}))
+        if better > quality:
+            best, quality = moved, better
+    if POOR < quality < GOOD and best and not cloud.kept and not any(scan.time is not None for scan in scans):
+        best = _with_another_seam(part, best, quality, seed)
+    return (Beams(best[0], source, best[1]) if best else None), cloud
+
+
+def _with_another_seam(
+    cloud: Cloud, best: tuple[Model, frozenset[str]], quality: float, seed: int
+) -> tuple[Model, frozenset[str]]:
+    """The best fit with turns that start behind the sensor, as before, or on another side of it."""
+    still = replace(best[0], motion=np.zeros_like(best[0].motion), tangents=np.zeros(1), heights=np.zeros(1))
+    for seam in (0.25, 0.5, 0.75):
+        turned = replace(cloud, time=(cloud.time + seam + 0.5) % 1.0 - 0.5)
+        other, better = _attempt(turned, still, seed, frozenset({"motion", "mount"}))
+        if other and better > quality:
+            best, quality = other, better
+    return best
+
+
+def _some_points(cloud: Cloud, count: int, seed: int) -> Cloud:
+    use = np.flatnonzero(np.hypot(cloud.points[:, 0], cloud.points[:, 1]) > NEAREST)
+    if cloud.kept:
+        use = use[cloud.ring[use] >= 0]
+    if len(use) > count:
+        use = np.sort(np.random.default_rng(seed).choice(use, count, replace=False))
+    return Cloud(cloud.points[use], cloud.scan[use], cloud.time[use], cloud.ring[use], cloud.kept)
+
+
+def _without_gaps(cloud: Cloud) -> Cloud:
+    """The cloud with rings of the file numbered 0, 1, ...: files may count from 1, and lasers may be dead."""
+    return replace(cloud, ring=np.unique(cloud.ring, return_inverse=True)[1]) if cloud.kept else cloud
+
+
+def _attempt(
+    cloud: Cloud, still: Model, seed: int, parts: frozenset[str] = frozenset()
+) -> tuple[tuple[Model, frozenset[str]] | None, float]:
+    """The best model from one mounting, its parts, and its quality."""
+    model = _from_rings(cloud, still) if cloud.kept else with_peaks(cloud, still)
+    if model is None:
+        return None, 0.0
+    few = _some_points(cloud, POINTS // 3, seed)
+    for _ in range(1 if cloud.kept else ROUNDS):
+        model, parts = _choose_parts(few, model, parts)
+        again = None if cloud.kept else with_peaks(cloud, model)
+        if again is None or len(again.tangents) == len(model.tangents):
+            break
+        model = again
+    if "motion" in parts:
+        model = _with_motion(cloud, model)
+    quality = 0.0
+    for _ in range(SETTLING):
+        model, fitted = refine(cloud, model, parts, 4)
+        before, quality = quality, quality_of(model, fitted)
+        if quality > GOOD_ENOUGH or quality - before < 0.001:
+            break
+    model = _without_doubles(model, fitted)
+    inside = bool((np.abs(model.offset) < np.array(REACH) + 0.5).all())
+    return (model, parts), quality if inside else 0.0
+
+
+def _without_doubles(model: Model, cloud: Cloud) -> Model:
+    """The model without beams that have met a stronger one on the same line."""
+    if cloud.kept:
+        return model
+    points = np.bincount(cloud.ring, minlength=len(model.tangents))
+    order = np.argsort(-model.tangents)
+    kept: list[int] = []
+    for beam in order.tolist():
+        if kept and np.arctan(model.tangents[kept[-1]]) - np.arctan(model.tangents[beam]) < DOUBLE:
+            kept[-1] = max(kept[-1], beam, key=lambda one: int(points[one]))
+        else:
+            kept.append(beam)
+    return replace(model, tangents=model.tangents[kept], heights=model.heights[kept])
+
+
+def quality_of(model: Model, cloud: Cloud) -> float:
+    """Share of points in the middle half between the borders of their beams; 0.5 for points anywhere."""
+    residual = residuals(model.aligned(cloud), cloud.ring, model.tangents, model.heights)
+    return float((np.abs(residual) < room_of(model.tangents)[cloud.ring] / 4).mean())
+
+
+def room_of(tangents: Floats) -> Floats:
+    """(B,) angle from each beam to the next one, the nearer of the two, radians."""
+    order = np.argsort(tangents)
+    gap = np.diff(np.arctan(tangents[order]))
+    room = np.empty(len(tangents))
+    room[order] = np.minimum(np.r_[gap, gap[-1]], np.r_[gap[0], gap])
+    return room
+
+
+def _choose_parts(cloud: Cloud, model: Model, parts: frozenset[str]) -> tuple[Model, frozenset[str]]:
+    """Add the part that reduces the residuals most, as long as one does so clearly."""
+    model, fitted = refine(cloud, model, parts, 5)
+    now = _score(model, fitted)
+    while others := [part for part in GAIN if part not in parts]:
+        trials = {
+            part: refine(cloud, _with_motion(cloud, model) if part == "motion" else model, parts | {part}, 8)
+            for part in others
+        }
+        scores = {part: _score(*trial) for part, trial in trials.items()}
+        part = min(scores, key=lambda name: scores[name] / GAIN[name])
+        if scores[part] >= GAIN[part] * now:
+            break
+        (model, _), parts, now = trials[part], parts | {part}, scores[part]
+    return model, parts
+
+
+def _with_motion(cloud: Cloud, model: Model) -> Model:
+    """The model with a new first guess of the motion of scans whose points lie off the beams."""
+    ring = cloud.ring if cloud.kept else nearest_beams(model.aligned(cloud), model.tangents, model.heights)
+    motion = model.motion.copy()
+    for scan in np.unique(cloud.scan):
+        use = cloud.scan == scan
+        part = Cloud(cloud.points[use], cloud.scan[use], cloud.time[use], ring[use], cloud.kept)
+        if quality_of(model, part) < GOOD:
+            motion[scan] = find_motion(part, model, scan)
+    return replace(model, motion=motion)
+
+
+def _score(model: Model, cloud: Cloud) -> float:
+    """The mean residual, capped, radians."""
+    residual = residuals(model.aligned(cloud), cloud.ring, model.tangents, model.heights)
+    return float(np.minimum(np.abs(residual), CAP).mean())
+
+
+def _from_rings(cloud: Cloud, still: Model) -> Model | None:
+    """A model with the median elevation of each ring; None without two rings."""
+    points = still.aligned(cloud)
+    order = np.argsort(cloud.ring, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(cloud.ring[order])) + 1)
+    if len(parts) < 2:
+        return None
+    tangents = np.zeros(int(cloud.ring.max()) + 1)
+    for part in parts:
+        tangents[cloud.ring[part[0]]] = np.median(points[part, 2] / np.hypot(points[part, 0], points[part, 1]))
+    return replace(still, tangents=tangents, heights=np.zeros(len(tangents)))
+
+
+def with_peaks(cloud: Cloud, model: Model) -> Model | None:
+    """The model with its beams found anew, as peaks of the elevations; None without two beams."""
+    points = model.aligned(cloud)
+    ring = nearest_beams(points, model.tangents, model.heights)
+    elevation = np.arctan2(points[:, 2] - model.heights[ring], np.hypot(points[:, 0], points[:, 1]))
+    found = [beam_peaks(elevation, width) for width in WIDTHS]
+    best = max(found, key=lambda beams: concentration(elevation, beams))
+    if len(best) < 2:
+        return None
+    nearest = np.abs(np.arctan(model.tangents)[None] - best[:, None]).argmin(1)
+    return replace(model, tangents=np.tan(best), heights=model.heights[nearest])
+
+
+def concentration(elevation: Floats, beams: Floats) -> float:
+    """Share of points in the middle half between the borders of their beams, 0.5 for points anywhere; 0 for no beams.
+
+    Args:
+        elevation: (N,) radians.
+        beams: (B,) radians, highest first.
+    """
+    if len(beams) < 2:
+        return 0.0
+    up = np.sort(beams)
+    border = (up[1:] + up[:-1]) / 2
+    ring = np.searchsorted(border, elevation)
+    gap = np.diff(up)
+    room = np.minimum(np.r_[gap, gap[-1]], np.r_[gap[0], gap])[ring]
+    distance = np.abs(elevation - up[ring])
+    near = distance < room / 2
+    return float((distance[near] < room[near] / 4).sum() / max(len(distance), 1))
+
+
+def with_lost_beams(model: Model, points: Floats) -> Model:
+    """The model with beams that have too few points to be peaks beside the others, such as those that see the sky.
+
+    A beam is found among the points beyond ``STRAY`` of all others: where they lie close together, with a valley
+    between them and the next beam on either side, so that the tail of a strong beam is none.
+
+    Args:
+        model: with beams in any order.
+        points: (N, 3) metres, in the sensor's frame.
+    """
+    ring = nearest_beams(points, model.tangents, model.heights)
+    rho, above = np.hypot(points[:, 0], points[:, 1]), points[:, 2] - model.heights[ring]
+    elevation = np.sort(np.arctan2(above, rho)[rho > NEAREST])
+    beams, heights = list(np.arctan(model.tangents)), list(model.heights)
+    stray = elevation[_distance(elevation, np.array(beams)) > STRAY]
+    while len(stray) >= LOST:
+        count = _count(stray, stray)
+        densest = stray[np.abs(stray - stray[int(np.argmax(count))]) < WINDOW]
+        place = float(np.median(densest))
+        if count.max() < LOST:
+            break
+        if _stands_alone(elevation, place, np.array(beams), int(count.max())):
+            heights.append(heights[int(np.abs(np.array(beams) - place).argmin())])
+            beams.append(place)
+        stray = stray[np.abs(stray - place) > STRAY]
+    return replace(model, tangents=np.tan(beams), heights=np.array(heights))
+
+
+def _distance(elevation: Floats, beams: Floats) -> Floats:
+    """(N,) radians from each elevation to the nearest beam."""
+    up = np.sort(beams)
+    nearest = np.searchsorted((up[1:] + up[:-1]) / 2, elevation)
+    return np.asarray(np.abs(elevation - up[nearest]))
+
+
+def _count(elevation: Floats, places: Floats) -> NDArray[np.intp]:
+    """Number of elevations (sorted) within ``WINDOW`` of each place."""
+    above = np.searchsorted(elevation, places + WINDOW)
+    return np.asarray(above - np.searchsorted(elevation, places - WINDOW), np.intp)
+
+
+def _stands_alone(elevation: Floats, place: float, beams: Floats, points: int) -> bool:
+    """Whether fewer than a third as many points lie somewhere between a place and the next beam on either side."""
+    for side in (1, -1):
+        gaps = side * (beams - place)
+        gap = min(gaps[gaps > 0], default=4 * STRAY)
+        between = place + side * np.linspace(WINDOW, min(gap, 4 * STRAY) - WINDOW, 16)
+        if gap < 3 * WINDOW or _count(elevation, between).min() >= points / 3:
+            return False
+    return True

@@ -1,0 +1,1 @@
+"""Labels per scan recovered for KITTI-360 from its accumulated clouds."""

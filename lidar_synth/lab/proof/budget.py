@@ -1,0 +1,106 @@
+"""How long a comparison takes, and what of it fits into a limit of time."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.lab.evaluate.segmenter import RangeSegmenter
+from lidar_synth.lab.proof.plan import Pair, ProofPlan
+from lidar_synth.lab.proof.pools import SKIN_STREETS
+from lidar_synth.lab.proof.settings import ProofSettings
+from lidar_synth.lab.train.precision import faster_in_bfloat16
+from lidar_synth.lab.train.segmentation import train_segmenter
+
+TOWN_SECONDS, SKIN_SECONDS, GENERATOR_SECONDS = 0.5, 1.5, 1.0
+"""Processor time for a scan of the town, a scan that a skin is learnt from, and a generated scan."""
+OVERHEAD = 1.3
+"""Time of a training over that of its steps: loading, tests, a busy machine."""
+
+
+def expected_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
+    """The time that some pairs take, with the pools that they need."""
+    settings, pools = plan.settings, {pool for row in plan.rows for pool in row.arm.pools()}
+    seconds = sum(map(plan.seconds, plan.rows)) * len(pairs)
+    for row in plan.rows:
+        if (stage := row.pretraining) is not None:
+            starts = len(pairs) if stage.pool == "skin" else len({seed for _, seed in pairs})
+            seconds += starts * stage.share * settings.iterations * plan.step
+    seconds *= OVERHEAD
+    town = settings.synthetic * TOWN_SECONDS
+    if "skin" in pools:
+        for place in {place for place, _ in pairs}:
+            scans = len(plan.skin_scans(place))
+            seconds += town + scans * SKIN_SECONDS + 2 * SKIN_STREETS * TOWN_SECONDS
+    seconds += town * ("town" in pools) + settings.synthetic * GENERATOR_SECONDS * ("generator" in pools)
+    return seconds / 60 / plan.jobs
+
+
+def within(plan: ProofPlan, minutes: float | None, resumed: bool = False) -> ProofPlan:
+    """The plan with as many pairs as fit into the time, or with two pairs of fewer iterations.
+
+    Args:
+        plan: of all pairs.
+        minutes: limit of the time; None for all pairs.
+        resumed: whether trainings with these iterations exist, so that they cannot be fewer.
+
+    Raises:
+        ConfigError: if two pairs do not fit even with ten iterations.
+    """
+    count = len(plan.pairs)
+    if minutes is not None:
+        while count > 0 and expected_minutes(plan, plan.pairs[:count]) > minutes:
+            count -= 1
+        least = min(2, len(plan.pairs))
+        if count < least and not resumed:
+            plan = _with_fewer_iterations(plan, least, minutes)
+        count = max(count, least)
+    pairs = plan.pairs[:count]
+    labelled = {pair: plan.labelled[pair] for pair in pairs}
+    return replace(plan, pairs=pairs, labelled=labelled, minutes=expected_minutes(plan, pairs))
+
+
+def _with_fewer_iterations(plan: ProofPlan, least: int, minutes: float) -> ProofPlan:
+    few = _most_iterations(plan, plan.pairs[:least], minutes)
+    if not few:
+        raise ConfigError(
+            f"{minutes:g} minutes, in which {least} places cannot be tested",
+            f"about {expected_minutes(plan, plan.pairs[:least]):.0f} or more",
+            "Give more --minutes or fewer arms (--arm).",
+        )
+    return replace(plan, settings=replace(plan.settings, iterations=few))
+
+
+def _most_iterations(plan: ProofPlan, pairs: Sequence[Pair], minutes: float) -> int:
+    """With how many iterations, a multiple of ten, some pairs fit into the time; 0 = none."""
+    for count in range(plan.settings.iterations // 10 * 10, 0, -10):
+        shorter = replace(plan, settings=replace(plan.settings, iterations=count))
+        if expected_minutes(shorter, pairs) <= minutes:
+            return count
+    return 0
+
+
+def measured_step(scans: list[Scan], settings: ProofSettings, half: bool | None) -> tuple[bool, float]:
+    """Whether bfloat16 is faster on this machine, and the seconds of an iteration."""
+    if settings.columns is None:
+        return False, 0.0
+    from lidar_synth.lab.proof.trial import images
+
+    sensor = scans[0].sensor
+    parts = images(scans, sensor)
+    batch = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    height = torch.from_numpy(np.sin(sensor.ray_angles()[0]))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    half = faster_in_bfloat16() if half is None else half
+    times: list[float] = []
+    train_segmenter(
+        RangeSegmenter(widths=settings.widths), [batch] * 4, height, 4, progress=False, half=half,
+        watch=lambda step: times.append(time.perf_counter()),
+    )  # fmt: skip
+    torch.set_num_threads(threads)
+    return half, float(np.diff(times).min())

@@ -1,0 +1,121 @@
+"""A trainer of your own as a command: it reads the mixture from a YAML file and writes predictions."""
+
+import shlex
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI, TRAIN_ID
+from lidar_synth.errors import ConfigError, DataError, ProcessError
+from lidar_synth.files.disk import read_values, write_file
+from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.lab.proof.arms import REAL, options_of
+from lidar_synth.lab.proof.pools import OBJECTS
+from lidar_synth.lab.proof.trial import Job
+from lidar_synth.labels import ObjectBank
+
+FIELD = "{job}"
+_TAIL = 2000
+
+
+@dataclass(frozen=True)
+class CommandTrainer:
+    """Trains by a command.
+
+    ``{job}`` in it stands for a YAML file with ``seed``, ``batch``, ``iterations``; ``real``, the folder of the
+    labelled scans; ``stages``, one after the other, each with ``iterations``, ``ratio``, ``synthetic`` (a folder, or
+    null), ``labels`` and ``label_options``, which are arguments of ``MixedScans``, and ``rate``, its learning rate as a
+    share of yours; ``held_out``, a folder of scans without labels; and ``predictions``, the folder to write one
+    ``NNNNNN.label`` to for each of them. All folders of scans have SemanticKITTI's layout, and predictions its values:
+    (N,) uint32, one for each point.
+
+    Args:
+        command: the words of the command, as a shell would split them.
+
+    Raises:
+        ConfigError: on a command without ``{job}``.
+    """
+
+    command: str
+
+    def __post_init__(self) -> None:
+        if FIELD not in self.command:
+            raise ConfigError(f"trainer {self.command!r}", f"a command with {FIELD}, such as 'python my.py {FIELD}'")
+
+    def __call__(self, job: Job) -> NDArray[np.int64]:
+        """(19, 19) confusion table of the predictions.
+
+        Raises:
+            ProcessError: if the command fails.
+            FileError, DataError: on missing or wrong predictions.
+        """
+        write_scans(job.real, job.folder / "real")
+        write_scans([replace(s, label=None, raw_label=None, instance=None) for s in job.held_out],
+                    job.folder / "held_out")  # fmt: skip
+        path = job.folder / "job.yaml"
+        write_file(path, yaml.safe_dump(describe(job), sort_keys=False).encode())
+        words = [word.replace(FIELD, str(path)) for word in shlex.split(self.command)]
+        try:
+            done = subprocess.run(words, capture_output=True, text=True, errors="replace")
+        except OSError as error:
+            raise ProcessError(f"trainer {words[0]!r} does not start ({error.strerror})", "a command") from error
+        if done.returncode:
+            raise ProcessError(
+                f"trainer {shlex.join(words)} ended with status {done.returncode}: "
+                f"{(done.stderr or done.stdout)[-_TAIL:].strip()}",
+                "status 0",
+            )
+        return _table(job.held_out, job.folder / "predictions")
+
+
+def describe(job: Job) -> dict[str, Any]:
+    """The plain values of a job, for its YAML file."""
+    stages = []
+    for stage, iterations in job.stages():
+        folder = job.folder / "real" if stage.pool == REAL else job.pool_folders.get(stage.pool)
+        options = options_of(stage, list(job.real), job.objects)
+        if isinstance(options.get("objects"), ObjectBank):
+            options["objects"] = str((job.pool_folders["skin"] / OBJECTS).resolve())
+        stages.append({
+            "iterations": iterations, "ratio": float(stage.ratio),
+            "synthetic": None if not stage.ratio or folder is None else str(folder.resolve()),
+            "labels": stage.labels, "label_options": options, "rate": stage.rate,
+        })  # fmt: skip
+    home = job.folder.resolve()
+    folders = {name: str(home / name) for name in ("real", "held_out", "predictions")}
+    plain = {"arm": job.row.key, "place": job.place, "seed": job.seed, "batch": job.batch}
+    return {**plain, "iterations": job.iterations, **folders, "stages": stages}
+
+
+def write_scans(scans: Sequence[Scan], folder: Path) -> None:
+    """Write scans in SemanticKITTI's layout, as sequence 00 from frame 0 on."""
+    writer = SemanticKITTIWriter(folder)
+    for index, scan in enumerate(scans):
+        writer.write(replace(scan, image_path=None), index, name=f"00/{index:06d}")
+    writer.finish()
+
+
+def _table(scans: Sequence[Scan], folder: Path) -> NDArray[np.int64]:
+    count = len(NAMES)
+    table = np.zeros((count, count), np.int64)
+    for index, scan in enumerate(scans):
+        path = folder / f"{index:06d}.label"
+        raw = read_values(path, "<u4")
+        assert scan.label is not None
+        if len(raw) != len(scan):
+            raise DataError(f"{path} with {len(raw)} predictions", f"{len(scan)}, one for each point")
+        predicted = SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16), str(path))
+        valid = scan.label != IGNORE
+        # A return without a prediction is an error: it counts as a class with which its own is never pooled.
+        wrong = np.where(scan.label == TRAIN_ID["road"], TRAIN_ID["car"], TRAIN_ID["road"])
+        given = np.where(predicted == IGNORE, wrong, predicted)
+        pairs = scan.label[valid].astype(np.int64) * count + given[valid]
+        table += np.bincount(pairs, minlength=count * count).reshape(count, count)
+    return table

@@ -1,0 +1,147 @@
+"""The page of a comparison: one HTML file that needs no network, for a reader who decides and does not train."""
+
+import html
+import re
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from lidar_synth.files.disk import write_file
+from lidar_synth.lab.proof.arms import BASE
+from lidar_synth.lab.proof.drawing import curves, differences
+from lidar_synth.lab.proof.summary import Proof, signed, span
+
+Values = Mapping[str, Any]
+
+
+def write_page(path: Path, proof: Proof) -> None:
+    """Write the page of a comparison.
+
+    Raises:
+        FileError: if it cannot be written.
+    """
+    template = files("lidar_synth.lab.proof").joinpath("page.html").read_text(encoding="utf-8")
+    write_file(path, template.replace("@body@", body(proof.values)).encode())
+
+
+def body(values: Values) -> str:
+    """The HTML of the page's content."""
+    first, _, rest = _sentences(values["headline"])
+    parts = [
+        f'<p class="headline">{_text(first)}</p>', f'<p class="more">{_text(rest)}</p>' if rest else "",
+        f"<p>{_text(what_was_done(values))}</p>",
+        _section("Change of the mIoU against real scans only", differences(values["arms"]), _DIFFERENCE),
+        _section("Table", _table(values)),
+        _section("During the training", curves(values["arms"]), "Mean mIoU on the places left out.")
+        if any(len(row["curve"]) > 1 for row in values["arms"]) else "",
+        _section("IoU by class, %", _classes(values), "Over all tested scans together. – : no label of this class."),
+        _section("By place: change of the mIoU", _places(values)),
+        _section("What was not tested", _list(values["limits"])),
+        _section("How it was measured", _list(protocol(values))),
+    ]  # fmt: skip
+    return "\n".join(filter(None, parts))
+
+
+_USES = "what it uses"
+_DIFFERENCE = (
+    "Percentage points. A dot is the mean over places and seeds, the bar its 95 % interval (bootstrap over places and "
+    "seeds). Where the bar crosses 0, the difference may be chance."
+)
+
+
+def what_was_done(values: Values) -> str:
+    """One paragraph for a reader who has never seen such a comparison."""
+    return (
+        f"The same small network was trained in {len(values['arms'])} ways on the same {values['labelled']} labelled "
+        f"scans, and tested on places that it had not seen: each of {len(values['tested_places'])} places was left out "
+        f"in turn, with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have the same iterations "
+        "and augmentation, unless the table says otherwise. mIoU is the mean over classes of the share of "
+        "correctly labelled returns (intersection over union)."
+    )
+
+
+def protocol(values: Values) -> list[str]:
+    """The facts that another person needs to repeat it."""
+    settings = values["settings"]
+    used = [f"{name} ({facts['scans']} scans, {facts['tested']} tested)" for name, facts in values["places"].items()]
+    return [
+        f"Places: {', '.join(used)}. Tested: {', '.join(values['tested_places'])}.",
+        f"Label budget: {values['labelled']} labelled scans in each training, from as many places as possible; another "
+        "choice with each place and seed. The table says what else an arm uses.",
+        f"Trainer: {values['trainer']}; {values['iterations']} iterations of {values['batch']} scans, grid of "
+        f"{settings['columns']} columns, {values['precision']}; turned and mirrored at random in all arms.",
+        f"Classes: {', '.join(values['classes'])}." + (f" Not in your labels: {', '.join(values['absent'])}."
+                                                      if values["absent"] else ""),
+        f"Sensor: {values['sensor']}. Machine: {values['machine']}. Date: {values['date']}.",
+        f"Command: {values['command']}",
+    ]  # fmt: skip
+
+
+def _sentences(text: str) -> tuple[str, str, str]:
+    """The first sentence of a text, and the rest."""
+    match = re.search(r"\. (?=[A-Z])", text)
+    return (text, "", "") if match is None else (text[: match.start() + 1], " ", text[match.end() :])
+
+
+def _table(values: Values) -> str:
+    head = ("training", "mIoU, %", "change", "95 % interval", "better in", "iterations", "minutes", _USES)
+    gains = [row["difference"] for row in values["arms"] if row["difference"] is not None and row["synthetic"]]
+    rows = []
+    for row in values["arms"]:
+        best = bool(gains) and row["synthetic"] and row["difference"] == max(gains)
+        cells = [
+            _cell(row["title"]), _cell(f"{row['miou']:.1f}"), _cell(signed(row["difference"]), _sign(row)),
+            _cell(span(row["interval"]) if row["arm"] != BASE else ""), _cell(row["better_in"]),
+            _cell(str(row["iterations"])), _cell(f"{row['minutes']:.1f}"), _cell(row["budget"], "text"),
+        ]  # fmt: skip
+        rows.append(f"<tr{' class=best' * best}>{''.join(cells)}</tr>")
+    return _grid(head, rows)
+
+
+def _classes(values: Values) -> str:
+    arms = values["arms"]
+    rows = []
+    for name in arms[0]["iou"]:
+        cells = [_cell(name)] + [_cell("–" if (v := row["iou"][name]) is None else f"{v:.1f}") for row in arms]
+        rows.append(f"<tr>{''.join(cells)}</tr>")
+    return _grid(["class", *(row["title"] for row in arms)], rows)
+
+
+def _places(values: Values) -> str:
+    arms = [row for row in values["arms"] if row["difference"] is not None]
+    base = values["arms"][0]
+    rows = []
+    for place in values["tested_places"]:
+        miou = base["miou_by_place"][place]
+        cells = [_cell(place), _cell("–" if miou is None else f"{miou:.1f}")]
+        cells += [_cell(signed(row["by_place"][place])) for row in arms]
+        rows.append(f"<tr>{''.join(cells)}</tr>")
+    return _grid(["place", f"{base['title']}, mIoU", *(row["title"] for row in arms)], rows)
+
+
+def _grid(head: Sequence[str], rows: Sequence[str]) -> str:
+    names = "".join(f"<th{' class=text' * (name == _USES)}>{_text(name)}</th>" for name in head)
+    return f'<div class="scroll"><table><thead><tr>{names}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+
+
+def _section(title: str, content: str, note: str = "") -> str:
+    below = f'<p class="dim">{_text(note)}</p>' if note else ""
+    return f"<section><h2>{_text(title)}</h2>{content}{below}</section>"
+
+
+def _list(sentences: Sequence[str]) -> str:
+    return f"<ul>{''.join(f'<li>{_text(sentence)}</li>' for sentence in sentences)}</ul>"
+
+
+def _cell(text: str, kind: str = "") -> str:
+    return f"<td{f' class={kind}' if kind else ''}>{_text(text)}</td>"
+
+
+def _sign(row: Values) -> str:
+    ends = row["interval"]
+    return "" if ends is None or ends[0] <= 0 <= ends[1] else ("plus" if ends[0] > 0 else "minus")
+
+
+def _text(text: str) -> str:
+    return html.escape(text)

@@ -1,0 +1,109 @@
+"""The plan of a comparison: places, labelled scans and trainings.
+
+A *pair* is a place that is left out and a seed; it has one training of every arm, on the same labelled scans. Only
+whole pairs are compared.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from lidar_synth.datasets.recordings import Recordings
+from lidar_synth.files.disk import hash_of_names
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.proof.arms import Row
+from lidar_synth.lab.proof.places import Places, spread
+from lidar_synth.lab.proof.pools import MOST_SKIN_SCANS
+from lidar_synth.lab.proof.scores import Groups
+from lidar_synth.lab.proof.settings import ProofSettings
+
+Pair = tuple[str, int]
+"""The place that is left out, and the seed."""
+
+FORMAT = "lidar-synth-proof/2"
+
+
+@dataclass(frozen=True)
+class ProofPlan:
+    """All that is known before the first training.
+
+    Args:
+        settings: what was asked for.
+        places: {name: indices of its scans}.
+        names: of all scans.
+        sensor: of the scans.
+        grid: on which they are thinned; None to keep all returns.
+        rows: the arms.
+        groups: the scored classes.
+        absent: those that no label has.
+        pairs: in the order in which they are trained.
+        wanted: number of pairs without a limit of time.
+        labelled: {pair: indices of the labelled scans that are trained on}.
+        tested: {place: indices of the scans that are tested on}.
+        recordings: of the tested scans.
+        half: whether the reference network computes in bfloat16.
+        step: seconds of one of its iterations.
+        minutes: expected for all pairs, with ``jobs`` processes.
+        jobs: processes.
+    """
+
+    settings: ProofSettings
+    places: Places
+    names: tuple[str, ...]
+    sensor: Sensor
+    grid: Sensor | None
+    rows: list[Row]
+    groups: Groups
+    absent: list[str]
+    pairs: list[Pair]
+    wanted: int
+    labelled: dict[Pair, list[int]]
+    tested: dict[str, list[int]]
+    recordings: Recordings
+    half: bool
+    step: float
+    minutes: float
+    jobs: int
+
+    @property
+    def budget(self) -> int:
+        """Number of labelled scans that a training gets."""
+        return len(next(iter(self.labelled.values())))
+
+    def skin_scans(self, place: str) -> list[int]:
+        """Indices of the scans, of other places than this, that a skin is learnt from; their labels are not used."""
+        indices = [i for name, members in self.places.items() if name != place for i in members]
+        return spread(indices, MOST_SKIN_SCANS)
+
+    def seconds(self, row: Row) -> float:
+        """Expected seconds of the iterations of a training, without a pretraining that it shares with others."""
+        shared = row.pretraining.share if row.pretraining and self.step else 0
+        return self.settings.iterations * row.arm.iterations * (1 - shared) * self.step
+
+    def identity(self) -> dict[str, Any]:
+        """Plain values that determine every training, to tell whether one that exists may be kept."""
+        own = asdict(self.settings)
+        free = ("arms", "ratios", "seeds", "classes", "only")  # they add trainings, or score the same ones
+        digest = hash_of_names(self.names)
+        return {
+            "format": FORMAT, "scans": digest, "sensor": self.sensor.name, "half": self.half,
+            **{name: value for name, value in own.items() if name not in free},
+        }  # fmt: skip
+
+
+def describe(plan: ProofPlan) -> str:
+    """The plan in words, for a user who decides whether to start it."""
+    tested = sorted({place for place, _ in plan.pairs})
+    lines = [
+        f"{len(plan.names)} scans of {plan.sensor.name} in {len(plan.places)} places: "
+        + ", ".join(f"{name} ({len(members)})" for name, members in plan.places.items()),
+        f"each training gets {plan.budget} labelled scans and is tested on a place that was left out",
+        f"tested places: {', '.join(tested)}; seeds: {len({seed for _, seed in plan.pairs})}; "
+        f"{len(plan.pairs)} of {plan.wanted} pairs of place and seed",
+        f"classes without a label: {', '.join(plan.absent) or 'none'}", "trainings of each pair:",
+    ]  # fmt: skip
+    for row in plan.rows:
+        count = round(plan.settings.iterations * row.arm.iterations)
+        uses = f" (uses {row.arm.budget})" if row.arm.budget else ""
+        lines.append(f"  {row.key:<16}{count} iterations of {plan.settings.batch}: {row.title}{uses}")
+    time = f"about {plan.minutes:.0f} minutes with {plan.jobs} processes" if plan.step else "time: that of your trainer"
+    return "\n".join([*lines, f"{len(plan.rows) * len(plan.pairs)} trainings; {time}"])

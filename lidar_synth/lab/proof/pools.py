@@ -1,0 +1,212 @@
+"""Pools of synthetic scans, which all arms and seeds share: made once, kept in SemanticKITTI's layout.
+
+A pool is a folder; ``objects.npz`` in the pool ``skin`` holds the objects that are pasted. An interrupted pool is
+continued where it stopped.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_synth.datasets.recordings import CONTENT, Recordings
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files.claims import claim
+from lidar_synth.files.disk import hash_of_names, read_text, write_file
+from lidar_synth.files.parsing import parse_json
+from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
+from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.generate.generator import Generator
+from lidar_synth.generate.loading import find_model, load_generator
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.transfer import Transfer
+from lidar_synth.lab.evaluate.leakage import content_of, contents, overlap, seen_by, town
+from lidar_synth.lab.proof.arms import RARE
+from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
+from lidar_synth.lab.town.skin.fit import FEWEST_SCANS
+from lidar_synth.labels import ObjectBank
+from lidar_synth.labels.exchange import thinned
+from lidar_synth.noise import keyed_rng
+
+FRAMES = (4, 10, 16)
+"""The scans of each street of the town that a pool has."""
+TOWN_SEED = 4242
+"""Seed of the towns in pools; the next one is taken where the dataset is that town."""
+MOST_SKIN_SCANS = 60
+SKIN_STREETS = 16
+SETTINGS, DONE, OBJECTS, SKIN = "pool.json", "complete", "objects.npz", "own.skin"
+
+
+@dataclass(frozen=True)
+class PoolTask:
+    """One pool to make.
+
+    Args:
+        kind: a name of ``POOLS``.
+        folder: where it is kept.
+        sensor: of the user's scans.
+        grid: the sensor on whose grid the scans are thinned; None to keep all returns.
+        count: number of scans.
+        town_seed: seed of the town.
+        model: the generator's name or path.
+        scans: unlabelled scans by whose look a skin is learnt, as a function that reads them.
+        learnt: names of these scans.
+    """
+
+    kind: str
+    folder: Path
+    sensor: Sensor
+    grid: Sensor | None
+    count: int
+    town_seed: int = TOWN_SEED
+    model: str = "town"
+    scans: Callable[[], Sequence[Scan]] | None = None
+    learnt: tuple[str, ...] = ()
+
+
+def raw_town(task: PoolTask) -> Iterator[Scan]:
+    """Scans of the town as the physical model measures them."""
+    yield from _streets(task, None)
+
+
+def skinned_town(task: PoolTask) -> Iterator[Scan]:
+    """Scans of the town with a skin that is learnt from the unlabelled scans."""
+    path = task.folder / SKIN
+    if not path.is_file():
+        assert task.scans is not None
+        scans = task.scans()
+        if len(scans) < FEWEST_SCANS:
+            raise DataError(
+                f"{len(scans)} scans to learn a skin from",
+                f"at least {FEWEST_SCANS} in the places that are trained on",
+                "Leave out the arms with a skin: --arm real --arm exchange --arm town.",
+            )  # fmt: skip
+        fit_skin(scans, task.sensor, streets=SKIN_STREETS, progress=False).save(path)
+    yield from _streets(task, load_skin(path))
+
+
+def generated(task: PoolTask) -> Iterator[Scan]:
+    """Scans of a generator, turned into scans of the user's sensor where theirs is another one. What a model with a
+    condition needs, the town gives: label maps or layouts of its streets."""
+    generator = load_generator(task.model)
+    change = None if _alike(generator.sensor, task.sensor) else Transfer(task.sensor)
+    streets = repeat(None) if generator.condition is None else _streets(replace(task, sensor=generator.sensor), None)
+    for index, street in zip(range(task.count), streets, strict=False):
+        [scan] = generator.scans(0, [index], street)
+        yield scan if change is None else change(scan, keyed_rng(0, index))
+
+
+POOLS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
+    "town": raw_town, "skin": skinned_town, "generator": generated,
+}  # fmt: skip
+"""Makers of pools by name."""
+
+
+def make_pool(task: PoolTask) -> Path:
+    """Make a pool, unless it is complete, and return its folder.
+
+    Raises:
+        ConfigError: if the folder holds another pool.
+        DataError, FileError: if it cannot be made or written.
+    """
+    start = time.monotonic()
+    claim(task.folder / SETTINGS, _settings(task))
+    if (task.folder / DONE).is_file():
+        return task.folder
+    writer = SemanticKITTIWriter(task.folder)
+    made, boxed = 0, []
+    for scan in POOLS[task.kind](task):
+        kept = scan if task.grid is None else thinned(scan, task.grid)
+        writer.write(kept, made, name=f"00/{made:06d}")
+        made += 1
+        boxed += [kept] if task.kind == "skin" and kept.boxes is not None else []
+    if boxed:
+        _save_objects(boxed, task.folder / OBJECTS)
+    write_file(task.folder / DONE, json.dumps({"scans": made, "seconds": time.monotonic() - start}).encode())
+    return task.folder
+
+
+def seconds_of(folder: Path) -> float:
+    """How long it took to make a pool."""
+    return float(parse_json(read_text(folder / DONE), str(folder / DONE))["seconds"])
+
+
+def read_pool(folder: Path) -> list[Scan]:
+    """All scans of a pool, in memory."""
+    return list(SemanticKITTI(folder))
+
+
+def read_objects(folder: Path) -> ObjectBank | None:
+    """The objects to paste; None if the scans of the pool have none."""
+    return ObjectBank.load(folder / OBJECTS) if (folder / OBJECTS).is_file() else None
+
+
+def refuse_leaks(model: str, tested: Recordings, scans: Iterable[Scan] = ()) -> Generator:
+    """Load a generator, and refuse one that was trained on the places that are tested.
+
+    Args:
+        model: its name or path.
+        tested: the recordings of the tested scans.
+        scans: those of them that are known by their content only; read if the generator has learnt from such scans.
+
+    Raises:
+        ConfigError: if it was; the message names drives and frames. On a model that needs camera images.
+    """
+    generator = load_generator(model)
+    if generator.condition == "camera":
+        raise ConfigError(f"generator {model!r}, which needs camera images", "one that needs none, such as town-dense")
+    seen = seen_by(generator.header.provenance)
+    if any(dataset == CONTENT for dataset, _ in seen.drives):
+        tested = tested | contents(map(content_of, scans))
+    if shared := overlap(seen, tested):
+        raise ConfigError(
+            f"generator {model!r}, which was trained on places that are tested: {shared}",
+            "a generator that has never seen them",
+            "Choose another --model, or leave out the arm: --arm with the names of the others.",
+        )
+    return generator
+
+
+def town_seed(recordings: Recordings) -> int:
+    """The seed of a town whose streets are not among the recordings."""
+    seed = TOWN_SEED
+    while town(seed) & recordings:
+        seed += 1
+    return seed
+
+
+def _settings(task: PoolTask) -> dict[str, Any]:
+    grid = None if task.grid is None else task.grid.to_dict()
+    plain = {"kind": task.kind, "sensor": task.sensor.to_dict(), "grid": grid, "count": task.count}
+    streets = {"seed": task.town_seed}
+    if task.kind == "generator":
+        header, checkpoint = read_header(find_model(task.model))
+        return plain | {"model": task.model, "checkpoint": checkpoint} | (streets if header.conditioning else {})
+    learnt = hash_of_names(task.learnt)
+    return plain | streets | ({"learnt_from": learnt} if task.kind == "skin" else {})
+
+
+def _streets(task: PoolTask, skin: Skin | None) -> Iterator[Scan]:
+    streets = -(-task.count // len(FRAMES))
+    made = Town(task.town_seed, task.sensor, streets * STRETCH_FRAMES, skin=skin)
+    places = [STRETCH_FRAMES * street + frame for street in range(streets) for frame in FRAMES]
+    for place in places[: task.count]:
+        yield made[place]
+
+
+def _save_objects(scans: list[Scan], path: Path) -> None:
+    bank = ObjectBank.from_scans(scans)
+    if set(bank.boxes.names) & set(RARE):
+        bank.save(path)
+
+
+def _alike(some: Sensor, other: Sensor) -> bool:
+    """Whether two sensors have beams of the same elevations."""
+    a, b = some.laser_elevations, other.laser_elevations
+    return a.shape == b.shape and bool(np.abs(a - b).max() < np.radians(0.1))

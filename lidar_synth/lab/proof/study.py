@@ -1,0 +1,335 @@
+"""``prove``: what synthetic scans add to a labelled dataset, measured on places that were left out."""
+
+import json
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from lidar_synth.datasets.recordings import PLACES
+from lidar_synth.errors import DataError
+from lidar_synth.files.claims import claim
+from lidar_synth.files.disk import read_text, write_file
+from lidar_synth.files.parsing import parse_json, read_sealed, seal
+from lidar_synth.files.processes import in_processes
+from lidar_synth.formats import ScanFiles, layout_of, open_scans
+from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.evaluate.leakage import seen_by
+from lidar_synth.lab.proof.arms import Row
+from lidar_synth.lab.proof.page import write_page
+from lidar_synth.lab.proof.plan import Pair, ProofPlan
+from lidar_synth.lab.proof.planning import make_plan
+from lidar_synth.lab.proof.pools import (
+    PoolTask,
+    make_pool,
+    read_objects,
+    read_pool,
+    refuse_leaks,
+    seconds_of,
+    town_seed,
+)
+from lidar_synth.lab.proof.settings import ProofSettings
+from lidar_synth.lab.proof.summary import Proof, Results, summarise
+from lidar_synth.lab.proof.trial import Job, Outcome, Trainer, pretrain, pretraining_seconds, reference, run_trainer
+from lidar_synth.labels import ObjectBank
+
+STUDY, GENERATOR, RUNS, POOLS, STARTS, JOBS = "study.json", "generator.json", "runs", "pools", "starts", "jobs"
+PAGE, RESULTS = "index.html", "results.json"
+
+
+@dataclass(frozen=True)
+class Trainings:
+    """What every process needs for its trainings.
+
+    Args:
+        plan: the plan.
+        scans: {index: scan on the grid}.
+        out: the output folder.
+        pools: the folder of the pools.
+        trainer: trains and tests.
+        deadline: ``time.time()`` after which no training begins; None for no limit.
+    """
+
+    plan: ProofPlan
+    scans: dict[int, Scan]
+    out: Path
+    pools: Path
+    trainer: Trainer
+    deadline: float | None
+
+    def path(self, row: Row, pair: Pair) -> Path:
+        """The file of an outcome."""
+        place, seed = pair
+        return self.out / RUNS / row.key / f"{seed}-{sorted(self.plan.places).index(place):03d}.json"
+
+    def pool_folder(self, kind: str, place: str) -> Path:
+        """The folder of a pool: one for all places, but for skins, which must not know the place that is tested on."""
+        return self.pools / (kind if kind != "skin" else f"skin-{sorted(self.plan.places).index(place):03d}")
+
+    def start(self, row: Row, pair: Pair) -> Path | None:
+        """The file of the reference network after the row's pretraining, which all places of a seed share."""
+        stage, (place, seed) = row.pretraining, pair
+        if stage is None or self.trainer is not reference:
+            return None
+        return self.out / STARTS / f"{row.key}-{self.pool_folder(stage.pool, place).name}-{seed}.safetensors"
+
+    def pretrain(self, task: tuple[Row, Pair]) -> None:
+        """Write the file of ``start``."""
+        path = self.start(*task)
+        assert path is not None
+        with _one_thread():
+            pretrain(self._job(*task), path)
+
+    def __call__(self, task: tuple[Row, Pair]) -> bool:
+        """Train and write the outcome, unless the time is over; returns whether it did."""
+        row, pair = task
+        expected = self.plan.seconds(row)
+        if self.deadline is not None and time.time() + expected > self.deadline:
+            return False
+        with _one_thread():
+            outcome = run_trainer(self.trainer, self._job(row, pair))
+        write_file(self.path(row, pair), seal(to_values(outcome)))
+        return True
+
+    def _job(self, row: Row, pair: Pair) -> Job:
+        plan, (place, seed) = self.plan, pair
+        kinds = row.arm.pools()
+        folders = {kind: self.pool_folder(kind, place) for kind in kinds}
+        used = {stage.pool for stage in row.stages()}
+        return Job(
+            row, place, seed,
+            real=[self.scans[i] for i in plan.labelled[pair]],
+            held_out=[self.scans[i] for i in plan.tested[place]],
+            pools={kind: _pool(folder) for kind, folder in folders.items() if kind in used},
+            objects=_objects(folders["skin"]) if row.name == "paste" else None,
+            iterations=round(plan.settings.iterations * row.arm.iterations),
+            batch=plan.settings.batch, widths=plan.settings.widths, half=plan.half,
+            folder=self.out / JOBS / row.key / self.path(row, pair).stem,
+            pool_folders=folders, start=self.start(row, pair),
+        )  # fmt: skip
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute on one thread: the trainings share the cores among them."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+_pool = lru_cache(maxsize=2)(read_pool)
+
+
+def _objects(folder: Path) -> ObjectBank | None:
+    bank = read_objects(folder)
+    if bank is None:
+        raise DataError(
+            f"{folder} without objects to paste", "people, cyclists or trucks in the scans of the town",
+            "Use more --synthetic scans, or leave out the arm 'paste'.",
+        )  # fmt: skip
+    return bank
+
+
+def prove(
+    scans: str | Path | Source,
+    out: str | Path = "proof",
+    settings: ProofSettings | None = None,
+    *,
+    minutes: float | None = None,
+    jobs: int | None = None,
+    trainer: Trainer = reference,
+    pools: str | Path | None = None,
+    progress: bool = True,
+) -> Proof:
+    """Measure what synthetic scans add to your labelled scans, on places that no training has seen.
+
+    Every place is left out in turn. The same small network is trained on labelled scans of the other places in several
+    ways (``ARMS``), with the same scans, seeds, iterations, augmentation and schedule, and tested on the place left
+    out. The result is a page, ``index.html`` in ``out``. Run it again to resume, or to add arms and seeds.
+
+    Args:
+        scans: labelled scans: what ``open_scans`` opens, or a source.
+        out: folder to write to.
+        settings: of the comparison.
+        minutes: limit of the time; places and seeds are chosen so that it is kept, and if not even two fit,
+            the iterations of a training.
+        jobs: processes of one thread each; by default one for each core.
+        trainer: your own in the place of the small network: a function that can be pickled, or a ``CommandTrainer``.
+        pools: folder of the synthetic scans, which several comparisons may share; by default in ``out``.
+        progress: whether to show progress bars.
+
+    Returns:
+        The result; ``print`` shows its table.
+
+    Raises:
+        ConfigError: on settings that do not fit the scans, a folder with another comparison, or a generator that was
+            trained on places that are tested.
+        DataError: on one place only, on scans without labels, or a class that nothing is labelled as.
+
+    Example:
+        >>> from lidar_synth import ProofSettings, prove
+        >>> short = {"iterations": 10, "batch": 1, "seeds": 1, "columns": 64}  # to be fast; leave it out
+        >>> settings = ProofSettings(arms=("real", "exchange"), places="stretch:2", **short)
+        >>> proof = prove("demo_out/town", "proof", settings, jobs=1, progress=False)
+        >>> proof.values["tested_places"], len(proof.values["arms"])
+        (['00, stretch 1', '00, stretch 2'], 2)
+    """
+    start = time.time()
+    out = Path(out)
+    source = open_scans(scans) if isinstance(scans, str | Path) else scans
+    jobs = jobs or os.cpu_count() or 1
+    plan, loaded = make_plan(source, settings or ProofSettings(), minutes, jobs, _earlier(out))
+    seen = ""
+    if any("generator" in row.arm.pools() for row in plan.rows):
+        generator = refuse_leaks(plan.settings.model, plan.recordings, _nameless(source, plan))
+        claim(out / GENERATOR, {"model": plan.settings.model, "checkpoint": generator.hash})
+        seen = str(seen_by(generator.header.provenance)) or "scans that its file does not name"
+    named = getattr(trainer, "command", getattr(trainer, "__name__", type(trainer).__name__))
+    claim(out / STUDY, plan.identity() | {"trainer": named})
+    deadline = None if minutes is None else start + 60 * minutes
+    work = Trainings(plan, loaded, out, Path(pools or out / POOLS), trainer, deadline)
+    _make_pools(work, source, progress)
+    tasks = [
+        (row, pair) for pair in plan.pairs for row in plan.rows if not _is_there(work.path(row, pair), read_outcome)
+    ]
+    _pretrain(work, tasks, progress)
+    with in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
+        for _ in tqdm(done, total=len(tasks), desc="trainings", disable=not progress):
+            pass
+    return report(work, named, seen)
+
+
+def report(work: Trainings, trainer: str, seen: str = "") -> Proof:
+    """Summarise the trainings that are there, and write the page and ``results.json``.
+
+    Args:
+        work: the trainings.
+        trainer: the name of the trainer.
+        seen: what the generator was trained on.
+
+    Raises:
+        DataError: if no pair is complete.
+    """
+    found: Results = {}
+    plan = work.plan
+    for pair in plan.pairs:
+        paths = {row: work.path(row, pair) for row in plan.rows}
+        if all(path.is_file() for path in paths.values()):
+            found[pair] = {row: read_outcome(path) for row, path in paths.items()}
+    if not found:
+        raise DataError("no place with trainings of all arms", "at least one", "Give more --minutes.")
+    costs = {row.key: _preparation(work, row) for row in plan.rows}
+    proof = summarise(plan, found, costs, trainer, seen)
+    write_file(work.out / RESULTS, (json.dumps(proof.values, indent=1) + "\n").encode())
+    write_page(work.out / PAGE, proof)
+    return proof
+
+
+def to_values(outcome: Outcome) -> dict[str, Any]:
+    """An outcome as plain values."""
+    curve = [[step, table.tolist()] for step, table in outcome.curve]
+    return {
+        "table": outcome.table.tolist(), "curve": curve, "losses": outcome.losses, "seconds": outcome.seconds,
+    }  # fmt: skip
+
+
+def read_outcome(path: Path) -> Outcome:
+    """The inverse of ``to_values``, from a sealed file.
+
+    Raises:
+        FileError: if it cannot be read.
+        DataError: on a damaged file.
+    """
+    values = read_sealed(path, "the outcome of a training")
+    try:
+        table = np.array(values["table"], np.int64)
+        curve = [(int(step), np.array(part, np.int64)) for step, part in values["curve"]]
+        return Outcome(table, curve, [float(v) for v in values["losses"]], float(values["seconds"]))
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise DataError(f"{path} is damaged ({error!r})", "the outcome of a training", "Remove it.") from error
+
+
+def _is_there(path: Path, read: Callable[[Path], object]) -> bool:
+    """Whether a file is there and intact; a damaged one is set aside with a warning, to be made again."""
+    if not path.is_file():
+        return False
+    try:
+        read(path)
+    except DataError as error:
+        warnings.warn(f"{error}; it is made again", stacklevel=2)
+        path.replace(path.with_suffix(".damaged"))
+        return False
+    return True
+
+
+def _earlier(out: Path) -> dict[str, Any] | None:
+    """The identity of the comparison that is resumed; None where there is none."""
+    path = out / STUDY
+    if not path.is_file():
+        return None
+    values = parse_json(read_text(path), str(path))
+    valid = isinstance(values, dict) and isinstance(values.get("iterations"), int)
+    return values if valid else None
+
+
+def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
+    plan, tasks = work.plan, {}
+    kinds = {kind for row in plan.rows for kind in row.arm.pools()}
+    seed = town_seed(plan.recordings)
+    for place in dict.fromkeys(place for place, _ in plan.pairs):
+        for kind in sorted(kinds):
+            folder = work.pool_folder(kind, place)
+            indices = plan.skin_scans(place)
+            tasks[folder] = PoolTask(
+                kind, folder, plan.sensor, plan.grid, plan.settings.synthetic, seed, plan.settings.model,
+                partial(_scans, source, indices), tuple(plan.names[i] for i in indices),
+            )  # fmt: skip
+    with in_processes(make_pool, list(tasks.values()), min(plan.jobs, max(1, len(tasks)))) as done:
+        for _ in tqdm(done, total=len(tasks), desc="synthetic scans", unit="pool", disable=not progress):
+            pass
+
+
+def _pretrain(work: Trainings, tasks: Sequence[tuple[Row, Pair]], progress: bool) -> None:
+    """Make the pretrained networks that the trainings begin with."""
+    needed = {
+        path: task
+        for task in tasks
+        if (path := work.start(*task)) is not None and not _is_there(path, pretraining_seconds)
+    }
+    with in_processes(work.pretrain, list(needed.values()), min(work.plan.jobs, max(1, len(needed)))) as done:
+        for _ in tqdm(done, total=len(needed), desc="pretraining", disable=not progress):
+            pass
+
+
+def _nameless(source: Source, plan: ProofPlan) -> Iterator[Scan]:
+    """The scans of the tested places, unless their names say which recordings they are of."""
+    if isinstance(source, ScanFiles) and layout_of(source.root) in PLACES:
+        return
+    for place in dict.fromkeys(place for place, _ in plan.pairs):
+        yield from (source[i] for i in plan.places[place])
+
+
+def _scans(source: Source, indices: Sequence[int]) -> list[Scan]:
+    return [source[i] for i in indices]
+
+
+def _preparation(work: Trainings, row: Row) -> float:
+    """Seconds that the pools and the pretraining of an arm took; the mean over places for skins."""
+    total = 0.0
+    for kind in row.arm.pools():
+        folders = {work.pool_folder(kind, place) for place, _ in work.plan.pairs}
+        total += float(np.mean([seconds_of(folder) for folder in folders]))
+    starts = {path for pair in work.plan.pairs if (path := work.start(row, pair)) is not None and path.is_file()}
+    return total + (float(np.mean([pretraining_seconds(path) for path in starts])) if starts else 0.0)

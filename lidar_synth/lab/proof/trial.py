@@ -1,0 +1,257 @@
+"""One training and its test: an arm, a place that is left out, a seed.
+
+``reference`` trains the package's small range-view segmenter. A trainer of your own is a function of the same form.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save
+from torch import Tensor, nn
+from torch.optim.swa_utils import update_bn
+
+from lidar_synth.datasets.classes import NAMES
+from lidar_synth.errors import DataError
+from lidar_synth.files.disk import write_file
+from lidar_synth.generate.checkpoint import weights_hash
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.evaluate.segmentation import Images, confusion
+from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
+from lidar_synth.lab.proof.arms import REAL, Row, Stage, policy_of
+from lidar_synth.lab.train.segmentation import RATE, endless_batches, train_segmenter
+from lidar_synth.labels import ObjectBank
+from lidar_synth.labels.augment import mirrored, rotated
+from lidar_synth.mixing import MixedScans
+
+LOOKS = 8
+"""Points of the curve of a training."""
+SETTLING, SETTLING_LOOK = 16, 4
+"""Batches of real scans over which the statistics of the normalisation are taken, after a training and during it."""
+SECONDS = "seconds"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training, as a trainer gets it.
+
+    Args:
+        row: the arm.
+        place: the place that is tested on.
+        seed: of the weights, of the order, and of all that is random.
+        real: the labelled scans.
+        held_out: scans of ``place``.
+        pools: {name: synthetic scans} of the arm.
+        objects: to paste, if the arm pastes any.
+        iterations: of the arm.
+        batch: samples of an iteration.
+        widths: channels of the reference network by level.
+        half: whether the reference network computes in bfloat16.
+        folder: where a trainer may write files.
+        pool_folders: {name: folder} of the pools, in SemanticKITTI's layout.
+        start: the reference network after the first stage, if ``pretrain`` has written it.
+    """
+
+    row: Row
+    place: str
+    seed: int
+    real: Sequence[Scan]
+    held_out: Sequence[Scan]
+    pools: dict[str, list[Scan]]
+    objects: ObjectBank | None
+    iterations: int
+    batch: int
+    widths: tuple[int, ...]
+    half: bool
+    folder: Path
+    pool_folders: dict[str, Path] = field(default_factory=dict)
+    start: Path | None = None
+
+    def stages(self) -> Iterator[tuple[Stage, int]]:
+        """The stages with their iterations, which add up to ``iterations``."""
+        stages, done = self.row.stages(), 0
+        for number, stage in enumerate(stages):
+            last = number + 1 == len(stages)
+            count = self.iterations - done if last else round(stage.share * self.iterations)
+            done += count
+            yield stage, count
+
+    def mixtures(self, **options: Any) -> Iterator[tuple[MixedScans, int]]:
+        """The training sets of the stages, one after the other, with their iterations.
+
+        Args:
+            options: further arguments of ``MixedScans``, such as ``to_sample`` and ``collate``.
+        """
+        for number, (stage, iterations) in enumerate(self.stages()):
+            real = None if stage.ratio == 1 else list(self.real)
+            synthetic, labels = None, None
+            if stage.ratio:
+                synthetic = list(self.real) if stage.pool == REAL else self.pools[stage.pool]
+                labels = policy_of(stage, list(self.real), self.objects, frozenset(synthetic[0].fields()))
+            yield MixedScans(
+                real, synthetic, stage.ratio, labels or "generated", seed=1000 * self.seed + number,
+                epoch_size=iterations * self.batch, balanced=True, augment=turned, augment_real=True, **options,
+            ), iterations  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a training.
+
+    Args:
+        table: (19, 19) number of returns of the held-out scans by label (row) and prediction (column).
+        curve: (iterations, table) during the training; empty if the trainer does not tell.
+        losses: mean training losses of ten equal parts of the training; empty if the trainer does not tell.
+        seconds: that the training took.
+    """
+
+    table: NDArray[np.int64]
+    curve: list[tuple[int, NDArray[np.int64]]] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+Trainer = Callable[[Job], "Outcome | NDArray[np.int64]"]
+"""Trains as a job says and tests on its held-out scans; returns an ``Outcome``, or its table alone."""
+
+
+def turned(scan: Scan, rng: np.random.Generator) -> Scan:
+    """Turn a scan by a whole number of columns, and mirror it left and right with probability one half.
+
+    Returns stay within their cells, so that the range image of a thinned scan loses none.
+    """
+    scan = rotated(scan, 2 * np.pi / scan.sensor.columns * int(rng.integers(scan.sensor.columns)))
+    return mirrored(scan, "y") if rng.random() < 0.5 else scan
+
+
+def run_trainer(trainer: Trainer, job: Job) -> Outcome:
+    """Run a trainer, and take its time.
+
+    Raises:
+        DataError: on a table of another shape than (19, 19).
+    """
+    start = time.monotonic()
+    result = trainer(job)
+    outcome = result if isinstance(result, Outcome) else Outcome(np.asarray(result, np.int64))
+    expected = (len(NAMES), len(NAMES))
+    if outcome.table.shape != expected:
+        raise DataError(f"a trainer that returns a table of shape {outcome.table.shape}", f"{expected}")
+    return replace(outcome, seconds=time.monotonic() - start)
+
+
+def reference(job: Job) -> Outcome:
+    """Train the package's range-view segmenter on the grid of the scans, and test it on the held-out scans."""
+    network, height = _fresh(job)
+    held_out = images(job.held_out, job.held_out[0].sensor)
+    looks = {round(job.iterations * part / LOOKS) for part in range(1, LOOKS)} - {job.iterations}
+    curve: list[tuple[int, NDArray[np.int64]]] = []
+    losses: list[float] = []
+
+    def test(batches: int) -> NDArray[np.int64]:
+        return _test(_settled(network, job, height, batches), held_out, height, job.half)
+
+    def watch(step: int) -> None:
+        if done + step in looks:
+            curve.append((done + step, test(SETTLING_LOOK)))
+
+    done = 0
+    for (stage, count), (mixed, _) in zip(job.stages(), job.mixtures(collate="range"), strict=True):
+        if job.start is not None and not done:
+            network.load_state_dict(load_file(job.start))
+            curve.append((count, test(SETTLING_LOOK)))
+        else:
+            losses += _learn(network, job, stage, mixed, count, height, watch)
+        done += count
+    table = test(SETTLING)
+    parts = [float(np.mean(part)) for part in np.array_split(losses, 10) if len(part)]
+    return Outcome(table, [*curve, (job.iterations, table)], parts)
+
+
+def pretrain(job: Job, path: Path) -> None:
+    """Write the reference network after a job's first stage, which has no real scan, and the seconds that it took.
+
+    Raises:
+        FileError: if it cannot be written.
+    """
+    start = time.monotonic()
+    network, height = _fresh(job)
+    stage, count = next(job.stages())
+    mixed, _ = next(job.mixtures(collate="range"))
+    _learn(network, job, stage, mixed, count, height)
+    state = {name: value.contiguous() for name, value in network.state_dict().items()}
+    facts = {SECONDS: str(time.monotonic() - start), "weights": weights_hash(state)}
+    write_file(path, save(state, facts))
+
+
+def pretraining_seconds(path: Path) -> float:
+    """How long ``pretrain`` took for a file of its own.
+
+    Raises:
+        DataError: if the file is damaged.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            facts = file.metadata()
+        if facts["weights"] == weights_hash(load_file(path)):
+            return float(facts[SECONDS])
+    except (SafetensorError, LookupError, TypeError, ValueError) as error:
+        raise DataError(f"{path} is damaged ({error})", "a pretrained network") from error
+    raise DataError(f"{path} is damaged (the sum of its weights differs)", "a pretrained network")
+
+
+def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:
+    """A network that has learnt nothing, and the (H, W) sine of the elevations of the grid."""
+    torch.manual_seed(job.seed)
+    return RangeSegmenter(widths=job.widths), torch.from_numpy(np.sin(job.held_out[0].sensor.ray_angles()[0]))
+
+
+def _learn(
+    network: RangeSegmenter, job: Job, stage: Stage, mixed: MixedScans, count: int, height: Tensor,
+    watch: Callable[[int], object] | None = None,
+) -> list[float]:  # fmt: skip
+    """Train one stage; returns its losses."""
+    batches = endless_batches(mixed, job.batch)
+    rate = RATE * stage.rate
+    return train_segmenter(network, batches, height, count, rate, progress=False, half=job.half, watch=watch)
+
+
+def images(scans: Sequence[Scan], sensor: Sensor) -> list[Images]:
+    """Batches of one labelled range image each."""
+    made: list[Images] = []
+    for scan in scans:
+        image = project(scan, sensor, ("reflectance", "label"))
+        arrays = {"range": image.range, **{name: image.channels[name] for name in ("reflectance", "label")}}
+        made.append({name: torch.from_numpy(values[None]) for name, values in arrays.items()})
+    return made
+
+
+def _test(network: nn.Module, held_out: Sequence[Images], height: Tensor, half: bool) -> NDArray[np.int64]:
+    network.eval()
+    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+        return confusion(network, held_out, height)
+
+
+def _settled(network: RangeSegmenter, job: Job, height: Tensor, batches: int) -> RangeSegmenter:
+    """A copy whose statistics of the normalisation are those of the labelled real scans; the same in every arm.
+
+    Those of the training are of real and synthetic scans together, and the test has only real ones.
+    """
+    mixed = MixedScans(
+        list(job.real), ratio=0, seed=job.seed, epoch_size=SETTLING * job.batch, augment=turned, augment_real=True,
+        collate="range",
+    )  # fmt: skip
+    some = islice(endless_batches(mixed, job.batch), batches)
+    network = deepcopy(network)
+    with torch.autocast("cpu", torch.bfloat16, enabled=job.half):
+        update_bn((segmenter_input(batch["range"], batch["reflectance"], height) for batch in some), network)
+    return network.eval()

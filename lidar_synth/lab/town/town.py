@@ -1,0 +1,247 @@
+"""The town as a source of scans: ``Town(seed)[i]`` is the same scan in every process and in any order of access.
+Twenty neighbouring scans share a stretch of road. The ego vehicle drives along it, with ``interval`` seconds from scan
+to scan, among static and moving objects. Stretches lie a kilometre apart in the world frame of the poses, so that
+accumulating scans by pose never mixes two of them.
+"""
+
+import hashlib
+import json
+from collections import OrderedDict
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.datasets.classes import SEMANTIC_KITTI
+from lidar_synth.errors import ConfigError
+from lidar_synth.formats.calibration import Calibration
+from lidar_synth.geometry.scan import SYNTHETIC, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.lab.town.boxes import boxes_of
+from lidar_synth.lab.town.camera import CAMERA
+from lidar_synth.lab.town.cast import Snapshot
+from lidar_synth.lab.town.ego import HEIGHT, free_rays
+from lidar_synth.lab.town.materials import SurfaceTable
+from lidar_synth.lab.town.movers import ego_place, ego_pose, place_movers
+from lidar_synth.lab.town.returns import Noise, laser_gains, measure, see_through
+from lidar_synth.lab.town.scene import Pose
+from lidar_synth.lab.town.shading import render, sample_light
+from lidar_synth.lab.town.skin.skin import Skin, load_skin
+from lidar_synth.lab.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, rng_for
+
+REVOLUTION = 0.1
+"""Seconds of one turn of the sensor."""
+APART = 1000.0
+"""Metres between the origins of two stretches in the world frame of the poses."""
+
+
+class Town:
+    """An indexable source of ray-cast scans of a procedural town, with labels, boxes and poses.
+
+    Args:
+        seed: of the whole town, 0 or more.
+        sensor: the sensor whose rays are cast, as ``load_sensor`` takes it.
+        scans: number of scans.
+        interval: seconds between neighbouring scans of a stretch, 0 < interval < 60.
+        noise: the measurement noise of the sensor; by default ``Noise()``.
+        motion: whether the vehicle moves while the sensor turns. The points are motion compensated, as SemanticKITTI's:
+            in the frame of the scan's pose, each cast from where the sensor was. Other objects stand still.
+        skin: the look of a real sensor's returns, as ``load_skin`` takes it; by default the physical model's alone.
+            Labels, rings and boxes are the same with it; a few returns are missing.
+
+    Raises:
+        ConfigError: on a negative seed or number of scans, an interval out of range, an unknown sensor or skin, or a
+            skin of another sensor.
+        FileError: on a skin that cannot be read.
+        DataError: on a damaged skin.
+        LibraryError: if embreex is missing.
+
+    Example:
+        >>> from lidar_synth import Town
+        >>> town = Town(seed=0, scans=100)
+        >>> scan = town[0]
+        >>> list(scan.fields())
+        ['reflectance', 'label', 'raw_label', 'instance', 'ring']
+        >>> "Car" in scan.boxes.names, scan.pose.shape
+        (True, (4, 4))
+    """
+
+    def __init__(
+        self,
+        seed: int = 0,
+        sensor: str | Path | Sensor = "town",
+        scans: int = 1000,
+        interval: float = 0.4,
+        noise: Noise | None = None,
+        motion: bool = True,
+        skin: str | Path | Skin | None = None,
+    ) -> None:
+        if seed < 0 or scans < 0 or not 0 < interval < 60:
+            raise ConfigError(
+                f"a town with seed {seed}, {scans} scans and an interval of {interval} s",
+                "seed >= 0, scans >= 0 and 0 < interval < 60 s",
+            )
+        self.seed, self.sensor, self.interval = seed, load_sensor(sensor), interval
+        self.skin = None if skin is None else load_skin(skin)
+        if self.skin is not None:
+            self.skin.check(self.sensor)
+        # A skin has the offsets of the real lasers.
+        self._noise = noise or (Noise(gain_std=0) if self.skin else Noise())
+        self._scans, self._motion = scans, motion
+        self._worlds: OrderedDict[int, World] = OrderedDict()
+        elevation, height = self.sensor.optics()
+        # The order in which the sensor writes points: ring by ring from the top, counter-clockwise from straight ahead.
+        azimuths = self.sensor.firing_azimuths()
+        order = np.argsort(-azimuths % (2 * np.pi), axis=1)
+        self._laser, place = np.nonzero(np.take_along_axis(free_rays(self.sensor), order, 1))
+        azimuth = azimuths[self._laser, order[self._laser, place]]
+        tilt = elevation[self._laser]
+        self._rays = np.stack(
+            [np.cos(azimuth) * np.cos(tilt), -np.sin(azimuth) * np.cos(tilt), np.sin(tilt)], 1
+        ).astype(np.float32)
+        self._heights = height[self._laser].astype(np.float32)
+        # It turns counter-clockwise and looks straight ahead at the moment of the pose.
+        self._turned = (-(azimuth + np.pi) % (2 * np.pi) / (2 * np.pi) - 0.5).astype(np.float32)
+        self._gains = laser_gains(self.sensor, self._noise)
+
+    def __reduce__(self) -> tuple[type["Town"], tuple[object, ...]]:
+        return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise, self._motion, self.skin)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Where the scans come from: the town's seed and interval, and its skin with the licence of that."""
+        skin = {} if self.skin is None else {"skin": self.skin.digest, "skin_licence": self.skin.provenance["licence"]}
+        return {"made_by": "town", "seed": self.seed, "interval": self.interval, **skin}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Plain values that determine the scans, apart from their number."""
+        plain = {"seed": self.seed, "interval": self.interval, "sensor": self.sensor.to_dict()}
+        return {**plain, "noise": asdict(self._noise), "motion": self._motion, "skin": self.skin and self.skin.digest}
+
+    @property
+    def identity(self) -> str:
+        """A text that tells it from other towns."""
+        digest = hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()
+        return f"town:{len(self)}:{digest[:16]}"
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration of the camera next to the sensor."""
+        return CAMERA
+
+    def __repr__(self) -> str:
+        scans = f"{len(self)} scans, {self.interval:g} s apart"
+        return f"Town of seed {self.seed}: {scans}\n  sensor {self.sensor.grid_text()}"
+
+    def __len__(self) -> int:
+        return self._scans
+
+    def world(self, index: int) -> World:
+        """The stretch of road of a scan; the last two stretches are cached."""
+        stretch = index // STRETCH_FRAMES
+        if stretch not in self._worlds:
+            if len(self._worlds) > 1:
+                self._worlds.popitem(last=False)
+            self._worlds[stretch] = build_world(self.seed, stretch, self.interval)
+        return self._worlds[stretch]
+
+    def moment(self, index: int) -> tuple[Snapshot, Pose, np.random.Generator]:
+        """The scene of a scan, the sensor's pose in its stretch, and the random generator of the scan."""
+        stretch, frame = divmod(index, STRETCH_FRAMES)
+        rng = rng_for(SCAN, self.seed, stretch, frame)
+        world, time = self.world(index), frame * self.interval
+        pose = ego_pose(world.street, world.scene, time, HEIGHT, rng.normal(0, 0.003, 2))
+        about = ego_place(world.street, time)[:2]
+        movers = place_movers(world.movers, world.scene, time, about, self.sensor.range_max + 20)
+        return Snapshot(world, movers), pose, rng
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """(376, 1408, 3) uint8 RGB, the image that the camera of ``calibration`` takes with scan ``index``.
+
+        Raises:
+            IndexError: on an index outside 0 to ``len - 1``.
+        """
+        snapshot, pose, _ = self.moment(self._checked(index))
+        stretch, frame = divmod(index, STRETCH_FRAMES)
+        light = sample_light(rng_for(LIGHT, self.seed, stretch))
+        return render(snapshot, pose, self.world(index).surfaces, light, rng_for(IMAGE, self.seed, stretch, frame))
+
+    def _checked(self, index: int) -> int:
+        if not 0 <= index < len(self):
+            raise IndexError(f"scan {index} of a town of {len(self)} scans")
+        return index
+
+    def __getitem__(self, index: int) -> Scan:
+        """Scan number ``index``.
+
+        Raises:
+            IndexError: on an index outside 0 to ``len - 1``.
+        """
+        snapshot, pose, rng = self.moment(self._checked(index))
+        world = self.world(index)
+        laser, surface, points, reflectance = self._turn(snapshot, pose, self._travelled(index), world.surfaces, rng)
+        raw, instance = world.surfaces.raw[surface], world.surfaces.instance[surface]
+        returned = np.bincount(instance, minlength=world.scene.instances + 1)
+        objects = [o for o in (*world.scene.placed, *snapshot.movers) if o.prototype.name and returned[o.instance]]
+        placed = pose.copy()
+        placed[0, 3] += APART * (index // STRETCH_FRAMES)
+        return Scan(
+            points=points,
+            reflectance=reflectance,
+            sensor=self.sensor,
+            label=SEMANTIC_KITTI.decode(world.surfaces.raw)[surface],
+            raw_label=raw | instance.astype(np.uint32) << np.uint32(16),
+            instance=instance,
+            ring=laser.astype(np.int16),
+            boxes=boxes_of(objects, pose, snapshot),
+            pose=placed,
+            id=f"town-{self.seed}-{index:06d}",
+            domain=SYNTHETIC,
+            provenance=self.provenance,
+        )
+
+    def _travelled(self, index: int) -> NDArray[np.float32]:
+        """(3,) metres that the ego vehicle drives during the revolution of a scan, in the world frame."""
+        if not self._motion:
+            return np.zeros(3, np.float32)
+        world, time = self.world(index), index % STRETCH_FRAMES * self.interval
+        still = np.zeros(2)
+        ends = [ego_pose(world.street, world.scene, time + t, HEIGHT, still) for t in (-REVOLUTION / 2, REVOLUTION / 2)]
+        return (ends[1] - ends[0])[:3, 3].astype(np.float32)
+
+    def _turn(
+        self,
+        snapshot: Snapshot,
+        pose: Pose,
+        travelled: NDArray[np.float32],
+        surfaces: SurfaceTable,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+        """Laser, surface number, point in the sensor frame and reflectance of each return of one revolution.
+
+        The vehicle moves while the sensor turns; the points are in the frame of ``pose``, as motion compensated scans.
+        """
+        turn = pose[:3, :3].astype(np.float32)
+        directions = self._rays @ turn.T
+        moved = self._turned[:, None] * travelled
+        eye = pose[:3, 3].astype(np.float32)
+        origins = eye + moved + self._heights[:, None] * turn[:, 2]
+        hits = snapshot.cast(origins, directions, eye)
+        see_through(snapshot, hits, origins, directions, eye, surfaces, rng)
+        back, far, reflectance = measure(
+            hits, origins, directions, self._laser, surfaces, self._gains, self._noise, rng
+        )
+        points = far[:, None] * self._rays[back]
+        points[:, 2] += self._heights[back]
+        points += moved[back] @ turn
+        if self.skin is not None:
+            boxed = surfaces.instance[hits.surface[back]] > 0
+            dressed = self.skin.apply(points, reflectance, self._laser[back], boxed, rng)
+            points += dressed.shift[:, None] * self._rays[back]
+            back, points, reflectance = back[dressed.kept], points[dressed.kept], dressed.reflectance[dressed.kept]
+        distance = np.sqrt(np.einsum("ij,ij->i", points, points))
+        kept = np.flatnonzero((distance >= self.sensor.range_min) & (distance <= self.sensor.range_max))
+        return self._laser[back[kept]], hits.surface[back[kept]], points[kept], reflectance[kept]

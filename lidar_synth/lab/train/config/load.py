@@ -1,0 +1,105 @@
+"""From a recipe to checked values; unknown keys are refused, with the known ones named."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.files.parsing import parse_yaml
+from lidar_synth.files.recipes import find_recipe, merged, read_recipe, validated
+from lidar_synth.generate.conditions import CONDITIONS
+from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.lab.train.config.sections import Run
+from lidar_synth.lab.train.config.training import DistillConfig, TrainConfig
+
+Config = TypeVar("Config", bound=Run)
+
+
+def load_config(
+    kind: type[Config], recipe: str | Path, overrides: Sequence[str] = (), values: Mapping[str, Any] | None = None
+) -> Config:
+    """The configuration of a recipe.
+
+    Args:
+        kind: ``TrainConfig`` or ``DistillConfig``.
+        recipe: a published recipe's name, such as ``town_teacher``, or a YAML file.
+        overrides: ``key=value`` with dots between levels and values in YAML, such as ``recipe.batch=4``.
+        values: plain values on top of the recipe's and below the overrides.
+
+    Returns:
+        The checked configuration, for ``run``.
+
+    Raises:
+        FileError: where the file cannot be read.
+        ConfigError: on a file that is not YAML, an unknown key, an invalid value or a resolution that the network
+            cannot have.
+
+    Example:
+        >>> from lidar_synth.lab.train import TrainConfig, load_config
+        >>> config = load_config(TrainConfig, "town_tiny", ["recipe.batch=4", "output=runs/mine"])
+        >>> config.recipe.batch, config.recipe.iterations, config.output.as_posix()
+        (4, 200, 'runs/mine')
+    """
+    given = merged(read_values(recipe, kind), dict(values or {}))
+    for override in overrides:
+        _override(given, override)
+    config = validated(kind, given, str(recipe))
+    check(config)
+    return config
+
+
+def read_values(given: str | Path, kind: type[BaseModel]) -> dict[str, Any]:
+    """The values of a recipe for a ``kind``, its bases included, not checked yet; raises as ``load_config``.
+
+    A run without ``output`` gets the folder ``runs/NAME``.
+    """
+    path = find_recipe(given)
+    values = read_recipe(path)
+    if issubclass(kind, Run):
+        values.setdefault("output", f"runs/{path.stem}")
+    return values
+
+
+def check(config: Run) -> None:
+    """Refuse what could not be built.
+
+    Raises:
+        ConfigError: naming it.
+    """
+    for data in (config.data, *([config.held_out.data] if config.held_out else [])):
+        if (data.town is None) == (data.path is None):
+            raise ConfigError(f"data with town={data.town} and path={data.path}", "one of the two")
+    if isinstance(config, TrainConfig):
+        _check_train(config)
+    if isinstance(config, DistillConfig) and config.grid is not None:
+        grid = config.grid
+        if len(grid) != config.intervals + 1 or (grid[0], grid[-1]) != (1, 0) or sorted(set(grid))[::-1] != list(grid):
+            raise ConfigError(f"grid {list(grid)}", f"{config.intervals + 1} descending times from 1 to 0")
+
+
+def _check_train(config: TrainConfig) -> None:
+    if config.autoencodes and (config.codec or config.condition):
+        raise ConfigError("an autoencoder with a codec or a condition", "neither: they belong to a flow")
+    if config.decoder and (config.init is None or config.condition):
+        raise ConfigError("decoder without init, or with a condition", "init: a latent model, with its own condition")
+    if config.data.roll and config.condition and not CONDITIONS[config.condition.kind].turns:
+        raise ConfigError(f"data.roll with the condition {config.condition.kind!r}", "data.roll=false")
+    if config.codec is not None and config.recipe.weights:
+        raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
+    if config.init is None and config.codec is None:  # what a codec makes is in its file
+        resolution = load_sensor(config.sensor).shape
+        config.parts((config.tensors().size, *resolution), resolution)
+
+
+def _override(values: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals or not key:
+        raise ConfigError(f"override {override!r}", "key=value, such as recipe.batch=4")
+    *levels, last = key.split(".")
+    for level in levels:
+        values = values.setdefault(level, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"override {override!r}: {level} is a single value", "a section")
+    values[last] = parse_yaml(text, f"override {override!r}")

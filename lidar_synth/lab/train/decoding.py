@@ -1,0 +1,61 @@
+"""Fine-tuning of a decoder on the latents that a flow generates.
+
+An autoencoder is trained on its own latents with a little noise. A student of few steps makes larger errors of another
+kind, such as walls whose pieces do not meet. Therefore the decoder alone is trained further, with encoder and flow
+frozen. Every other latent is noised to the student's last timestep and denoised by the student's last step; the decoder
+learns to reconstruct the original scan from it. The other latents get noise of random strength up to that of
+``Losses``, so that the decoder still trusts exact latents.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from lidar_synth.generate.flow.path import Example, Metric, Velocity, interpolate
+from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
+from lidar_synth.generate.models.town_codec.autoencoder import Autoencoder
+from lidar_synth.lab.train.autoencoder import Autoencoding
+from lidar_synth.lab.train.data import Batch
+from lidar_synth.lab.train.loop import Task
+
+
+class Decoding(Autoencoding):
+    """The trained module: a decoder; the encoder is frozen. Takes the arguments of ``Autoencoding``."""
+
+    network: Autoencoder | SurfaceAutoencoder
+
+    def forward(self, z: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]  # it does not make its latents
+        """The loss of images (B, C, H, W) under what latents (B, *latent_shape) say, a scalar."""
+        return self.nll(self.network.expand(self.network.bounded(z), x), x)
+
+
+def decoding_loss(network: nn.Module, example: Example, metric: Metric) -> Tensor:
+    """The loss of ``Decoding``, which knows its metric itself."""
+    loss: Tensor = network(example.y, example.velocity)
+    return loss
+
+
+def decoding_task(autoencoder: Autoencoder | SurfaceAutoencoder, velocity: Velocity, time: float, noise: float) -> Task:
+    """Latents as a flow leaves them; the answer is the image.
+
+    Args:
+        autoencoder: of the latents, standing still.
+        velocity: of the flow.
+        time: where its last step begins.
+        noise: of ``Losses``.
+    """
+
+    @torch.no_grad()
+    def task(batch: Batch) -> Example:
+        shape = autoencoder.latent_shape
+        z = autoencoder.encode(batch.y0)
+        some = batch.y1.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
+        u = batch.u.view(-1, 1, 1, 1)
+        t = torch.full_like(batch.u, time)
+        y = interpolate(z, some, t)
+        left = y - time * velocity(y, t, batch.cond).float()
+        shaken = z + (2 * u - 1).clamp_min(0) * noise * some / autoencoder.scale.view(1, -1, 1, 1)
+        return Example(torch.where(u < 0.5, left, shaken), batch.u, batch.y0)
+
+    return task

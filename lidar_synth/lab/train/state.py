@@ -1,0 +1,229 @@
+"""The state of a training run, and how it is saved for resumption.
+
+The file is safetensors like a checkpoint, but serves to resume, not to sample: it holds the network, the averaged
+weights, the optimiser's moments, the step, the seconds of training and a checksum. Everything else is a function of the
+configuration and the step.
+"""
+
+import copy
+import hashlib
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.disk import write_file
+from lidar_synth.generate.checkpoint import weights_hash
+from lidar_synth.generate.flow.path import METRICS
+from lidar_synth.geometry.normalize import CHANNELS
+from lidar_synth.lab.train.optimizers import OPTIMIZERS
+from lidar_synth.lab.train.schedules import SCHEDULES
+
+STATE = "state.safetensors"
+"""The file of the state in a run's folder."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The optimisation settings; the defaults are those of R2Flow's 1-RF.
+
+    Args:
+        iterations: optimiser steps in all.
+        batch: samples of a step, over all processes and micro-batches.
+        accumulate: micro-batches of a step.
+        metric: a name of ``METRICS``.
+        weights: {channel: weight} of squared errors, 1 by default. Labels are five channels of seven, but should not
+            dominate the loss.
+        optimizer: a name of ``OPTIMIZERS``.
+        rate: the learning rate at the top of the schedule.
+        betas, weight_decay: of AdamW; the weight decay also applies to Muon.
+        schedule: a name of ``SCHEDULES``.
+        warmup: steps until the full rate is reached.
+        clip: maximum norm of the gradient.
+        ema_decay: decay of the averaged weights at each update; smaller in the first updates.
+        ema_every: steps between these updates.
+
+    Raises:
+        ConfigError: on an unknown name or a number below 1.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # used when a configuration is validated
+
+    iterations: int
+    batch: int = 8
+    accumulate: int = 1
+    metric: str = "squared_l2"
+    weights: Mapping[str, float] = field(default_factory=dict)
+    optimizer: str = "adamw"
+    rate: float = 1e-4
+    betas: tuple[float, float] = (0.9, 0.99)
+    weight_decay: float = 0.01
+    schedule: str = "cosine"
+    warmup: int = 10_000
+    clip: float = 1.0
+    ema_decay: float = 0.995
+    ema_every: int = 10
+
+    def __post_init__(self) -> None:
+        for key, table in (("metric", METRICS), ("optimizer", OPTIMIZERS), ("schedule", SCHEDULES)):
+            if getattr(self, key) not in table:
+                raise ConfigError(f"{key} {getattr(self, key)!r}", f"one of {', '.join(table)}")
+        if set(self.weights) - set(CHANNELS) or not all(weight > 0 for weight in self.weights.values()):
+            raise ConfigError(f"weights {dict(self.weights)}", f"numbers above 0 for some of {', '.join(CHANNELS)}")
+        if min(self.iterations, self.batch, self.accumulate, self.ema_every) < 1 or not self.rate > 0:
+            raise ConfigError(f"{self}", "iterations, batch, accumulate, ema_every of at least 1 and a rate above 0")
+
+
+class Training:
+    """The state of a run between two steps: the network, its averaged copy, the optimisers, the step.
+
+    Args:
+        network: the velocity network, on its device.
+        recipe: the optimisation settings.
+    """
+
+    def __init__(self, network: nn.Module, recipe: Recipe) -> None:
+        self.network = network
+        self.recipe = recipe
+        self.average = copy.deepcopy(network).eval().requires_grad_(False)
+        make = OPTIMIZERS[recipe.optimizer]
+        self.optimizers = make(network, recipe.rate, recipe.betas, recipe.weight_decay)
+        self.step = 0
+        self.earlier = 0.0
+        self.began = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """Of training, interruptions left out; ``began`` is set when the data are ready."""
+        return self.earlier + time.monotonic() - self.began
+
+    def update_average(self) -> None:
+        """Move the averaged weights towards the network's, and copy its buffers (statistics of norms, codebooks)."""
+        updates = self.step // self.recipe.ema_every
+        # Early averages have a short memory, so that they forget the initial weights.
+        keep = min(self.recipe.ema_decay, (1 + updates) / (10 + updates))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - keep)
+            for mine, new in zip(self.average.buffers(), self.network.buffers(), strict=True):
+                mine.copy_(new)
+
+    def save(self, path: Path) -> None:
+        """Write the state beside ``path``, then rename.
+
+        Raises:
+            FileError: where it cannot be written.
+        """
+        tensors = {f"network.{n}": p for n, p in self.network.state_dict().items()}
+        tensors |= {f"average.{n}": p for n, p in self.average.state_dict().items()}
+        for k, optimizer in enumerate(self.optimizers):
+            for i, moments in optimizer.state_dict()["state"].items():
+                tensors |= {f"optimizer.{k}.{i}.{n}": value for n, value in moments.items()}
+        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+        facts = {"step": str(self.step), "seconds": f"{self.seconds:.3f}"}
+        write_file(path, save(tensors, facts | {"checksum": _checksum(facts, tensors)}))
+
+    def load(self, path: Path) -> None:
+        """Restore the state that ``save`` wrote.
+
+        Raises:
+            FileError: where the file cannot be read.
+            DataError: if it is not the state of such a run.
+        """
+        progress, tensors = _read(path)
+        parts: dict[str, dict[str, Any]] = {"network": {}, "average": {}, "optimizer": {}}
+        try:
+            for name, tensor in tensors.items():
+                part, key = name.split(".", 1)
+                parts[part][key] = tensor
+            self.network.load_state_dict(parts["network"])
+            self.average.load_state_dict(parts["average"])
+            moments: list[dict[int, dict[str, Tensor]]] = [{} for _ in self.optimizers]
+            for name, tensor in parts["optimizer"].items():
+                which, number, key = name.split(".")
+                moments[int(which)].setdefault(int(number), {})[key] = tensor
+            for optimizer, state in zip(self.optimizers, moments, strict=True):
+                optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+        except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
+            raise DataError(f"{path} is the state of another network ({error})", "the same configuration") from error
+        self.step, self.earlier = progress
+        self.began = time.monotonic()
+
+
+class Progress(NamedTuple):
+    """How far a saved run has come.
+
+    Args:
+        step: its last step.
+        seconds: of training.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+
+
+def read_progress(folder: Path) -> Progress:
+    """How far the run in a folder has come; nothing yet if there is no state.
+
+    Raises:
+        FileError: where the state cannot be read.
+        DataError: on another file in its place.
+    """
+    if not (folder / STATE).exists():
+        return Progress()
+    with _opened(folder / STATE) as file:
+        return _progress(file)
+
+
+def set_damaged_aside(folder: Path) -> None:
+    """Rename the state of a run if it is damaged, with a warning, so that the run begins anew.
+
+    Raises:
+        FileError: where the state cannot be read.
+    """
+    path = folder / STATE
+    try:
+        _read(path)
+    except DataError as error:
+        kept = path.with_suffix(".damaged")
+        warnings.warn(f"{error}. It is kept as {kept.name}, and the run begins anew", stacklevel=2)
+        path.replace(kept)
+
+
+def _read(path: Path) -> tuple[Progress, dict[str, Tensor]]:
+    """The progress and the tensors of a state, if they have the checksum that was written with them."""
+    with _opened(path) as file:
+        facts = dict(file.metadata())
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
+        expected = facts.pop("checksum", None)  # older states have none
+        if expected not in (None, _checksum(facts, tensors)):
+            raise ValueError("its checksum differs")
+        return _progress(file), tensors
+
+
+def _checksum(facts: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+    return hashlib.sha256(f"{sorted(facts.items())} {weights_hash(tensors)}".encode()).hexdigest()
+
+
+def _progress(file: Any) -> Progress:
+    held = file.metadata()
+    return Progress(int(held["step"]), float(held.get("seconds", 0.0)))  # older states have no seconds
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        with safe_open(path, "pt") as file:
+            yield file
+    except OSError as error:
+        raise FileError(f"{path} cannot be read ({error})", "a saved state", "Start without --resume.") from error
+    except (SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(f"{path} is not a saved state ({error})", "state.safetensors of a run") from error

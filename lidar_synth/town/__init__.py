@@ -1,9 +1,0 @@
-"""The procedural town: synthetic streets, ray-cast with a sensor's beams (no download, no neural network)."""
-
-from lidar_synth.town.export import LAYOUTS, export_town
-from lidar_synth.town.skin import Skin, load_skin
-from lidar_synth.town.skin.fit import fit_skin
-from lidar_synth.town.town import Town
-from lidar_synth.town.world import STRETCH_FRAMES
-
-__all__ = ["LAYOUTS", "STRETCH_FRAMES", "Skin", "Town", "export_town", "fit_skin", "load_skin"]
