@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from lidar_synth import KITTI360, MixedScans
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
-from lidar_synth.formats import kitti360_labels
 from lidar_synth.formats.kitti360 import boxes_path, confidence_path, label_file, labels_folder, scans_folder
 from lidar_synth.formats.kitti360_boxes import read_boxes
 from lidar_synth.formats.kitti360_poses import (
@@ -25,6 +24,7 @@ from lidar_synth.formats.kitti360_poses import (
     undo_ego_motion,
 )
 from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.lab.kitti360 import labels as kitti360_labels
 from lidar_synth.lab.kitti360.accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
 from lidar_synth.lab.kitti360.labels import label_scans, plan_labels
 from lidar_synth.lab.kitti360.report import LabelReport
