@@ -92,7 +92,7 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             training device; otherwise workers, which have no GPU, make them.
 
     Raises:
-        ConfigError: with ``on_device``, on synthetic sources that are not generators.
+        ConfigError: on a ``MixedStream``; with ``on_device``, on synthetic sources that are not generators.
     """
 
     def __init__(
@@ -106,6 +106,12 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         on_device: bool = False,
     ) -> None:
         super().__init__()
+        if not isinstance(train, MixedScans):
+            raise ConfigError(
+                f"train={type(train).__name__}",
+                "a MixedScans, whose batches resume after the last one that was trained on",
+                "Of a MixedStream: MixedData(stream.scans).",
+            )
         if on_device and not all(isinstance(source, Generated) for source in train.synthetic):
             raise ConfigError(
                 f"on_device with {[type(s).__name__ for s in train.synthetic]}", "a generator: load_generator(...)"

@@ -204,6 +204,25 @@ def test_a_repeated_epoch_gives_one_warning(caught: list[warnings.WarningMessage
         assert not caught
 
 
+@pytest.mark.parametrize("told", [False, True])
+@pytest.mark.parametrize("way", ["in order", "batches", "stream"])
+def test_a_mixture_that_is_made_anew_for_each_epoch_is_noticed(
+    way: str, told: bool, caught: list[warnings.WarningMessage]
+) -> None:
+    for epoch in range(3):
+        train = mixed(9)
+        if told:
+            train.set_epoch(epoch)
+        ways: dict[str, Any] = {
+            "in order": DataLoader(train, 4, collate_fn=list),
+            "batches": DataLoader(train, batch_sampler=train.batches(4), collate_fn=list),
+            "stream": DataLoader(MixedStream(train, batch_size=4, endless=False), 4, collate_fn=list),
+        }
+        loader = ways[way]
+        assert samples(loader) == planned(train, epoch if told else 0)
+    assert {str(w.message)[: len(AGAIN)] for w in caught} == (set() if told else {AGAIN})
+
+
 def show_warnings(worker: int) -> None:
     """As outside of pytest, which keeps them to itself."""
     warnings.showwarning = lambda message, *_: print(message, file=sys.stderr, flush=True)  # type: ignore[assignment]

@@ -1,6 +1,6 @@
 """The epoch that is set or resumed is loaded, whatever loads it; its length is the same under every schedule."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import torch
 from mixtures import Endless, Scans
 from torch.utils.data import ConcatDataset, DataLoader, DistributedSampler
 
+from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import Linear, MixedScans, MixedStream
 from lidar_synth.mixing.state import make_state
@@ -91,34 +92,68 @@ def test_a_data_loader(workers: dict[str, Any], form: str, start: str, schedule:
     check_passes(train, loader, start)
 
 
-@SCHEDULED
-@STARTED_WHOLE
-@WORKED
-def test_a_distributed_sampler(workers: dict[str, Any], start: str, schedule: str) -> None:
-    """Of torch, made once, for two ranks."""
-    train = mixed(schedule)
-    ranks = [DistributedSampler(train, 2, rank) for rank in range(2)]
-    loaders = [DataLoader(train, 4, sampler=s, collate_fn=train.collate, **workers) for s in ranks]
-    first, _ = STARTS[start]
-    for epoch in range(first, first + 3):
-        train.set_epoch(epoch)
-        for sampler in ranks:
-            sampler.set_epoch(epoch)
-        found = [x for loader in loaders for x in read(loader)]
-        assert sorted(found) == sorted(planned(train, epoch))
+def make_shards(train: MixedScans, kind: Any, **workers: Any) -> list[Any]:
+    """Loaders of two ranks by torch's own sampler."""
+    samplers = [DistributedSampler(train, 2, rank) for rank in range(2)]
+    return [kind(train, 4, sampler=s, collate_fn=train.collate, **workers) for s in samplers]
 
 
-@SCHEDULED
-@STARTED_WHOLE
-@WORKED
-def test_a_concatenation(workers: dict[str, Any], start: str, schedule: str) -> None:
-    train = mixed(schedule)
+def make_chained(train: MixedScans, kind: Any, **workers: Any) -> list[Any]:
+    """A loader of a mixture and three samples more."""
     both: Any = ConcatDataset([train, [torch.tensor(1000)] * 3])
-    loader = DataLoader(both, 4, shuffle=True, collate_fn=train.collate, **workers)
-    first, _ = STARTS[start]
+    return [kind(both, 4, shuffle=True, collate_fn=train.collate, **workers)]
+
+
+def set_epochs(train: MixedScans, loaders: list[Any], epoch: int) -> None:
+    """As a training script does that uses torch's sampler."""
+    train.set_epoch(epoch)
+    for loader in loaders:
+        if isinstance(loader.sampler, DistributedSampler):
+            loader.sampler.set_epoch(epoch)
+
+
+@SCHEDULED
+@STARTED
+@WORKED
+@pytest.mark.parametrize("make", [make_shards, make_chained])
+def test_torchs_own_sampler_and_concatenation(
+    make: Callable[..., list[Any]], workers: dict[str, Any], start: str, schedule: str
+) -> None:
+    """Made once; resumed, as ``StatefulDataLoader`` does by the batches that it has yielded."""
+    kind: Any = DataLoader
+    first, position = STARTS[start]
+    seen: list[int] = []
+    states = []
+    if position:
+        kind = pytest.importorskip("torchdata.stateful_dataloader").StatefulDataLoader
+        stopped = mixed(schedule)
+        before = make(stopped, kind, **workers)
+        set_epochs(stopped, before, first)
+        for loader in before:
+            seen += read(islice(loader, 1))
+            states.append(loader.state_dict())
+    train = mixed(schedule)
+    loaders = make(train, kind, **workers)
+    more = [1000] * 3 if make is make_chained else []
     for epoch in range(first, first + 3):
-        train.set_epoch(epoch)
-        assert sorted(read(loader)) == sorted(planned(train, epoch)) + [1000] * 3
+        set_epochs(train, loaders, epoch)
+        for loader in loaders:
+            if states:
+                loader.load_state_dict(states.pop(0))
+            seen += read(loader)
+        assert sorted(seen) == sorted(planned(train, epoch)) + more
+        seen = []
+
+
+def test_a_stream_is_in_no_sampler_and_no_concatenation() -> None:
+    """torch refuses them: a stream is divided among ranks by itself."""
+    stream: Any = MixedStream(mixed("rising"), batch_size=4, endless=False)
+    with pytest.raises(TypeError, match="'MixedStream' has no len"):
+        DistributedSampler(stream, 2, 0)
+    with pytest.raises(ValueError, match="expected unspecified sampler"):
+        DataLoader(stream, 4, sampler=DistributedSampler(mixed("rising"), 2, 0))
+    with pytest.raises(AssertionError, match="ConcatDataset does not support IterableDataset"):
+        ConcatDataset([stream, mixed("rising")])
 
 
 @pytest.fixture
@@ -163,23 +198,47 @@ def test_a_stateful_data_loader(workers: dict[str, Any], form: str, start: str, 
     check_passes(train, loader, start)
 
 
-@SCHEDULED
-@STARTED
-@WORKED
-def test_lightning(workers: dict[str, Any], start: str, schedule: str, tmp_path: Path) -> None:
-    """A run from epoch 5 on that stops in its second epoch and resumes, or that does not stop."""
+@pytest.fixture
+def fit(tmp_path: Path) -> Any:
+    """Trains for three epochs by Lightning, with the options of ``Trainer.fit``; a ``KeyError`` writes a checkpoint."""
     lightning = pytest.importorskip("lightning")
-    from lidar_synth.integrations.lightning import MixedData
+
+    def train(model: Any, data: Any, **options: Any) -> None:
+        saving = lightning.pytorch.callbacks.OnExceptionCheckpoint(tmp_path, "last")
+        lightning.Trainer(
+            max_epochs=3,
+            accelerator="cpu",
+            logger=False,
+            default_root_dir=tmp_path,
+            callbacks=[saving],
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            use_distributed_sampler=False,
+        ).fit(model, data, **options)
+
+    return train
+
+
+def make_model(stop: tuple[int, int] = (9, 9), begin: Callable[[int], None] = print) -> Any:
+    """A Lightning module that keeps what it has seen.
+
+    Args:
+        stop: epoch and number of the batch at which it raises ``KeyError``.
+        begin: called with the number of an epoch when it begins.
+    """
+    lightning = pytest.importorskip("lightning")
 
     class Model(lightning.LightningModule):  # type: ignore[name-defined, misc]
-        def __init__(self, stop: tuple[int, int] = (9, 9)) -> None:
+        def __init__(self) -> None:
             super().__init__()
             self.weight = torch.nn.Parameter(torch.zeros(1))
             self.seen: list[int] = []
-            self.stop = stop
+
+        def on_train_epoch_start(self) -> None:
+            begin(self.current_epoch)
 
         def training_step(self, batch: Any, index: int) -> Any:
-            if (self.current_epoch, index) == self.stop:
+            if (self.current_epoch, index) == stop:
                 raise KeyError
             self.seen += batch.tolist()
             return self.weight.sum()
@@ -187,13 +246,18 @@ def test_lightning(workers: dict[str, Any], start: str, schedule: str, tmp_path:
         def configure_optimizers(self) -> Any:
             return torch.optim.SGD(self.parameters(), 0.1)
 
-    def fit(model: Any, **options: Any) -> None:
-        data = MixedData(train, batch_size=4, num_workers=workers["num_workers"])
-        saving = lightning.pytorch.callbacks.OnExceptionCheckpoint(tmp_path, "last")
-        lightning.Trainer(
-            max_epochs=3, accelerator="cpu", logger=False, default_root_dir=tmp_path, callbacks=[saving],
-            enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=False,
-        ).fit(model, data, **options)  # fmt: skip
+    return Model()
+
+
+@SCHEDULED
+@STARTED
+@WORKED
+def test_lightning(fit: Any, workers: dict[str, Any], start: str, schedule: str, tmp_path: Path) -> None:
+    """A run from epoch 5 on that stops in its second epoch and resumes, or that does not stop."""
+    from lidar_synth.integrations.lightning import MixedData
+
+    def make_data() -> Any:
+        return MixedData(train, batch_size=4, num_workers=workers["num_workers"])
 
     train = mixed(schedule)
     first = 0 if start == "fresh" else 5
@@ -201,12 +265,30 @@ def test_lightning(workers: dict[str, Any], start: str, schedule: str, tmp_path:
     seen = []
     options = {}
     if start == "resumed":
-        stopped = Model((1, 2))
+        stopped = make_model((1, 2))
         with pytest.raises(KeyError):
-            fit(stopped)
+            fit(stopped, make_data())
         seen += stopped.seen
         train = mixed(schedule)
         options = {"ckpt_path": tmp_path / "last.ckpt"}
-    model = Model()
-    fit(model, **options)
+    model = make_model()
+    fit(model, make_data(), **options)
     assert seen + model.seen == [x for e in range(first, first + 3) for x in planned(train, e)]
+
+
+@SCHEDULED
+@STARTED_WHOLE
+@WORKED
+def test_lightning_with_a_stream(fit: Any, workers: dict[str, Any], start: str, schedule: str) -> None:
+    """A loader of a stream whose epoch the user's module sets; ``MixedData`` asks for its scans."""
+    from lidar_synth.integrations.lightning import MixedData
+
+    train = mixed(schedule)
+    stream = MixedStream(train, batch_size=4, endless=False)
+    with pytest.raises(ConfigError, match=r"train=MixedStream.*MixedData\(stream.scans\)"):
+        MixedData(stream)  # type: ignore[arg-type]
+    first, _ = STARTS[start]
+    train.set_epoch(first)
+    model = make_model(begin=lambda epoch: stream.set_epoch(first + epoch))
+    fit(model, DataLoader(stream, 4, **workers))
+    assert model.seen == [x for e in range(first, first + 3) for x in planned(train, e)]

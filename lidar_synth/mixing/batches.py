@@ -9,17 +9,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Protocol, overload
-from weakref import WeakKeyDictionary
 
 from torch.utils.data import Sampler
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, Position
+from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, CurrentEpoch, Position
 from lidar_synth.mixing.quotas import Mixture
 from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state, make_state, place
-
-_PASSED: WeakKeyDictionary[Any, dict[int, tuple[int, int]]] = WeakKeyDictionary()
-"""By dataset and rank: epoch and position where the latest complete pass began, also of a sampler made for it alone."""
 
 AHEAD = 1 << 20
 """Number of positions that are announced at a time to a source that works ahead."""
@@ -27,6 +23,8 @@ AHEAD = 1 << 20
 
 class Epochs(Protocol):
     """The part of a dataset that a batch sampler uses."""
+
+    current: CurrentEpoch
 
     @property
     def mixture(self) -> Mixture: ...
@@ -164,7 +162,7 @@ class MixedBatches(Sampler[list[int]]):
         steps, epoch = self._steps(), self.dataset.epoch
         if steps and len(steps[-1]) < self.world_size:
             warnings.warn(f"{len(steps[-1])} samples left for {self.world_size} ranks: some get none", stacklevel=2)
-        if _PASSED.get(self.dataset, {}).get(self.rank) == (epoch, steps.start) and not self._warned:
+        if self.dataset.current.passed.get(self.rank) == (epoch, steps.start) and not self._warned:
             self._warned = True
             warnings.warn(REPEATED.format(epoch), stacklevel=2)
         before, yielded = self._fetched
@@ -212,7 +210,7 @@ class MixedBatches(Sampler[list[int]]):
         """
         self._start = checked_state(state, self.dataset.mixture)
         self._taken = (0, 0)
-        _PASSED.get(self.dataset, {}).pop(self.rank, None)
+        self.dataset.current.forget_pass()
         go_to(self.dataset, *self._start)
 
     def _batches(self, epoch: int, steps: CutSteps) -> Iterator[list[int]]:
@@ -226,7 +224,7 @@ class MixedBatches(Sampler[list[int]]):
                 number, yielded = number + 1, yielded + len(share)
                 self._taken = (epoch, number)
                 yield [Position(position, epoch) for position in share]
-        _PASSED.setdefault(self.dataset, {})[self.rank] = (epoch, steps.start)
+        self.dataset.current.passed[self.rank] = (epoch, steps.start)
         self._fetched = (before, yielded)
 
     def divide(self, rank: int, world_size: int) -> None:

@@ -21,7 +21,8 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.state import count_accelerated
 
 REPEATED = (
-    "epoch {} begins again, with the same scans in the same order as before. Call set_epoch(epoch) before each pass."
+    "epoch {} begins again, with the same scans in the same order as before. Make the mixture once, and call "
+    "set_epoch(epoch) before each pass."
 )
 
 SHARED_TWICE = (
@@ -69,6 +70,8 @@ class CurrentEpoch:
         # current epoch; epoch of the latest pass; 1 once it has warned; 1 once the current epoch is used
         self._shared = shared_integers(0, -1, 0, 0)
         self._fetched = shared_integers(*[0] * _COUNTERS)  # number of positions fetched, by worker
+        self.passed: dict[int, tuple[int, int]] = {}
+        """By rank: epoch and position where its latest complete pass by ``batches`` began."""
         self._own = 0  # the epoch that this process set, or the current epoch when this process started
         self._process = os.getpid()
         self._passes: WeakKeyDictionary[Any, int] = WeakKeyDictionary()  # {fetcher: epoch of its pass}
@@ -150,6 +153,12 @@ class CurrentEpoch:
     def forget_pass(self) -> None:
         """Forget the latest pass: the next one resumes from a state and is not a repetition."""
         self._shared[1] = -1
+        self.passed.clear()
+
+    def take_pass(self, other: "CurrentEpoch") -> None:
+        """Take another mixture's latest pass for this one's, so that a repetition is noticed."""
+        self._shared[1:3] = other._shared[1:3]
+        self.passed = dict(other.passed)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name not in ("_passes", "_followers")}

@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from torch.utils.data import Dataset, default_collate, get_worker_info
@@ -36,6 +37,9 @@ Ratio = float | Sequence[float] | Mapping[int, float] | Schedule
 
 ToSample = Callable[[Scan, np.random.Generator], Any]
 """Makes a sample from a scan; the random generator is keyed by (seed, epoch, position)."""
+
+_LATEST: WeakValueDictionary[str, Any] = WeakValueDictionary()
+"""By the hash of epoch 0: the mixture that was made last. One that is made anew before each epoch repeats it."""
 
 
 class MixedScans(Dataset[Any]):
@@ -155,9 +159,16 @@ class MixedScans(Dataset[Any]):
             collate = Collate(collate, sensors[0] if sensors else None, "allow" if labels == "none" else unlabelled)
         self.collate: Callable[[Any], Any] = collate
         self.current = CurrentEpoch()
+        self._untold = False  # whether it is made as an earlier one was, and no epoch has been set
         self._planned: tuple[int, MixingPlan] | None = None
         self.set_epoch(0)
-        report_repeats(MixingPlan(self.mixture, 0))
+        first = MixingPlan(self.mixture, 0)
+        report_repeats(first)
+        earlier = _LATEST.get(first.hash)
+        if earlier is not None:
+            self.current.take_pass(earlier.current)
+        self._untold = earlier is not None
+        _LATEST[first.hash] = self
         if real_as_is and compare:
             check_alike(self.real, self.synthetic, self._finish)
 
@@ -234,6 +245,9 @@ class MixedScans(Dataset[Any]):
             ConfigError: on an epoch for which there is no ratio.
         """
         MixingPlan(self.mixture, epoch)
+        if self._untold:
+            self._untold = False
+            self.current.forget_pass()
         self.current.set(epoch)
         if get_worker_info() is None:
             self.tell_sources(epoch)

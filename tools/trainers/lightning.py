@@ -7,27 +7,39 @@ from trainers.trial import STEPS, Failed, Row, Trial
 
 TITLE = "Lightning"
 
-SCRIPT = Path(__file__).parent / "scripts" / "fit_lightning.py"
-EPOCHS = ["--max-epochs", "2"]
+SCRIPTS = Path(__file__).parent / "scripts"
+"""``segmenter.py`` there is the reader's own model."""
+OPTIONS = (
+    "accelerator='cpu', logger=False, enable_progress_bar=False, "
+    "callbacks=[lightning.pytorch.callbacks.ModelCheckpoint({folder!r}, 'last', every_n_train_steps=1)]"
+)
 
 
 def rows(trial: Trial) -> Iterator[Row]:
     """A small segmenter on SemanticKITTI and a bank."""
     python = trial.environment(extras=("lightning",))
-    command = [python, SCRIPT, "--scans", trial.data.semantic_kitti, "--bank", trial.data.bank]
-    whole = trial.run("train", [*command, "--out", trial.folder / "whole", *EPOCHS], expect=[r"validation loss \d"])
-    seen = samples(whole)
+
+    def fit(title: str, out: str, limit: str = "max_epochs=2", resumed: bool = False) -> list[str]:
+        folder = trial.folder / out
+        checkpoint = str(folder / "last.ckpt") if resumed else None
+        names = {
+            "demo_out/town": trial.data.semantic_kitti,
+            "demo_out/bank": trial.data.bank,
+            "import lightning": "import lightning\nfrom segmenter import Segmenter",
+            "max_epochs=1": f"{limit}, {OPTIONS.format(folder=str(folder))}",
+            "# then trainer.fit(model, data)": f"\ntrainer.fit(Segmenter(), data, ckpt_path={checkpoint!r})",
+        }
+        env = {"PYTHONPATH": str(SCRIPTS)}
+        expect = [r"validation loss \d"] if out == "whole" else []
+        said = trial.type_page(title, python, "lightning", names, env=env, expect=expect)
+        return [line for line in said.splitlines() if line.startswith("sample ")]
+
+    seen = fit("train", "whole")
     if not {"domain 0", "domain 1"} <= {" ".join(line.split()[3:5]) for line in seen}:
         raise Failed("no real or no synthetic sample in the uninterrupted run")
-    for name, limit in {"middle of an epoch": ["--max-steps", "3"], "end of an epoch": ["--max-epochs", "1"]}.items():
-        out = trial.folder / name.replace(" ", "-")
-        first = trial.run(f"stop in the {name}", [*command, "--out", out, *limit])
-        rest = trial.run(f"resume from the {name}", [*command, "--out", out, *EPOCHS, "--resume", out / "last.ckpt"])
-        if not samples(rest) or samples(first) + samples(rest) != seen:
-            raise Failed(f"resuming from the {name} gives other samples; see {trial.folder / 'logs'}")
-    yield trial.row(f"python {SCRIPT.name} --scans SemanticKITTI --bank bank", STEPS, "GPUs: `on_device`")
-
-
-def samples(output: str) -> list[str]:
-    """The lines of a log that name a training sample."""
-    return [line for line in output.splitlines() if line.startswith("sample ")]
+    for name, limit in {"middle": "max_epochs=2, max_steps=3", "end": "max_epochs=1"}.items():
+        first = fit(f"stop in the {name} of an epoch", name, limit)
+        rest = fit(f"resume from the {name} of an epoch", name, resumed=True)
+        if not rest or first + rest != seen:
+            raise Failed(f"resuming from the {name} of an epoch gives other samples; see {trial.folder / 'logs'}")
+    yield trial.row("trainer.fit(model, data)", STEPS, "GPUs: `on_device`")

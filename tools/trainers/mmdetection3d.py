@@ -6,12 +6,14 @@ cannot run on a CPU, because its voxelisation sends tensors to CUDA.
 """
 
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 from trainers.trial import ROOT, Failed, Row, Trial
 
 TITLE = "MMDetection3D 1.4"
+PAGE = "mmdetection3d"
 
 SCRIPTS = Path(__file__).parent / "scripts"
 ITERATIONS = 4
@@ -34,11 +36,9 @@ ENVIRONMENT = {"NUMBA_ENABLE_CUDASIM": "1"}
 def rows(trial: Trial) -> Iterator[Row]:
     """A few iterations, validation and a checkpoint of each configuration, and a resumed run."""
     python = trial.environment()
-    installer = ["bash", ROOT / "tools" / "install_mmdet3d.sh", python.parent.parent, "--ops"]
-    trial.run("install MMDetection3D", installer, minutes=90)
+    installer = {"VENV": python.parent.parent, "tools/install_mmdet3d.sh": ROOT / "tools" / "install_mmdet3d.sh"}
+    trial.type_page("install", python, PAGE, installer, skip="^(?!bash)", minutes=90)
     trial.install(python, "spconv")
-    tools = python.parent.parent.glob("lib/python*/site-packages/mmdet3d/.mim/tools/train.py")
-    train = [python, next(tools)]
     configs, env = dict(RUNS), ENVIRONMENT | {"PYTHONPATH": str(SCRIPTS)}
     if os.environ.get("FRNET_ROOT"):
         env |= {"PYTHONPATH": f"{SCRIPTS}:{trial.tree('FRNET_ROOT')}", "FRNET_ROOT": str(trial.tree("FRNET_ROOT"))}
@@ -48,40 +48,42 @@ def rows(trial: Trial) -> Iterator[Row]:
         del configs["frnet_semantickitti.py"]
     prepare(trial, python, list(configs), env)
     for config, metric in configs.items():
-        yield one(trial, train, config, metric, env)
+        yield one(trial, python, config, metric, env)
 
 
 def prepare(trial: Trial, python: Path, configs: list[str], env: dict[str, str]) -> None:
-    """Write data, lists and short configurations to the trial's folder."""
+    """Write data, lists and short configurations to the trial's folder; the page writes SemanticKITTI's lists."""
     nuscenes = trial.folder / "nuscenes"
     trial.run("nuScenes", [python, SCRIPTS / "nuscenes_town.py", nuscenes])
-    data = ["--kitti", trial.data.kitti, "--semantic-kitti", trial.data.semantic_kitti, "--nuscenes", nuscenes]
+    data = ["--kitti", trial.data.kitti, "--nuscenes", nuscenes]
     frame = Path(os.environ.get("LIDAR_SYNTH_REAL_SCANS", "")) / "nuscenes"
     if (frame / "info.json").is_file():
         data += ["--frame", frame]
     command = [python, SCRIPTS / "mmdet3d_prepare.py", trial.folder, *data, "--configs", *configs]
     trial.run("prepare", command, env=env)
+    shutil.copytree(trial.data.semantic_kitti, trial.folder / "data" / "semantickitti")
+    names = {'"bank"': repr(str(trial.data.bank))}
+    trial.type_page("lists", python, PAGE, names, skip="^bash|^python VENV|custom_imports|data/nuscenes")
 
 
-def one(trial: Trial, train: list[Path], config: str, metric: str, env: dict[str, str]) -> Row:
+def one(trial: Trial, python: Path, config: str, metric: str, env: dict[str, str]) -> Row:
     """Train with a configuration, and for the first one resume from the middle."""
     name, ran = config.removesuffix(".py"), ["training", "validation", "checkpoint"]
     out = trial.folder / f"work-{name}"
-    whole = trial.run(name, [*train, config, "--work-dir", out], env=env, expect=[r"loss: \d", metric], minutes=120)
-    seen = samples(whole)
+
+    def train(title: str, arguments: str, expect: list[str]) -> list[str]:
+        names = {"VENV": python.parent.parent, "CONFIG": f"{config} {arguments}"}
+        said = trial.type_page(title, python, PAGE, names, skip="^(?!python VENV)", env=env, expect=expect, minutes=120)
+        return [line for line in said.splitlines() if line.startswith("samples ")]
+
+    seen = train(name, f"--work-dir {out}", [r"loss: \d", metric])
     if len(seen) != ITERATIONS or not (out / f"iter_{ITERATIONS}.pth").is_file():
         raise Failed(f"{name}: {len(seen)} of {ITERATIONS} iterations, or no checkpoint; see {trial.folder / 'logs'}")
     if config == next(iter(RUNS)):
-        again = trial.folder / "work-resumed"
-        load = ["--resume", out / f"iter_{ITERATIONS // 2}.pth", "--work-dir", again]
-        rest = samples(trial.run(f"{name} resumed", [*train, config, *load], env=env, minutes=120))
+        load = f"--resume {out / f'iter_{ITERATIONS // 2}.pth'} --work-dir {trial.folder / 'work-resumed'}"
+        rest = train(f"{name} resumed", load, [])
         if rest != seen[ITERATIONS // 2 :]:
             raise Failed(f"{name}: the resumed run saw {rest} instead of {seen}")
         ran.append("resume")
     left_out = "; ".join(filter(None, ["mixed precision, several GPUs", LEFT_OUT.get(config)]))
     return trial.row(f"python tools/train.py {config}", ran, left_out)
-
-
-def samples(output: str) -> list[str]:
-    """The lines of a log that name an iteration's samples."""
-    return [line for line in output.splitlines() if line.startswith("samples ")]

@@ -10,24 +10,19 @@ import yaml
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.convert import convert
 from lidar_synth.lab.town import Town
-from trainers.trial import Failed, Row, Trial
+from trainers.trial import NOT_PIP, PIP, Failed, Row, Trial
 
 TITLE = "OpenPCDet 0.6"
 
+PAGE = "openpcdet"
 SCRIPTS = Path(__file__).parent / "scripts"
-PACKAGES = (
-    "SharedArray", "easydict", "scikit-image", "tensorboardX", "pyquaternion", "spconv", "torchvision", "setuptools",
-    "ninja", "opencv-python-headless", "pandas", "pyarrow",
-)  # fmt: skip
-DEVKIT = ("cachetools", "descartes", "shapely", "scikit-learn", "matplotlib")  # nuscenes-devkit itself pins numpy < 2
 LEFT_OUT = "its GPU kernels: non-maximum suppression is ours, from its overlaps for a CPU; `pointnet2`, RoI pooling"
 
 
 def rows(trial: Trial) -> Iterator[Row]:
     """Two epochs and a resumed one on KITTI; two on nuScenes."""
-    python = trial.environment(*PACKAGES)
-    trial.install(python, *DEVKIT)
-    trial.install(python, "nuscenes-devkit==1.2.0", options=["--no-deps"])
+    python = trial.environment("setuptools", "ninja")  # to compile its functions for a CPU
+    trial.type_page("install", python, PAGE, {}, skip=NOT_PIP)
     tree = trial.tree("OPENPCDET_ROOT")
     yield kitti(trial, python, tree)
     yield nuscenes(trial, python, tree)
@@ -40,13 +35,13 @@ def kitti(trial: Trial, python: Path, tree: Path) -> Row:
     trial.run("KITTI's lists", [python, SCRIPTS / "openpcdet_prepare.py", tree, "kitti", data, trial.data.objects])
     mixture = {"synthetic": str(trial.data.bank), "ratio": 0.5, "labels": "mix"}
     mixture |= {"label_options": {"objects": str(trial.data.objects)}}
-    config = "cfgs/kitti_models/pointpillar.yaml"
-    command, environment = train(trial, python, config, "MixedKitti", mixture, ["DATA_CONFIG.DATA_PATH", str(data)])
-    environment |= {"OPENPCDET_OUTPUT": str(trial.folder / "whole")}
-    whole = trial.run(
-        "PointPillars", command, cwd=tree / "tools", env=environment, minutes=60,
-        expect=[r"Loss: \d", r"Car AP_R40@0.70, 0.70, 0.70"],
-    )  # fmt: skip
+
+    def train(title: str, out: str) -> str:
+        changes = f"DATA_CONFIG.DATA_PATH {data}"
+        expect = [r"Loss: \d", r"Car AP_R40@0.70, 0.70, 0.70"]
+        return type_training(trial, python, title, "MixedKitti", mixture, changes, out, expect)
+
+    whole = train("PointPillars", "whole")
     first = next((trial.folder / "whole").rglob("checkpoint_epoch_1.pth"), None)
     if first is None:
         raise Failed("no checkpoint after the first epoch")
@@ -54,11 +49,11 @@ def kitti(trial: Trial, python: Path, tree: Path) -> Row:
     folder = trial.folder / "resumed" / first.parent.relative_to(trial.folder / "whole")
     folder.mkdir(parents=True)
     shutil.copy(first, folder)
-    environment |= {"OPENPCDET_OUTPUT": str(trial.folder / "resumed")}
-    rest = batches(trial.run("PointPillars resumed", command, cwd=tree / "tools", env=environment, minutes=60))
+    rest = batches(train("PointPillars resumed", "resumed"))
     if rest != batches(whole)[half:]:
         raise Failed(f"the resumed run saw {rest} instead of {batches(whole)[half:]}")
-    return trial.row(f"train.py --cfg_file {config}", ["training", "validation", "checkpoint", "resume"], LEFT_OUT)
+    script = "openpcdet train.py --cfg_file cfgs/kitti_models/pointpillar.yaml"
+    return trial.row(script, ["training", "validation", "checkpoint", "resume"], LEFT_OUT)
 
 
 def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
@@ -69,32 +64,43 @@ def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
     convert(Town(seed=9, sensor="hdl32e_nuscenes", scans=4), WRITERS["npz"](synthetic), progress=False)
     trial.run("nuScenes' lists", [python, SCRIPTS / "openpcdet_prepare.py", tree, "nuscenes", data, trial.data.objects])
     mixture = {"synthetic": str(synthetic), "ratio": 0.5}
-    config = "cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml"
     small = yaml.safe_load((tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").read_text())
     small |= {"BALANCED_RESAMPLING": False}  # it divides by the number of objects of each class; the town has four
     small["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]["SAMPLE_GROUPS"] = ["car:2", "pedestrian:2"]
     (tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").write_text(yaml.safe_dump(small))
-    changes = ["DATA_CONFIG.DATA_PATH", str(data), "DATA_CONFIG.VERSION", "v1.0-mini"]
-    command, environment = train(trial, python, config, "MixedNuScenes", mixture, changes)
-    trial.run(
-        "CenterPoint", command, cwd=tree / "tools", env=environment | {"OPENPCDET_OUTPUT": str(trial.folder / "nus")},
-        expect=[r"Loss: \d", r"NDS: \d"], minutes=90,
-    )  # fmt: skip
+    changes = f"DATA_CONFIG.DATA_PATH {data} DATA_CONFIG.VERSION v1.0-mini"
+    expect = [r"Loss: \d", r"NDS: \d"]
+    type_training(trial, python, "CenterPoint", "MixedNuScenes", mixture, changes, "nus", expect)
     if not list((trial.folder / "nus").rglob("checkpoint_epoch_1.pth")):
         raise Failed("no checkpoint")
-    return trial.row(f"train.py --cfg_file {config}", ["training", "validation", "checkpoint"], LEFT_OUT)
+    script = "openpcdet train.py --cfg_file cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml"
+    return trial.row(script, ["training", "validation", "checkpoint"], LEFT_OUT)
 
 
-def train(
-    trial: Trial, python: Path, config: str, dataset: str, mixture: dict[str, object], changes: list[str],
-) -> tuple[list[object], dict[str, str]]:  # fmt: skip
-    """The command and its environment."""
+def type_training(
+    trial: Trial,
+    python: Path,
+    title: str,
+    dataset: str,
+    mixture: dict[str, object],
+    changes: str,
+    out: str,
+    expect: list[str],
+) -> str:
+    """Type the page's command for one of its datasets, with the script for a CPU that the page names."""
     file = trial.folder / f"{dataset}.yaml"
     file.write_text(yaml.safe_dump(mixture))
-    options = ["--epochs", 2, "--batch_size", 2, "--workers", 1, "--logger_iter_interval", 1, "--wo_gpu_stat"]
-    changed = ["--set", "DATA_CONFIG.DATASET", dataset, *changes]
-    command = [python, SCRIPTS / "openpcdet_cpu.py", "train.py", "--cfg_file", config, *options, *changed]
-    return command, {"LIDAR_SYNTH_MIX": str(file)}
+    options = "--epochs 2 --batch_size 2 --workers 1 --logger_iter_interval 1 --wo_gpu_stat"
+    names = {
+        "OpenPCDet/tools": trial.folder / "tree" / "tools",
+        "/data/mix.yaml": file,
+        "-m lidar_synth.integrations.openpcdet": SCRIPTS / "openpcdet_cpu.py",
+        "--cfg_file": f"{options} --cfg_file",
+        dataset: f"{dataset} {changes}",
+    }
+    other = "MixedNuScenes" if dataset == "MixedKitti" else "MixedKitti"
+    env = {"OPENPCDET_OUTPUT": str(trial.folder / out)}
+    return trial.type_page(title, python, PAGE, names, skip=f"{PIP}|{other}", env=env, expect=expect, minutes=90)
 
 
 def batches(output: str) -> list[str]:

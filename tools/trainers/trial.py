@@ -19,6 +19,11 @@ STEPS = ("training", "validation", "checkpoint", "resume")
 """What a run of a trainer can show: iterations with finite losses; its own evaluation; a checkpoint on disk; and
 resumed training that sees the samples of an uninterrupted run."""
 
+PIP = "^pip "
+"""``skip`` of ``Trial.type_page`` for what has been installed."""
+NOT_PIP = "^(?!pip )"
+"""``skip`` of ``Trial.type_page`` for all but the installation."""
+
 
 class Failed(Exception):
     """A trial that did not do what it should; the text says what to look at."""
@@ -166,14 +171,14 @@ class Trial:
     def type_page(
         self, title: str, python: Path, page: str, names: Mapping[str, object], *, skip: str = "(?!)", **options: Any
     ) -> str:
-        """Type the shell commands of a trainer's page as they stand, in one shell.
+        """Type the blocks of a trainer's page as they stand, from top to bottom, in one shell; see ``commands_of``.
 
         Args:
             title: name of the log.
             python: of the environment, whose programs come first.
             page: name of a page of ``docs/how-to/trainers``.
             names: what the reader has in place of names in the page, such as ``{"/data/mix.yaml": file}``.
-            skip: a regular expression of commands that the reader leaves out.
+            skip: a regular expression of commands that the reader leaves out; see ``re.search``.
             options: of ``run``.
 
         Returns:
@@ -200,10 +205,22 @@ class Trial:
 
 
 def commands_of(page: str) -> list[str]:
-    """The commands in the shell blocks of a page of ``docs/how-to/trainers``, without comments."""
+    """What the reader of a page of ``docs/how-to/trainers`` types, as commands of a shell, without comments.
+
+    Python and YAML whose first line names a file are saved under that name; other Python is run.
+    """
     text = (ROOT / "docs" / "how-to" / "trainers" / f"{page}.md").read_text()
-    code = "\n".join(re.findall(r"^```sh\n(.*?)^```$", text, re.S | re.M)).replace("\\\n", " ")
-    return [line for line in (re.sub(r"(^|\s+)#.*", "", line) for line in code.splitlines()) if line]
+    commands: list[str] = []
+    for language, code in re.findall(r"^```(sh|python|yaml)\n(.*?)^```$", text, re.S | re.M):
+        file = re.match(r"# ([\w./-]+\.(?:py|yaml))\b", code)
+        if file:
+            commands.append(f"cat > {file[1]} <<'END'\n{code}END")
+        elif language == "python":
+            commands.append(f"python - <<'END'\n{code}END")
+        elif language == "sh":
+            lines = code.replace("\\\n", " ").splitlines()
+            commands += filter(None, (re.sub(r"(^|\s+)#.*", "", line) for line in lines))
+    return commands
 
 
 def wheel_of_checkout(folder: Path) -> Path:

@@ -1,6 +1,6 @@
 """Prepare short trainings of MMDetection3D: lists, mixed lists, databases of objects, and short configurations.
 
-    python tools/trainers/scripts/mmdet3d_prepare.py OUT --kitti KITTI --semantic-kitti DATASET --nuscenes NUSCENES
+    python tools/trainers/scripts/mmdet3d_prepare.py OUT --kitti KITTI --nuscenes NUSCENES
         [--frame NUSCENES_FRAME]
 
 Datasets are copied to OUT/data, where the stock configurations look for them; run the trainer in OUT. KITTI is mixed
@@ -20,7 +20,7 @@ from typing import Any
 from lidar_synth.integrations.detection import write_gt_database
 from lidar_synth.integrations.folders import write_planes
 from lidar_synth.integrations.mmdet3d_infos import write_infos
-from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
+from lidar_synth.integrations.mmdet3d_lists import kitti_list
 from lidar_synth.integrations.mmdet3d_nuscenes import nuscenes_list
 from mmengine.config import Config
 
@@ -33,15 +33,6 @@ CONFIGS = Path(__file__).parents[3] / "configs" / "mmdet3d"
 MIX = {"ratio": 0.5, "seed": 0}
 SPCONV_ON_CPU = ("centerpoint_voxel_nuscenes.py",)
 """Configurations whose sparse convolutions need ``spconv_on_cpu``."""
-
-
-def semantic_kitti(out: Path, scans: int) -> None:
-    """The lists of ``data/semantickitti``, and the mixed one."""
-    root = out / "data" / "semantickitti"
-    for split in ("train", "val"):
-        semantic_kitti_list(root, root / f"semantickitti_infos_{split}.pkl", split)
-    settings = MIX | {"synthetic": town(out / "synthetic", scans, "town")}
-    write_infos(out / "data" / "semantickitti_mixed", root / "semantickitti_infos_train.pkl", settings, data_root=root)
 
 
 def kitti(out: Path, scans: int) -> None:
@@ -145,21 +136,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--kitti", type=Path)
-    parser.add_argument("--semantic-kitti", type=Path)
     parser.add_argument("--nuscenes", type=Path)
     parser.add_argument("--frame", type=Path, help="a real nuScenes key frame: info.json and samples/LIDAR_TOP")
     parser.add_argument("--scans", type=int, default=4, help="number of synthetic scans")
     parser.add_argument("--configs", nargs="*", default=[], help="configurations to shorten")
     options = parser.parse_args()
     out = options.out.resolve()
-    given = {"kitti": options.kitti, "semantickitti": options.semantic_kitti, "nuscenes": options.nuscenes}
+    given = {"kitti": options.kitti, "nuscenes": options.nuscenes}
     for name, root in given.items():
         if root is not None:
             shutil.copytree(root, out / "data" / name)
     if options.kitti:
         kitti(out, options.scans)
-    if options.semantic_kitti:
-        semantic_kitti(out, options.scans)
     if options.nuscenes:
         nuscenes(out, options.scans, options.frame)
     for name in options.configs:
