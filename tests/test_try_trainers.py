@@ -1,5 +1,6 @@
 """The frame of ``tools/try_trainers.py``: commands are judged by their output, and a failure becomes a row."""
 
+import inspect
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -131,7 +132,8 @@ def test_a_failure_is_a_row_and_keeps_the_rows_before(script: Any, tmp_path: Pat
     assert "| **failed**: no validation |" in script.line(done[1])
 
 
-def test_every_trial_has_a_title_and_rows(script: Any) -> None:
+def test_every_trial_has_a_title_and_rows_and_types_its_page(script: Any) -> None:
     for name in script.names():
         module = script.importlib.import_module(f"trainers.{name}")
         assert module.TITLE and callable(module.rows)
+        assert "trial.type_page(" in inspect.getsource(module)

@@ -189,7 +189,7 @@ class Trial:
         """
         script = "\n".join(command for command in commands_of(page) if not re.search(skip, command))
         for name, own in names.items():
-            pattern = rf"(?<![\w./-]){re.escape(name)}(?![\w./-])"
+            pattern = rf"(?<![\w./-]){re.escape(name)}(?![\w.-])"
             if not re.search(pattern, script):
                 raise Failed(f"{title}: {page}.md has no {name!r} in {script!r}")
             script = re.sub(pattern, str(own).replace("\\", r"\\"), script)
