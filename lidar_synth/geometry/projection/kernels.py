@@ -289,11 +289,11 @@ def elevations_from(points, height, elevation):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(error_model="numpy", cache=True)
-def count_sectors(azimuth, counts):  # type: ignore[no-untyped-def]
-    """Count the points of each of K equal sectors of azimuth, from [0, 2 pi] on, in ``counts`` (K,)."""
-    sectors = len(counts)
-    for i in range(len(azimuth)):
-        counts[min(int(azimuth[i] / (_TWO * PI) * _f(sectors)), sectors - 1)] += 1
+def count_octants(points, counts):  # type: ignore[no-untyped-def]
+    """Count the points (N, 3) of each of eight equal sectors of azimuth in ``counts`` (8,), in any order."""
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        counts[4 * (x < _ZERO) + 2 * (y < _ZERO) + (abs(x) < abs(y))] += 1
 
 
 @numba.njit(error_model="numpy", cache=True)
@@ -355,26 +355,25 @@ def medians(values, bounds, middle):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(error_model="numpy", cache=True)
-def distances_from(values, bounds, middle, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (N,) with the distance of each of ``values`` (N,) from the middle (K,) of its part."""
+def spreads(values, bounds, middle, spread):  # type: ignore[no-untyped-def]
+    """Fill ``spread`` (K,) with the median distance of each part of ``values`` (N,) from its ``middle`` (K,)."""
     for k in range(len(middle)):
-        at = _f(middle[k])
-        for i in range(bounds[k], bounds[k + 1]):
-            out[i] = abs(values[i] - at)
+        spread[k] = np.median(np.abs(values[bounds[k] : bounds[k + 1]] - _f(middle[k])))
 
 
 @numba.njit(error_model="numpy", cache=True)
-def heights_of(points, ring, out):  # type: ignore[no-untyped-def]
+def heights_of(points, bounds, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (N,) with the heights of the lasers by pairs of near and distant neighbours of a ring, and return
     their number."""
     found, last_inverse, last_sine = 0, _ZERO, _ZERO
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        distance = max(np.sqrt(x * x + y * y + z * z), _f(0.1))
-        inverse, sine = _ONE / distance, z / distance
-        step = inverse - last_inverse
-        if i > 0 and ring[i] == ring[i - 1] and abs(step) > _f(0.02):
-            out[found] = (sine - last_sine) / step
-            found += 1
-        last_inverse, last_sine = inverse, sine
+    for k in range(len(bounds) - 1):
+        for i in range(bounds[k], bounds[k + 1]):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            distance = max(np.sqrt(x * x + y * y + z * z), _f(0.1))
+            inverse, sine = _ONE / distance, z / distance
+            step = inverse - last_inverse
+            if i > bounds[k] and abs(step) > _f(0.02):
+                out[found] = (sine - last_sine) / step
+                found += 1
+            last_inverse, last_sine = inverse, sine
     return found

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.projection.kernels import (
-    count_sectors,
+    count_octants,
     decreases,
-    distances_from,
     elevations_from,
     heights_of,
     medians,
+    spreads,
     steps_at,
     turns_of,
 )
@@ -44,30 +44,36 @@ def ring_numbers(points: NDArray[np.float32]) -> NDArray[np.int16]:
     Args:
         points: (N, 3) float32 metres, in the order of the file.
     """
-    starts = np.zeros(len(points), bool)
+    bounds = ring_bounds(points)
+    return np.repeat(np.arange(len(bounds) - 1, dtype=np.int16), np.diff(bounds))
+
+
+def ring_bounds(points: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(R + 1,) the first point of each ring, and N, for a scan of N points in raw ring order or a crop of one."""
+    starts = np.empty(0, np.int64)
     groups = _start_candidates(points)
     if groups:
         found = np.array([_best_candidate(group, points) for group in groups])
-        starts[_without_fragments(found, points)] = True
-    return np.cumsum(starts, dtype=np.int16)
+        starts = _without_fragments(found, points)
+    return np.concatenate([[0], starts, [len(points)]]).astype(np.int64)
 
 
-def fault_of(points: NDArray[np.float32], ring: NDArray[np.int16], lasers: Sensor) -> str:
-    """Why the rings from ``ring_numbers`` cannot be those of a sensor, as a text; "" if they can.
+def fault_of(points: NDArray[np.float32], bounds: NDArray[np.int64], lasers: Sensor) -> str:
+    """Why the rings from ``ring_bounds`` cannot be those of a sensor, as a text; "" if they can.
 
     Args:
         points: (N, 3) float32 metres, in the order of the file.
-        ring: (N,) increasing from 0.
+        bounds: (R + 1,) the first point of each ring, and N.
         lasers: the sensor, with one row per laser.
     """
     if not len(points):
         return ""
-    count = int(ring[-1]) + 1
+    count = len(bounds) - 1
     if count > lasers.shape[0]:
         return f"{count} rings found for the {lasers.shape[0]} lasers of {lasers.name!r}"
-    azimuth, flat = turns(points)
-    everywhere = _all_around(azimuth)
+    everywhere = _all_around(points)
     if count > 1 and not everywhere:
+        azimuth, flat = turns(points)
         width = float(np.ptp(np.percentile(azimuth, (1, 99))))
         near = float(np.percentile(flat, 5))
         if width < 3 * (MIN_DECREASE + 2 * MOTION / max(near, 0.1)):
@@ -75,20 +81,18 @@ def fault_of(points: NDArray[np.float32], ring: NDArray[np.int16], lasers: Senso
     beams = lasers.laser_elevations.astype(np.float64)
     gap, extent = float(np.median(-np.diff(beams))), float(beams[0] - beams[-1])
     elevation = np.empty(len(points), np.float32)
-    elevations_from(points, np.float32(_height(points, ring)), elevation)
-    inner = np.flatnonzero(np.diff(ring)) + 1
-    bounds = np.concatenate([[0], inner, [len(points)]])
-    middle, spread = np.empty(count), np.empty(count)
+    elevations_from(points, np.float32(_height(points, bounds)), elevation)
+    middle = np.empty(count)
     medians(elevation, bounds, middle)
-    distances_from(elevation, bounds, middle, flat)
-    medians(flat, bounds, spread)
+    spread = np.empty(count)
+    spreads(elevation, bounds, middle, spread)
     # The limits are loose: motion compensation bends rings near the sensor as much as merged rings would spread.
     if np.median(spread) > gap or spread.max() > min(3 * gap, extent / 6):
         found = f"{np.degrees(np.median(spread)):.2f} degrees (median) and {np.degrees(spread.max()):.2f} (largest)"
         return f"{count} rings found, whose elevations spread by {found}; the lasers are {np.degrees(gap):.2f} apart"
     downward = -np.diff(middle)
     if everywhere:
-        steps_at(elevation, inner, STRAYS, downward)
+        steps_at(elevation, bounds[1:-1], STRAYS, downward)
     if count > 2 and np.median(downward) < gap / 4:
         return f"{count} rings found that do not descend from one to the next, each starting straight ahead"
     return ""
@@ -101,11 +105,11 @@ def turns(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.
     return azimuth, flat
 
 
-def _all_around(azimuth: NDArray[np.float32]) -> bool:
+def _all_around(points: NDArray[np.float32]) -> bool:
     """Whether each of eight sectors of azimuth contains more than 1 % of the points."""
     counts = np.zeros(8, np.int64)
-    count_sectors(azimuth, counts)
-    return bool(counts.min() > 0.01 * len(azimuth))
+    count_octants(points, counts)
+    return bool(counts.min() > 0.01 * len(points))
 
 
 def _elevations(points: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -120,7 +124,7 @@ def _start_candidates(points: NDArray[np.float32]) -> list[NDArray[np.intp]]:
     places, limits = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
     count = decreases(azimuth, flat, np.float32(MIN_DECREASE), np.float32(MOTION), places, limits)
     places, limits = places[:count], limits[:count]
-    if _all_around(azimuth):
+    if _all_around(points):
         limits = np.maximum(limits, np.float32(MIN_DECREASE_ALL_AROUND))
     steps = np.empty(count, np.float32)
     steps_at(azimuth, places, STRAYS, steps)
@@ -161,11 +165,11 @@ def _without_fragments(starts: NDArray[np.intp], points: NDArray[np.float32]) ->
     return np.array([start for i, start in enumerate(starts, 1) if i not in removed], np.intp)
 
 
-def _height(points: NDArray[np.float32], ring: NDArray[np.int16]) -> float:
+def _height(points: NDArray[np.float32], bounds: NDArray[np.int64]) -> float:
     """The height of the lasers above the points' origin, metres, from pairs of near and distant neighbouring points.
 
     A laser at height h with elevation e measures z = h + r sin(e), so h is the change of z / r per change of 1 / r.
     """
     heights = np.empty(len(points), np.float32)
-    count = heights_of(points, ring, heights)
+    count = heights_of(points, bounds, heights)
     return float(np.clip(np.median(heights[:count]), -1, 1)) if count else 0.0

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection.kernels import (
+    Grid,
     along_rays,
     gather,
     grid_of,
@@ -62,15 +63,15 @@ def locate(points: NDArray[np.float32], sensor: Sensor) -> Cells:
         >>> int(cells.point.flat[19966])
         1
     """
-    cell, distance = cells_of(points, sensor)
+    cell, distance = cells_of(points, grid_of(sensor))
     return Cells(cell, distance, nearest_in(cell, distance, sensor)[1])
 
 
-def cells_of(points: NDArray[np.float32], sensor: Sensor) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def cells_of(points: NDArray[np.float32], grid: Grid) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Cell (N,) and range (N,) of each point; see ``locate``."""
     points = _checked(points)
     cell, distance = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
-    locate_points(points, grid_of(sensor), cell, distance)
+    locate_points(points, grid, cell, distance)
     return cell, distance
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.projection.kernels import medians, put_in_rows, sines_of
-from lidar_synth.geometry.projection.rings import fault_of, ring_numbers
+from lidar_synth.geometry.projection.kernels import grid_of, medians, put_in_rows, sines_of
+from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
 from lidar_synth.geometry.projection.spherical import carry, cells_of, nearest_in
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -60,7 +60,8 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         ((64, 1024), 'town/beams')
     """
     lasers = (sensor or scan.sensor).by_beams()
-    cell, distance = cells_of(scan.points, lasers)
+    grid = grid_of(lasers)._replace(edges=np.empty(0, np.float32))  # the rows follow from the rings
+    cell, distance = cells_of(scan.points, grid)
     put_in_rows(cell, laser_rows(scan, lasers, anchor), lasers.shape[1])
     image, index = nearest_in(cell, distance, lasers)
     return RangeImage(image, lasers, carry(scan, index))
@@ -83,10 +84,10 @@ def laser_rows(scan: Scan, lasers: Sensor, anchor: Anchor = "elevation") -> NDAr
             rings = f"rings {scan.ring.min()} to {scan.ring.max()}"
             raise _not_in_rings(scan, f"{rings} for the {height} lasers of {lasers.name!r}")
         return scan.ring.astype(np.int64)
-    ring = ring_numbers(scan.points)
-    if fault := fault_of(scan.points, ring, lasers):
+    bounds = ring_bounds(scan.points)
+    if fault := fault_of(scan.points, bounds, lasers):
         raise _not_in_rings(scan, fault)
-    return _rows_of_rings(scan, ring, lasers, anchor)[ring]
+    return np.repeat(_rows_of_rings(scan, bounds, lasers, anchor), np.diff(bounds))
 
 
 def _not_in_rings(scan: Scan, reason: str) -> DataError:
@@ -97,13 +98,12 @@ def _not_in_rings(scan: Scan, reason: str) -> DataError:
     )
 
 
-def _rows_of_rings(scan: Scan, ring: NDArray[np.int16], lasers: Sensor, anchor: Anchor) -> NDArray[np.int64]:
+def _rows_of_rings(scan: Scan, bounds: NDArray[np.int64], lasers: Sensor, anchor: Anchor) -> NDArray[np.int64]:
     """(R,) the row of each ring."""
-    bounds = np.concatenate([[0], np.flatnonzero(np.diff(ring)) + 1, [len(ring)]])
     count = len(bounds) - 1
     if anchor == "last":
         return np.arange(count) + lasers.shape[0] - count
-    sine, middle = np.empty(len(ring), np.float32), np.empty(count)
+    sine, middle = np.empty(len(scan), np.float32), np.empty(count)
     sines_of(scan.points, sine)
     medians(sine, bounds, middle)
     return _rows_by_elevation(np.arcsin(middle), lasers.laser_elevations)

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.projection import locate, ring_numbers
+from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.projection.kernels import medians, sines_of
-from lidar_synth.geometry.projection.rings import fault_of, turns
+from lidar_synth.geometry.projection.rings import fault_of, ring_bounds, turns
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer.kernels import find_level, neighbours_below, triangulate
 
@@ -96,9 +96,9 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
     lasers = scan.sensor.by_beams()
     turn = np.abs(np.diff(turns(scan.points)[0]))
     if len(turn) and np.median(turn) < ORDERED:
-        ring = ring_numbers(scan.points)
-        if ring[-1] > 0 and not fault_of(scan.points, ring, lasers):
-            return ring.astype(np.int64), False
+        bounds = ring_bounds(scan.points)
+        if len(bounds) > 2 and not fault_of(scan.points, bounds, lasers):
+            return np.repeat(np.arange(len(bounds) - 1), np.diff(bounds)), False
     if len(scan.sensor.starts):
         return _rows_of(scan), True
     sine = np.empty(len(scan), np.float32)

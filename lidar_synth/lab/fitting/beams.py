@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.lines import CAP, Cloud, Model, nearest_beams, refine, residuals
-from lidar_synth.geometry.projection.rings import fault_of, ring_numbers
+from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.peaks import beam_peaks
@@ -138,18 +138,19 @@ def rings_of_file(scans: Sequence[Scan]) -> tuple[str, NDArray[np.int64] | None]
 
 def rings_in_order(points: NDArray[np.float32]) -> NDArray[np.int16] | None:
     """(N,) rings of a scan in KITTI's order of points; None if it is in another order."""
-    ring = ring_numbers(points)
-    count = int(ring[-1]) + 1 if len(ring) else 0
+    bounds = ring_bounds(points)
+    count = len(bounds) - 1
     if not 4 <= count <= 512:
         return None
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).astype(np.float64))
-    bounds = np.flatnonzero(np.diff(ring)) + 1
-    middle = np.sort([np.median(part) for part in np.split(elevation, bounds)])[::-1]
+    middle = np.sort([np.median(part) for part in np.split(elevation, bounds[1:-1])])[::-1]
     try:
         lasers = Sensor("rings", 2, 0.0, 1.0, elevations=tuple(middle))
     except ConfigError:  # two rings with the same elevation
         return None
-    return None if fault_of(points, ring, lasers) else ring
+    if fault_of(points, bounds, lasers):
+        return None
+    return np.repeat(np.arange(count, dtype=np.int16), np.diff(bounds))
 
 
 def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud]:
