@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from blocks import BUILDING, CAR, CAR_BOX, GROUND, REFLECTANCE, ROAD, WALL, image, record
-from conftest import random_scan
+from conftest import Golden, random_scan
 
 from lidar_synth import Town
 from lidar_synth.errors import ConfigError, DataError
@@ -313,3 +313,25 @@ def test_impossible_mounts_are_refused(wrong: dict[str, float]) -> None:
 def test_impossible_measurements_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match="range_noise="):
         Measurement(**wrong)
+
+
+def porous(seed: int = 0) -> Scan:
+    """A small scan with lost returns and with leaves, so that triangles, their rims and gaps all occur."""
+    rng = np.random.default_rng(seed)
+    sensor = Sensor("small", 360, 1.0, 80.0, rows=24, fov_up=4.0, fov_down=-20.0)
+    scan = record(sensor)
+    leaves = np.where((rng.random(len(scan)) < 0.3) & (scan.label == BUILDING), rng.uniform(0.6, 1.0, len(scan)), 1.0)
+    moved = replace(scan, points=(scan.points * leaves[:, None]).astype(np.float32))
+    return moved[rng.random(len(scan)) < 0.9]
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_returns_are_those_of_the_kernels_before_they_were_made_faster(golden: Golden, mount: str) -> None:
+    """The returns that version 0.1.0 gave (tests/golden/README.md)."""
+    target = Sensor("other", 400, 1.0, 80.0, elevations=tuple(np.linspace(3, -16, 12)))
+    found = Transfer(target, MOUNTS[mount])(porous())
+    with np.load(golden / "transfer.npz") as file:
+        before = {name: file[f"{mount} {name}"] for name in ("points", "ring", "label", "reflectance")}
+    assert np.array_equal(found.ring, before["ring"]) and np.array_equal(found.label, before["label"])
+    np.testing.assert_allclose(found.points, before["points"], rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(found.reflectance, before["reflectance"], atol=1e-6)

@@ -195,8 +195,11 @@ class Scan:
 
     def __getitem__(self, keep: Any) -> "Scan":
         """The scan with the points that a mask or an index array selects; everything else is kept."""
+        if isinstance(keep, np.ndarray) and keep.dtype == bool and keep.shape == (len(self),):
+            keep = np.flatnonzero(keep)  # several times as fast as masks for points
         picked = {n: getattr(self, n)[keep] for n in POINT_FIELDS if getattr(self, n) is not None}
-        return replace(self, points=self.points[keep], **picked)
+        points = self.points.take(keep, 0) if isinstance(keep, np.ndarray) else self.points[keep]
+        return replace(self, points=points, **picked)
 
     def fields(self) -> dict[str, NDArray[Any]]:
         """The fields that the scan has for each point besides its position: {name: (N,)}."""

@@ -1,19 +1,20 @@
 """The first hits of a sensor's rays on the surfaces of one scan."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE
-from lidar_synth.geometry.scan import POINT_FIELDS, Scan
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer.kernels import (
+    FootprintShape,
+    Nearest,
+    Vertices,
     hit_footprints,
     hit_triangles,
-    put_in_front,
     rows_above,
-    shape_footprints,
 )
 from lidar_synth.geometry.transfer.rays import Rays
 from lidar_synth.geometry.transfer.surfaces import Surfaces
@@ -28,30 +29,34 @@ on."""
 
 @dataclass
 class Hits:
-    """The first hits of (H, F) rays.
+    """The first hits of (H, F) rays on surfaces of N returns.
 
     Args:
-        rho: horizontal distance in metres; inf = none.
-        reflectance: in [0, 1].
-        facing: cosine of the angle between ray and normal, in [0, 1].
-        carried: fields of ``POINT_FIELDS`` of the nearest return.
+        nearest: the hits.
+        fields: {name: (N,)}, the fields of the returns.
     """
 
-    rho: NDArray[np.float64]
-    reflectance: NDArray[np.float64]
-    facing: NDArray[np.float64]
-    carried: dict[str, NDArray[Any]]
+    nearest: Nearest
+    fields: dict[str, NDArray[Any]]
 
-    def fill(self, other: "Hits") -> None:
-        """Take the hits of others, in place, for rays without one; fields that others lack stay 0."""
-        empty = np.isinf(self.rho) & np.isfinite(other.rho)
-        for name in (f.name for f in fields(self) if f.name != "carried"):
-            getattr(self, name)[empty] = getattr(other, name)[empty]
-        for name, values in self.carried.items():
-            values[empty] = other.carried[name][empty] if name in other.carried else _UNKNOWN.get(name, 0)
+    def add(self, other: "Hits", where: NDArray[np.bool_]) -> None:
+        """Take the hits of others, in place, for some rays (H, F); fields that others lack are 0, labels unknown."""
+        count = len(next(iter(self.fields.values())))
+        more = len(next(iter(other.fields.values())))
+        for name in Nearest._fields:
+            getattr(self.nearest, name)[where] = getattr(other.nearest, name)[where]
+        self.nearest.vertex[where] += count
+        for name, values in self.fields.items():
+            unknown = np.full(more, IGNORE if name == "label" else 0)
+            added = other.fields.get(name, unknown)
+            self.fields[name] = np.concatenate([values, added]).astype(values.dtype)
 
-
-_UNKNOWN = {"label": IGNORE}
+    def carried(self, at: NDArray[np.integer]) -> dict[str, Any]:
+        """{name: (n,)}, the fields of the nearest returns of some rays (n,), numbered row by row, except for
+        reflectance and ring."""
+        vertex = self.nearest.vertex.take(at)
+        names = self.fields.keys() - {"reflectance", "ring"}
+        return {name: self.fields[name].take(vertex) for name in names}
 
 
 def first_hits(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upright: NDArray[np.float64]) -> Hits:
@@ -65,27 +70,22 @@ def first_hits(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upri
         rays: H lasers with F firings.
         upright: (3,) the upward direction in the frame of the rays.
     """
-    scan, shape = surfaces.scan, (len(rays.slope), rays.firings)
+    scan = surfaces.scan
     there = np.isfinite(points[:, 0])
-    azimuth, rho = -np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
+    azimuth = -np.arctan2(points[:, 1], points[:, 0])
+    rho = np.empty(len(points))
     rows = np.empty(len(points), np.int32)
-    rows_above(rho, points[:, 2], rays.slope, rays.height, rows)
+    rows_above(points, rays, rho, rows)
+    vertices = Vertices(points, azimuth, rho, rows, scan.reflectance)
     triangles = surfaces.triangles if there.all() else surfaces.triangles[there[surfaces.triangles].all(1)]
-    value = scan.reflectance.astype(np.float64)
-    lasers = rays.slope, rays.height, rays.first, rays.step
-    solid, vertex = np.full(shape, np.inf), np.zeros(shape, np.int32)
-    mean, facing = np.zeros(shape), np.ones(shape)
-    hit_triangles(points, azimuth, rho, rows, value, triangles, *lasers, rays.directions, solid, vertex, mean, facing)
-    patch, of = np.full(shape, np.inf), np.zeros(shape, np.int32)
+    size = len(rays.slope), rays.firings
+    nothing = np.zeros(size, np.float32)
+    nearest = Nearest(np.full(size, np.inf), np.zeros(size, np.int32), nothing, np.ones_like(nothing))
+    hit_triangles(vertices, triangles, rays, nearest)
     rim = np.flatnonzero(surfaces.rim & there & (rho > 0.05))
-    half, up, down = np.empty((3, len(rim)))
-    normal = np.empty((len(rim), 3))
-    opening = surfaces.step, surfaces.up, surfaces.down
-    shape_footprints(scan.points, points, rho, rim, surfaces.level, *opening, upright, half, up, down, normal)
-    hit_footprints(points[rim], azimuth[rim], rho[rim], normal, half, up, down, _reach(scan, rim), *lasers, patch, of)
-    put_in_front(patch, of, rim, value, *FRONT, solid, vertex, mean, facing)
-    names = [n for n in POINT_FIELDS if n not in ("reflectance", "ring") and getattr(scan, n) is not None]
-    return Hits(solid, mean, facing, {n: getattr(scan, n).take(vertex) for n in names})
+    shape = FootprintShape(scan.points, surfaces.level, surfaces.step / 2, surfaces.up, surfaces.down)
+    hit_footprints(vertices, rim, _reach(scan, rim), shape, upright, rays, FRONT, nearest)
+    return Hits(nearest, scan.fields())
 
 
 def _reach(scan: Scan, which: NDArray[np.intp]) -> NDArray[np.float64]:

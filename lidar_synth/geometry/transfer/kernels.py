@@ -5,10 +5,12 @@ rho = hypot(x, y). A triangle is cut by the cone in a segment, and the segment i
 between its ends. So each triangle visits only the rays that hit it.
 """
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-INF = np.inf
 SAME_RING, SAME_OBJECT, OTHER_OBJECT = np.tan(np.radians(4.0)), np.tan(np.radians(8.0)), np.tan(np.radians(25.0))
 """Smallest angle between a ray and the line from its return to the neighbouring return, for which both are of one
 surface (Bogoslavskyi and Stachniss, "Fast range image-based segmentation", IROS 2016): along a ring, between rings,
@@ -24,6 +26,60 @@ _UNKNOWN = -1
 
 NEAREST, FARTHEST = 0.6, 1.6
 """How far a footprint extends along grazing rays, as a factor of the distance of its return."""
+
+WIDEST_FOOTPRINT = 0.2
+"""Radians to either side of its return by which a footprint extends at most."""
+
+
+class Vertices(NamedTuple):
+    """N returns in the target's frame.
+
+    Args:
+        points: (N, 3) metres.
+        azimuth: (N,) radians, clockwise.
+        rho: (N,) horizontal distance, metres.
+        rows: (N,) of ``rows_above``.
+        value: (N,) is interpolated between them.
+    """
+
+    points: NDArray[np.float64]
+    azimuth: NDArray[np.float64]
+    rho: NDArray[np.float64]
+    rows: NDArray[np.int32]
+    value: NDArray[np.float32]
+
+
+class FootprintShape(NamedTuple):
+    """The shape of the footprints of N returns.
+
+    Args:
+        recorded: (N, 3) metres, in the frame of the sensor that recorded the returns.
+        level: (N,) returns of level surfaces; the footprints of others are vertical and face the target.
+        half: width to either side, metres per metre of distance.
+        up, down: (N,) height above and below the return, metres per metre of distance.
+    """
+
+    recorded: NDArray[np.float32]
+    level: NDArray[np.bool_]
+    half: float
+    up: NDArray[np.float64]
+    down: NDArray[np.float64]
+
+
+class Nearest(NamedTuple):
+    """The nearest hit of each ray.
+
+    Args:
+        rho: (H, F) horizontal distance, metres; inf = none.
+        vertex: (H, F) the nearest of the returns that form the surface.
+        value: (H, F) interpolated between them.
+        facing: (H, F) cosine of the angle between the ray and the normal.
+    """
+
+    rho: NDArray[np.float64]
+    vertex: NDArray[np.int32]
+    value: NDArray[np.float32]
+    facing: NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -54,8 +110,10 @@ def find_level(points, below, level):  # type: ignore[no-untyped-def]
     for i in range(len(points)):
         j = below[i]
         if j >= 0:
-            along = np.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
-            if abs(points[i, 2] - points[j, 2]) <= 0.12 * along + 0.02 and along > 0.05:
+            xi, yi, zi = _exactly(points, i)
+            xj, yj, zj = _exactly(points, j)
+            along = np.sqrt((xi - xj) ** 2 + (yi - yj) ** 2)
+            if abs(zi - zj) <= 0.12 * along + 0.02 and along > 0.05:
                 level[i] = True
     for i in range(len(points)):  # the nearest returns of a surface have no neighbour below
         j = below[i]
@@ -64,16 +122,22 @@ def find_level(points, below, level):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+def _exactly(points, i):  # type: ignore[no-untyped-def]
+    """The coordinates of a float32 point in float64, which differences of near points need."""
+    return np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
 def _joined(points, distance, key, ground, level, i, j, across):  # type: ignore[no-untyped-def]
     """1 if two neighbouring returns are of one surface, else 0."""
     if abs(distance[i] - distance[j]) < NOISE:
         return 1
-    xi, yi, zi, xj, yj, zj = points[i, 0], points[i, 1], points[i, 2], points[j, 0], points[j, 1], points[j, 2]
-    ri, rj = xi * xi + yi * yi + zi * zi, xj * xj + yj * yj + zj * zj
-    far = max(ri, rj)
+    xi, yi, zi = _exactly(points, i)
+    xj, yj, zj = _exactly(points, j)
+    far = max(xi * xi + yi * yi + zi * zi, xj * xj + yj * yj + zj * zj)
     same = key[i] == key[j]
     if across and (same or (ground[i] and ground[j])) and level[i] and level[j]:
-        return int(abs(zi - zj) < 0.1 + 0.03 * np.hypot(xi - xj, yi - yj))
+        return int(abs(zi - zj) < 0.1 + 0.03 * np.sqrt((xi - xj) ** 2 + (yi - yj) ** 2))
     cx, cy, cz = yi * zj - zi * yj, zi * xj - xi * zj, xi * yj - yi * xj
     least = OTHER_OBJECT if not same else SAME_OBJECT if across else SAME_RING
     return int(np.sqrt(cx * cx + cy * cy + cz * cz) >= least * (far - (xi * xj + yi * yj + zi * zj)))
@@ -96,7 +160,7 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
         rings: (K,) number of each ring, increasing.
         starts: (K + 1,) the first return of each ring, and N.
         azimuth: (N,) radians, increasing within a ring.
-        points: (N, 3) metres.
+        points: (N, 3) float32 metres.
         key: (N,) equal for returns of one object.
         ground: (N,) returns with the label of a ground.
         level, below: of ``find_level`` and ``neighbours_below``.
@@ -111,7 +175,8 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
     found, farthest = 0, 2 if bridge else 1
     distance = np.empty(count)
     for i in range(count):
-        distance[i] = np.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1] + points[i, 2] * points[i, 2])
+        x, y, z = _exactly(points, i)
+        distance[i] = np.sqrt(x * x + y * y + z * z)
     rim = np.zeros(count, np.bool_)
     rim[: starts[1]] = True
     rim[starts[len(rings) - 1] :] = True
@@ -164,183 +229,201 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
 
 
 @numba.njit(cache=True, nogil=True)
-def rows_above(rho, z, slope, height, rows):  # type: ignore[no-untyped-def]
-    """Fill ``rows`` (N,) with the number of lasers whose cones pass above each point."""
-    for i in range(len(rho)):
-        rows[i] = _above(rho[i], z[i], slope, height)
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _above(rho, z, slope, height):  # type: ignore[no-untyped-def]
-    low, high = 0, len(slope)
-    while low < high:
-        middle = (low + high) // 2
-        if height[middle] + slope[middle] * rho > z:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+def rows_above(points, rays, rho, rows):  # type: ignore[no-untyped-def]
+    """Fill ``rho`` (N,) with horizontal distances, and ``rows`` (N,) with the number of lasers whose cones pass above
+    each point."""
+    for i in range(len(points)):
+        rho[i] = np.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
+        low = 0
+        high = len(rays.slope)
+        while low < high:
+            middle = (low + high) // 2
+            if rays.height[middle] + rays.slope[middle] * rho[i] > points[i, 2]:
+                low = middle + 1
+            else:
+                high = middle
+        rows[i] = low
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def hit_triangles(  # type: ignore[no-untyped-def]
-    points, azimuth, rho, rows, value, triangles, slope, height, first, step, table, out, vertex, mean, facing
-):
+def hit_triangles(vertices, triangles, rays, nearest):  # type: ignore[no-untyped-def]
     """Find the first triangle that each ray hits.
 
+    Where the cone of a laser passes between the corners of a triangle, one corner is alone on its side. The cone cuts
+    the two edges that meet there.
+
     Args:
-        points, azimuth, rho, rows: (N, ...) returns in the target's frame; ``rows`` of ``rows_above``.
-        value: (N,) is interpolated.
-        triangles: (T, 3).
-        slope, height, first, step: of ``Rays``.
-        table: (H, F, 2) x and y of the rays' directions, or empty.
-        out: (H, F) rho of the hit, metres; inf = none. Nearer hits replace what is there.
-        vertex: (H, F) the nearest corner of the triangle.
-        mean: (H, F) the interpolated value.
-        facing: (H, F) cosine of the angle between the ray and the normal.
+        vertices: N ``Vertices``.
+        triangles: (T, 3) indices of vertices.
+        rays: ``Rays``.
+        nearest: ``Nearest``, filled where a triangle is nearer than what is there.
     """
-    firings, known = out.shape[1], table.shape[1]
-    end, weight = np.zeros((2, 6)), np.zeros(3)  # of each end of the segment: x, y, azimuth, weights of the corners
+    rows = vertices.rows
     for t in range(len(triangles)):
-        corner = triangles[t]
-        origin = azimuth[corner[0]]
-        top = min(rows[corner[0]], rows[corner[1]], rows[corner[2]])
-        bottom = max(rows[corner[0]], rows[corner[1]], rows[corner[2]])
+        i = np.uintp(triangles[t, 0])  # unsigned: no test whether an index counts from the end
+        j = np.uintp(triangles[t, 1])
+        k = np.uintp(triangles[t, 2])
+        top = min(rows[i], rows[j], rows[k])
+        bottom = max(rows[i], rows[j], rows[k])
         if top == bottom:
             continue
-        nx, ny, nz = _normal(points, corner[0], corner[1], corner[2])
-        for r in range(top, bottom):
-            ends = 0
-            for e in range(3):
-                p, q = corner[e], corner[(e + 1) % 3]
-                if (rows[p] <= r) == (rows[q] <= r):
-                    continue
-                over_p = points[p, 2] - height[r] - slope[r] * rho[p]
-                over_q = points[q, 2] - height[r] - slope[r] * rho[q]
-                w = over_p / (over_p - over_q)
-                end[ends, 0] = points[p, 0] + w * (points[q, 0] - points[p, 0])
-                end[ends, 1] = points[p, 1] + w * (points[q, 1] - points[p, 1])
-                at_p = _turn(azimuth[p] - origin)
-                end[ends, 2] = at_p + w * _turn(azimuth[q] - azimuth[p])
-                end[ends, 3 + e], end[ends, 3 + (e + 1) % 3], end[ends, 3 + (e + 2) % 3] = 1 - w, w, 0
-                ends += 1
-            low, high = min(end[0, 2], end[1, 2]) + origin, max(end[0, 2], end[1, 2]) + origin
-            if ends < 2 or high - low > np.pi:
-                continue
-            f = int(np.ceil((low - first[r]) / step))
-            while first[r] + f * step < high:
-                if 0 <= f < known:
-                    dx, dy = table[r, f, 0], table[r, f, 1]
-                else:
-                    dx, dy = np.cos(first[r] + f * step), -np.sin(first[r] + f * step)
-                side0, side1 = end[0, 0] * dy - end[0, 1] * dx, end[1, 0] * dy - end[1, 1] * dx
-                s = min(max(side0 / (side0 - side1), 0.0), 1.0) if side0 != side1 else 0.0
-                x, y = end[0, 0] + s * (end[1, 0] - end[0, 0]), end[0, 1] + s * (end[1, 1] - end[0, 1])
-                along, column = np.hypot(x, y), f % firings
-                f += 1
-                if along >= out[r, column]:
-                    continue
-                out[r, column] = along
-                for e in range(3):
-                    weight[e] = end[0, 3 + e] + s * (end[1, 3 + e] - end[0, 3 + e])
-                mean[r, column] = (
-                    weight[0] * value[corner[0]] + weight[1] * value[corner[1]] + weight[2] * value[corner[2]]
-                )
-                vertex[r, column] = corner[np.argmax(weight)]
-                facing[r, column] = abs(nx * dx + ny * dy + nz * slope[r]) / np.sqrt(1 + slope[r] * slope[r])
+        normal = _normal(vertices.points, i, j, k)
+        for laser in range(top, bottom):
+            alone, one, other = _alone_first(rows, laser, i, j, k)
+            start = _cut(vertices, rays, laser, alone, one)
+            end = _cut(vertices, rays, laser, alone, other)
+            _hit_segment(vertices, (alone, one, other), start, end, normal, rays, laser, nearest)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _alone_first(rows, laser, i, j, k):  # type: ignore[no-untyped-def]
+    """The three corners of a triangle, first the one that is alone on its side of a laser's cone."""
+    below = rows[i] > laser
+    if below == (rows[j] > laser):
+        return k, i, j
+    if below == (rows[k] > laser):
+        return j, k, i
+    return i, j, k
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _cut(vertices, rays, laser, p, q):  # type: ignore[no-untyped-def]
+    """Where the cone of a laser cuts the edge from p to q: share of the way, x, y, azimuth."""
+    points = vertices.points
+    over_p = points[p, 2] - rays.height[laser] - rays.slope[laser] * vertices.rho[p]
+    over_q = points[q, 2] - rays.height[laser] - rays.slope[laser] * vertices.rho[q]
+    share = over_p / (over_p - over_q)
+    x = points[p, 0] + share * (points[q, 0] - points[p, 0])
+    y = points[p, 1] + share * (points[q, 1] - points[p, 1])
+    turn = _turn(vertices.azimuth[q] - vertices.azimuth[p])
+    return share, x, y, vertices.azimuth[p] + share * turn
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _hit_segment(vertices, corners, start, end, normal, rays, laser, nearest):  # type: ignore[no-untyped-def]
+    """Hit a triangle with the firings of a laser between the two cuts of its edges from the first corner."""
+    alone, one, other = corners
+    share0, x0, y0, azimuth0 = start
+    share1, x1, y1, azimuth1 = end
+    low = min(azimuth0, azimuth1) - rays.first[laser]
+    high = max(azimuth0, azimuth1) - rays.first[laser]
+    if high - low > np.pi:
+        return
+    firing = int(np.ceil(low / rays.step))
+    column = firing % rays.firings
+    while firing * rays.step < high:
+        dx = rays.directions[laser, column, 0]
+        dy = rays.directions[laser, column, 1]
+        side0 = x0 * dy - y0 * dx
+        side1 = x1 * dy - y1 * dx
+        s = min(max(side0 / (side0 - side1), 0.0), 1.0) if side0 != side1 else 0.0
+        x = x0 + s * (x1 - x0)
+        y = y0 + s * (y1 - y0)
+        rho = np.sqrt(x * x + y * y)
+        if rho < nearest.rho[laser, column]:
+            of_one = (1 - s) * share0
+            of_other = s * share1
+            of_alone = 1 - of_one - of_other
+            closest = alone
+            if of_one > of_alone:
+                closest = one
+            if of_other > max(of_alone, of_one):
+                closest = other
+            nearest.rho[laser, column] = rho
+            nearest.vertex[laser, column] = closest
+            value = vertices.value
+            nearest.value[laser, column] = of_alone * value[alone] + of_one * value[one] + of_other * value[other]
+            squares = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+            length = np.sqrt(squares * (1 + rays.slope[laser] * rays.slope[laser]))
+            towards = normal[0] * dx + normal[1] * dy + normal[2] * rays.slope[laser]
+            nearest.facing[laser, column] = abs(towards) / length
+        firing += 1
+        column += 1
+        if column == rays.firings:
+            column = 0
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _turn(angle):  # type: ignore[no-untyped-def]
-    """The same angle in [-pi, pi], radians."""
-    return angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
+    """The difference of two azimuths in [-pi, pi], radians."""
+    if angle > np.pi:
+        return angle - 2 * np.pi
+    if angle < -np.pi:
+        return angle + 2 * np.pi
+    return angle
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _normal(points, i, j, k):  # type: ignore[no-untyped-def]
+    """A vector perpendicular to a triangle, of any length."""
     ax, ay, az = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
     bx, by, bz = points[k, 0] - points[i, 0], points[k, 1] - points[i, 1], points[k, 2] - points[i, 2]
-    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    length = np.sqrt(nx * nx + ny * ny + nz * nz) + 1e-12
-    return nx / length, ny / length, nz / length
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@numba.njit(cache=True, nogil=True)
-def hit_footprints(points, azimuth, rho, normal, half, up, down, reach, slope, height, first, step, out, vertex):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def hit_footprints(vertices, which, reach, shape, upright, rays, front, nearest):  # type: ignore[no-untyped-def]
     """Find the first footprint that each ray hits: the patch of a surface that one return of the source stands for.
 
     Args:
-        points, azimuth, rho: (N, ...) returns in the target's frame.
-        normal: (N, 3) of each footprint, unit length.
-        half: (N,) radians to either side.
-        up, down: (N,) metres above and below the return.
-        reach: (N,) metres along a ray beyond which it ends.
-        slope, height, first, step: of ``Rays``.
-        out: (H, F) rho of the hit, metres; inf = none. Nearer hits replace what is there.
-        vertex: (H, F) the return.
-    """
-    firings = out.shape[1]
-    for i in range(len(points)):
-        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
-        x, y, z, distance = points[i, 0], points[i, 1], points[i, 2], rho[i]
-        top, bottom = _above(distance, z + up[i], slope, height), _above(distance, z - down[i], slope, height)
-        for r in range(top, bottom):
-            f = int(np.ceil((azimuth[i] - half[i] - first[r]) / step))
-            while first[r] + f * step < azimuth[i] + half[i]:
-                dx, dy = np.cos(first[r] + f * step), -np.sin(first[r] + f * step)
-                over = nx * x + ny * y + nz * (z - height[r])
-                towards = nx * dx + ny * dy + nz * slope[r]
-                along = over / towards if over * towards > 0 else distance
-                beyond = abs(along - distance) > reach[i]
-                along = min(max(along, NEAREST * distance), FARTHEST * distance)
-                column = f % firings
-                if along < out[r, column] and not beyond:
-                    out[r, column] = along
-                    vertex[r, column] = i
-                f += 1
-
-
-@numba.njit(cache=True, nogil=True)
-def shape_footprints(recorded, points, rho, rim, level, step, rise, fall, upright, half, up, down, normal):  # type: ignore[no-untyped-def]
-    """Fill half, up, down and normal of the footprints of R returns, see ``hit_footprints``.
-
-    Args:
-        recorded: (N, 3) float32, the returns in the frame of the sensor that recorded them.
-        points, rho: (N, ...) in the target's frame.
-        rim: (R,) indices of the returns.
-        level: (N,) returns of level surfaces; the footprints of others are vertical and face the target.
-        step: radians between the recording sensor's firings.
-        rise, fall: (N,) radians, half the angle to its neighbouring rings.
+        vertices: N ``Vertices``.
+        which: (R,) indices of the returns.
+        reach: (R,) metres along a ray beyond which a footprint ends.
+        shape: ``FootprintShape`` of the N returns.
         upright: (3,) the upward direction in the target's frame.
+        rays: ``Rays``.
+        front: metres, and share of its distance, by which a footprint has to lie in front of a triangle to hide it.
+        nearest: ``Nearest`` of ``hit_triangles``, in which footprints replace what they hide.
     """
+    points = vertices.points
+    found = np.zeros(nearest.rho.shape, np.bool_)  # rays that hit a footprint
+    for k in range(len(which)):
+        i = which[k]
+        away = vertices.rho[i]
+        z = points[i, 2]
+        nx, ny, nz = _level_or_upright(points, i, shape.level[i], upright)
+        x0, y0, z0 = shape.recorded[i, 0], shape.recorded[i, 1], shape.recorded[i, 2]
+        distance = np.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
+        half = min(shape.half * distance / away, WIDEST_FOOTPRINT)
+        above = z + shape.up[i] * distance
+        below = z - shape.down[i] * distance
+        top = vertices.rows[i]
+        while top > 0 and rays.height[top - 1] + rays.slope[top - 1] * away <= above:
+            top -= 1
+        for laser in range(top, len(rays.slope)):
+            if rays.height[laser] + rays.slope[laser] * away <= below:
+                break
+            over = nx * points[i, 0] + ny * points[i, 1] + nz * (z - rays.height[laser])
+            low = vertices.azimuth[i] - half - rays.first[laser]
+            firing = int(np.ceil(low / rays.step))
+            column = firing % rays.firings
+            while firing * rays.step < low + 2 * half:
+                dx = rays.directions[laser, column, 0]
+                dy = rays.directions[laser, column, 1]
+                towards = nx * dx + ny * dy + nz * rays.slope[laser]
+                rho = over / towards if over * towards > 0 else away
+                beyond = abs(rho - away) > reach[k]
+                rho = min(max(rho, NEAREST * away), FARTHEST * away)
+                hidden = rho if found[laser, column] else rho * (1 + front[1]) + front[0]
+                if hidden < nearest.rho[laser, column] and not beyond:
+                    found[laser, column] = True
+                    nearest.rho[laser, column] = rho
+                    nearest.vertex[laser, column] = i
+                    nearest.value[laser, column] = vertices.value[i]
+                    nearest.facing[laser, column] = 1.0
+                firing += 1
+                column += 1
+                if column == rays.firings:
+                    column = 0
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _level_or_upright(points, i, level, upright):  # type: ignore[no-untyped-def]
+    """The normal of a footprint: upward, or horizontal and along the ray of its return."""
     ux, uy, uz = upright[0], upright[1], upright[2]
-    for k in range(len(rim)):
-        i = rim[k]
-        x, y, z = recorded[i, 0], recorded[i, 1], recorded[i, 2]
-        distance = np.sqrt(x * x + y * y + z * z)
-        half[k] = min(np.float32(np.float32(step / 2) * distance) / rho[i], 0.2)
-        up[k], down[k] = np.tan(rise[i]) * distance, np.tan(fall[i]) * distance
-        nx, ny, nz = ux, uy, uz
-        if not level[i]:
-            above = points[i, 0] * ux + points[i, 1] * uy + points[i, 2] * uz
-            nx, ny, nz = points[i, 0] - above * ux, points[i, 1] - above * uy, points[i, 2] - above * uz
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            nx, ny, nz = nx / length, ny / length, nz / length
-        normal[k, 0], normal[k, 1], normal[k, 2] = nx, ny, nz
-
-
-@numba.njit(cache=True, nogil=True)
-def put_in_front(patch, of, rim, value, least, share, out, vertex, mean, facing):  # type: ignore[no-untyped-def]
-    """Let footprints hide the triangles that they lie in front of.
-
-    Args:
-        patch, of: (H, F) out and vertex of ``hit_footprints``.
-        rim, value: (R,) returns of the footprints; (N,) value of each return.
-        least, share: metres, and share of its distance, by which a footprint has to lie in front.
-        out, vertex, mean, facing: (H, F) of ``hit_triangles``.
-    """
-    for r in range(out.shape[0]):
-        for f in range(out.shape[1]):
-            if patch[r, f] * (1 + share) + least < out[r, f]:
-                i = rim[of[r, f]]
-                out[r, f], vertex[r, f], mean[r, f], facing[r, f] = patch[r, f], i, value[i], 1.0
+    if level:
+        return ux, uy, uz
+    above = points[i, 0] * ux + points[i, 1] * uy + points[i, 2] * uz
+    nx, ny, nz = points[i, 0] - above * ux, points[i, 1] - above * uy, points[i, 2] - above * uz
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx / length, ny / length, nz / length

@@ -44,7 +44,11 @@ class Mount:
 
     def points(self, points: NDArray[np.floating]) -> Matrix:
         """(N, 3) points of the recording sensor's frame in the target's frame, metres."""
-        return (np.asarray(points, np.float64) - self.matrix[:3, 3]) @ self.matrix[:3, :3]
+        if self == Mount():
+            return points.astype(np.float64)
+        turned = points.astype(np.float64) @ self.matrix[:3, :3]
+        turned -= self.matrix[:3, 3] @ self.matrix[:3, :3]
+        return turned
 
     def boxes(self, boxes: Boxes) -> Boxes:
         """Boxes of the recording sensor's frame in the target's frame.

@@ -16,10 +16,9 @@ class Rays(NamedTuple):
         slope: (H,) tangent of the elevation.
         height: (H,) metres above the sensor's origin at which the laser starts.
         first: (H,) radians, clockwise.
-        step: radians.
+        step: radians; F steps are a full turn.
         firings: F.
-        directions: (H, F, 2) x and y of each ray's direction, per unit of horizontal distance; empty = computed when
-            needed.
+        directions: (H, F, 2) x and y of each ray's direction, per unit of horizontal distance.
     """
 
     slope: NDArray[np.float64]
@@ -27,7 +26,16 @@ class Rays(NamedTuple):
     first: NDArray[np.float64]
     step: float
     firings: int
-    directions: NDArray[np.float64] = np.empty((0, 0, 2))
+    directions: NDArray[np.float64]
+
+
+def rays_from(
+    slope: NDArray[np.float64], height: NDArray[np.float64], first: NDArray[np.float64], firings: int
+) -> Rays:
+    """The rays of H lasers (H,) with F firings each, see ``Rays``."""
+    step = 2 * np.pi / firings
+    turned = first[:, None] + np.arange(firings) * step
+    return Rays(slope, height, first, step, firings, np.stack([np.cos(turned), -np.sin(turned)], -1))
 
 
 @lru_cache(maxsize=16)
@@ -35,9 +43,4 @@ def rays_of(sensor: Sensor) -> Rays:
     """The rays of a sensor."""
     elevation, height = sensor.optics()
     azimuth = sensor.firing_azimuths()
-    count = azimuth.shape[1]
-    first = azimuth[:, 0].copy()
-    step = 2 * np.pi / count
-    turned = first[:, None] + np.arange(count) * step
-    directions = np.stack([np.cos(turned), -np.sin(turned)], -1)
-    return Rays(np.tan(elevation), height, first, step, count, directions)
+    return rays_from(np.tan(elevation), height, azimuth[:, 0].copy(), azimuth.shape[1])

@@ -45,23 +45,26 @@ class Measurement:
     def returned(
         self,
         distance: NDArray[np.float64],
-        reflectance: NDArray[np.float64],
-        facing: NDArray[np.float64],
+        reflectance: NDArray[np.float32],
+        facing: NDArray[np.float32],
+        at: NDArray[np.int32],
         rng: np.random.Generator,
     ) -> NDArray[np.bool_]:
         """(N,) which of N hits return.
 
         Args:
             distance: (N,) metres.
-            reflectance: (N,) in [0, 1].
-            facing: (N,) cosine of the angle of incidence.
+            reflectance: (H, F) of each ray's hit, in [0, 1].
+            facing: (H, F) cosine of the angle of incidence.
+            at: (N,) the ray of each hit, numbered row by row.
             rng: samples the losses.
         """
-        kept = np.full(len(distance), 1 - self.loss)
-        if self.reach is not None:
-            signal = np.maximum(reflectance, DARKEST) * facing * (self.reach / distance) ** 2 / 0.1
-            kept *= signal**2 / (1 + signal**2)
-        return np.asarray(rng.random(len(distance)) < kept)
+        uniform = rng.random(len(distance))
+        if self.reach is None:
+            return np.asarray(uniform < 1 - self.loss)
+        strength = np.maximum(reflectance.take(at), DARKEST) * facing.take(at)
+        signal = strength * (self.reach / distance) ** 2 / 0.1
+        return np.asarray(uniform < (1 - self.loss) * (signal**2 / (1 + signal**2)))
 
     def ranges(self, distance: NDArray[np.float64], target: Sensor, rng: np.random.Generator) -> NDArray[np.float64]:
         """(N,) measured ranges of hits at a distance (N,), metres, in the steps of the target."""
@@ -70,55 +73,65 @@ class Measurement:
         step = target.range_step
         return distance if step is None else np.round(distance / step) * step
 
-    def reflectances(self, reflectance: NDArray[np.float64], target: Sensor) -> NDArray[np.float32]:
+    def reflectances(self, reflectance: NDArray[np.floating], target: Sensor) -> NDArray[np.float32]:
         """(N,) measured reflectances in [0, 1], in the levels of the target: multiples of 1 / levels below 1."""
         if self.response is not None:
             reflectance = self.response(reflectance)
         levels = target.reflectance_levels
         if levels is not None:
             reflectance = np.minimum(np.round(reflectance * levels), levels - 1) / levels
-        return np.clip(reflectance, 0, 1).astype(np.float32)
+        return np.asarray(np.clip(reflectance, 0, 1), np.float32)
 
 
 @numba.njit(cache=True, nogil=True)
-def gather_hits(rho, slope, row, firing, distance):  # type: ignore[no-untyped-def]
+def gather_hits(rho, slope, at, distance):  # type: ignore[no-untyped-def]
     """Find the rays that hit something, row by row.
 
     Args:
         rho: (H, F) metres; inf = none.
         slope: (H,) of ``Rays``.
-        row, firing: (H * F,) of each of N hits, in the first N places.
+        at: (H * F,) the ray of each of N hits, numbered row by row, in the first N places.
         distance: (H * F,) metres from the laser, in the first N places.
 
     Returns:
         N.
     """
     found = 0
+    firings = rho.shape[1]
     for r in range(rho.shape[0]):
         secant = np.sqrt(1 + slope[r] * slope[r])
-        for f in range(rho.shape[1]):
+        for f in range(firings):
             if rho[r, f] < np.inf:
-                row[found], firing[found], distance[found] = r, f, rho[r, f] * secant
+                at[found] = r * firings + f
+                distance[found] = rho[r, f] * secant
                 found += 1
     return found
 
 
 @numba.njit(cache=True, nogil=True)
-def place_returns(row, firing, distance, slope, height, directions, low, high, points, inside):  # type: ignore[no-untyped-def]
-    """Fill ``points`` (N, 3) float32 with the returns of rays, and ``inside`` (N,) with whether they are in range.
+def place_returns(at, distance, rays, low, high, points):  # type: ignore[no-untyped-def]
+    """Place the returns of rays, and drop those that are out of range.
 
     Args:
-        row, firing: (N,) of each return.
+        at: (N,) the ray of each return, numbered row by row; the M that are in range move to the first places.
         distance: (N,) measured from the laser, metres.
-        slope, height, directions: of ``Rays``.
+        rays: ``Rays``.
         low, high: limits of the range from the sensor's origin, metres.
+        points: (N, 3) float32, metres, filled in the first M places.
+
+    Returns:
+        M.
     """
-    for i in range(len(row)):
-        r, f = row[i], firing[i]
-        rho = distance[i] / np.sqrt(1 + slope[r] * slope[r])
-        x = np.float32(rho * directions[r, f, 0])
-        y = np.float32(rho * directions[r, f, 1])
-        z = np.float32(height[r] + rho * slope[r])
-        points[i, 0], points[i, 1], points[i, 2] = x, y, z
+    found = 0
+    for i in range(len(at)):
+        r, f = divmod(at[i], rays.firings)
+        rho = distance[i] / np.sqrt(1 + rays.slope[r] * rays.slope[r])
+        x = np.float32(rho * rays.directions[r, f, 0])
+        y = np.float32(rho * rays.directions[r, f, 1])
+        z = np.float32(rays.height[r] + rho * rays.slope[r])
         away = np.sqrt(x * x + y * y + z * z)
-        inside[i] = rho > 0 and low <= away <= high
+        if rho > 0 and low <= away <= high:
+            points[found, 0], points[found, 1], points[found, 2] = x, y, z
+            at[found] = at[i]
+            found += 1
+    return found

@@ -12,10 +12,14 @@ from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.projection.kernels import medians, sines_of
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds, turns
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.kernels import find_level, neighbours_below, triangulate
 
 ORDERED = np.radians(2.0)
-"""Median step of azimuth between successive points of a file that may be in ring order, radians."""
+"""Half of the steps of azimuth between successive points of a file that may be in ring order are smaller, radians."""
+
+SAMPLES = 4096
+"""Number of returns that decide whether a scan lies on rows or on beams."""
 
 SCATTERED = 0.1
 """Neighbours along a ring differ in elevation by less than this share of the gap between rings, in the median: by 0.01
@@ -33,7 +37,7 @@ class Surfaces:
         rim: (N,) bool, returns that some side has no triangle.
         level: (N,) bool, returns of nearly level surfaces.
         step: radians between firings.
-        up, down: (N,) radians, half the angle to the neighbouring rings.
+        up, down: (N,) tangent of half the angle to the neighbouring rings.
         bounds: lowest and highest elevation, radians, that the rings cover.
     """
 
@@ -61,29 +65,32 @@ def estimate(scan: Scan) -> Surfaces:
     _check(scan)
     ring, on_grid = rings_of(scan)
     azimuth = -np.arctan2(scan.points[:, 1], scan.points[:, 0]).astype(np.float64)
-    order = np.argsort(ring * 8.0 + azimuth)
+    order = np.argsort(ring * 8.0 + azimuth, kind="stable")  # fast where rings are in order, as in most files
     scan, ring, azimuth = scan[order], ring[order], azimuth[order]
     starts = np.flatnonzero(np.append(True, ring[1:] != ring[:-1]))
     present = ring[starts]
     if len(present) < 2:
         raise DataError(f"scan {scan.id!r} with returns of one beam only", "at least two beams, to find surfaces")
     starts = np.append(starts, len(scan)).astype(np.int64)
-    points = scan.points.astype(np.float64)
-    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    elevation = _elevations(scan)
     middle = np.empty(len(present))
     medians(elevation, starts, middle)
     _check_rings(scan, elevation, starts, middle)
     step = _step(azimuth, starts, scan)
     below, level = np.empty(len(scan), np.int64), np.empty(len(scan), bool)
     neighbours_below(starts, azimuth, step, on_grid, below)
-    find_level(points, below, level)
+    find_level(scan.points, below, level)
     ground = np.ones(len(scan), bool) if scan.label is None else GROUND[scan.label] | (scan.label == IGNORE)
-    triangles, rim = triangulate(present, starts, azimuth, points, _objects(scan), ground, level, below, step, on_grid)
+    triangles, rim = triangulate(
+        present, starts, azimuth, scan.points, _objects(scan), ground, level, below, step, on_grid
+    )
     half = np.maximum(-np.diff(middle), 0) / np.diff(present) / 2
     up, down = np.concatenate([half[:1], half]), np.concatenate([half, half[-1:]])
     counts = np.diff(starts)
     bounds = float(middle.min() - down[-1]), float(middle.max() + up[0])
-    return Surfaces(scan, azimuth, triangles, rim, level, step, np.repeat(up, counts), np.repeat(down, counts), bounds)
+    up = np.repeat(np.tan(up), counts)
+    down = np.repeat(np.tan(down), counts)
+    return Surfaces(scan, azimuth, triangles, rim, level, step, up, down, bounds)
 
 
 def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
@@ -94,21 +101,30 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
     if scan.ring is not None:
         return scan.ring.astype(np.int64), False
     lasers = scan.sensor.by_beams()
-    turn = np.abs(np.diff(turns(scan.points)[0]))
-    if len(turn) and np.median(turn) < ORDERED:
+    turn = np.diff(turns(scan.points)[0])
+    if 2 * np.count_nonzero((turn >= 0) & (turn < ORDERED)) > len(turn):
         bounds = ring_bounds(scan.points)
         if len(bounds) > 2 and not fault_of(scan.points, bounds, lasers):
             return np.repeat(np.arange(len(bounds) - 1), np.diff(bounds)), False
     if len(scan.sensor.starts):
         return _rows_of(scan), True
+    elevation = _elevations(scan)
+    some = elevation[:: 1 + len(elevation) // SAMPLES]
+    off = [np.median(np.abs(some - s.row_elevations()[_row(some, s)])) for s in (scan.sensor, lasers)]
+    on_grid = bool(off[0] <= off[1])
+    return _row(elevation, scan.sensor if on_grid else lasers), on_grid
+
+
+def _elevations(scan: Scan) -> NDArray[np.float32]:
+    """(N,) elevation of each return, radians."""
     sine = np.empty(len(scan), np.float32)
     sines_of(scan.points, sine)
-    elevation = np.arcsin(np.clip(sine, -1, 1))
-    rows = [np.searchsorted(-s.edges[1:-1], -elevation) for s in (scan.sensor, lasers)]
-    centres = [scan.sensor.row_elevations(), lasers.laser_elevations]
-    off = [np.median(np.abs(elevation - c[r])) for r, c in zip(rows, centres, strict=True)]
-    best = int(off[1] < off[0])
-    return rows[best], best == 0
+    return np.arcsin(np.clip(sine, -1, 1))
+
+
+def _row(elevation: NDArray[np.float32], sensor: Sensor) -> NDArray[np.int64]:
+    """(N,) row of a sensor's grid at each elevation (N,), radians."""
+    return np.searchsorted(-sensor.edges[1:-1], -elevation)
 
 
 def _rows_of(scan: Scan) -> NDArray[np.int64]:
@@ -127,13 +143,13 @@ def _check(scan: Scan) -> None:
 
 
 def _check_rings(
-    scan: Scan, elevation: NDArray[np.float64], starts: NDArray[np.int64], middle: NDArray[np.float64]
+    scan: Scan, elevation: NDArray[np.float32], starts: NDArray[np.int64], middle: NDArray[np.float64]
 ) -> None:
     """Refuse points that do not lie on rings, such as those of a map."""
     gap = np.median(np.abs(np.diff(middle)))
     jump = np.abs(np.diff(elevation))
     jump[starts[1:-1] - 1] = 0
-    if np.median(jump) > SCATTERED * gap:
+    if 2 * np.count_nonzero(jump > SCATTERED * gap) > len(jump):
         raise DataError(
             f"scan {scan.id!r}: its points lie on no rings of {scan.sensor.name!r} (neighbours differ by "
             f"{np.degrees(np.median(jump)):.2f} degrees of elevation, rings by {np.degrees(gap):.2f})",

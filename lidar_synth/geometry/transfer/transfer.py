@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,7 @@ class Transfer:
 
     def __call__(self, scan: Scan, rng: np.random.Generator | None = None) -> Scan:
         """The scan as the target sensor would have recorded it; see ``cast``."""
-        return self.cast(scan, rng).scan
+        return self._seen_by_target(scan, rng or keyed_rng(0), ())[0]
 
     def cast(self, scan: Scan, rng: np.random.Generator | None = None, sweeps: Sequence[Scan] = ()) -> Transferred:
         """The scan as the target sensor would have recorded it, and the share of its field of view that was seen.
@@ -91,20 +91,30 @@ class Transfer:
             DataError: on a scan without a return, with one beam only, with points on no rings or that are not finite;
                 if nothing of it is in the target's field of view; on sweeps without poses.
         """
-        rays, rng = rays_of(self.target), rng or keyed_rng(0)
+        result, surfaces = self._seen_by_target(scan, rng or keyed_rng(0), sweeps)
+        return Transferred(result, _seen(surfaces, self.target, self.mount))
+
+    def _seen_by_target(self, scan: Scan, rng: np.random.Generator, sweeps: Sequence[Scan]) -> tuple[Scan, Surfaces]:
+        """The scan as the target sensor would have recorded it, and the surfaces of the given one."""
+        rays = rays_of(self.target)
         surfaces = estimate(self._without_vehicle(scan))
         _warn_of_differences(scan.sensor, self.target, self.mount.pitch, self.measurement.response is None)
-        seen = _seen(surfaces, self.target, self.mount)
         upright = self.mount.matrix[2, :3]
         hits = first_hits(surfaces, self.mount.points(surfaces.scan.points), rays, upright)
-        others = [estimate(self._without_vehicle(sweep)) for sweep in sweeps]
-        if others:
-            placed = [self.mount.points(moved(other.scan, scan)) for other in others]
-            found = [first_hits(other, points, rays, upright) for other, points in zip(others, placed, strict=True)]
-            hits.carried.pop("time", None)  # sweeps count from moments of their own
-            hits.fill(_nearest(found, hits))
+        further: Hits | None = None
+        for sweep in sweeps:
+            other = estimate(self._without_vehicle(sweep))
+            found = first_hits(other, self.mount.points(moved(other.scan, scan)), rays, upright)
+            if further is None:
+                further = found
+            else:
+                further.add(found, found.nearest.rho < further.nearest.rho)
+        if further is not None:
+            hits.fields.pop("time", None)  # sweeps count from moments of their own
+            hits.add(further, np.isinf(hits.nearest.rho) & np.isfinite(further.nearest.rho))
         returns = self._returns(hits, rays, rng)
         if not len(returns):
+            seen = _seen(surfaces, self.target, self.mount)
             raise DataError(
                 f"scan {scan.id!r} of {scan.sensor.name!r}: none of its surfaces lies within the field of view and the "
                 f"range of {self.target.name!r} ({self.target.down:.1f} to {self.target.up:.1f} degrees; "
@@ -115,7 +125,7 @@ class Transfer:
         boxes = None if scan.boxes is None else self.mount.boxes(scan.boxes)
         pose = None if scan.pose is None else scan.pose @ self.mount.matrix
         kept = {name: getattr(scan, name) for name in ("image_path", "id", "domain", "provenance")}
-        return Transferred(replace(returns, boxes=boxes, pose=pose, **kept), seen)
+        return replace(returns, boxes=boxes, pose=pose, **kept), surfaces
 
     def _without_vehicle(self, scan: Scan) -> Scan:
         """The scan without returns of the vehicle that carries its sensor, where the target has another mount."""
@@ -128,23 +138,21 @@ class Transfer:
 
     def _returns(self, hits: Hits, rays: Rays, rng: np.random.Generator) -> Scan:
         """The returns of the rays that hit something, row by row."""
-        size = hits.rho.size
-        row, firing, distance = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size)
-        count = gather_hits(hits.rho, rays.slope, row, firing, distance)
-        row, firing, distance = row[:count], firing[:count], distance[:count]
-        at = row * rays.firings + firing
-        kept = self.measurement.returned(distance, hits.reflectance.take(at), hits.facing.take(at), rng)
+        nearest = hits.nearest
+        at, distance = np.empty(nearest.rho.size, np.int32), np.empty(nearest.rho.size)
+        count = gather_hits(nearest.rho, rays.slope, at, distance)
+        at, distance = at[:count], distance[:count]
+        kept = self.measurement.returned(distance, nearest.value, nearest.facing, at, rng)
         if not kept.all():
-            row, firing, distance, at = row[kept], firing[kept], distance[kept], at[kept]
+            at, distance = at[kept], distance[kept]
         distance = self.measurement.ranges(distance, self.target, rng)
-        points, inside = np.empty((len(row), 3), np.float32), np.empty(len(row), bool)
+        points = np.empty((len(at), 3), np.float32)
         limits = np.float32(self.target.range_min), np.float32(self.target.range_max)
-        place_returns(row, firing, distance, rays.slope, rays.height, rays.directions, *limits, points, inside)
-        if not inside.all():
-            points, row, at = points[inside], row[inside], at[inside]
-        carried: dict[str, Any] = {name: values.take(at) for name, values in hits.carried.items()}
-        reflectance = self.measurement.reflectances(hits.reflectance.take(at), self.target)
-        return Scan(points, reflectance, self.target, ring=row.astype(np.int16), **carried)
+        count = place_returns(at, distance, rays, *limits, points)
+        at = at[:count]
+        reflectance = self.measurement.reflectances(nearest.value.take(at), self.target)
+        ring = (at // rays.firings).astype(np.int16)
+        return Scan(points[:count], reflectance, self.target, ring=ring, **hits.carried(at))
 
     @property
     def identity(self) -> str:
@@ -227,19 +235,3 @@ def _views(target: Sensor, mount: Mount) -> tuple[NDArray[np.float64], NDArray[n
 def _sector(angle: NDArray[np.floating]) -> NDArray[np.int64]:
     """The sector of an angle in [-pi, pi], radians."""
     return np.asarray(np.floor(angle / (2 * np.pi) * SECTORS), np.int64) % SECTORS
-
-
-def _nearest(several: list[Hits], like: Hits) -> Hits:
-    """The nearest hit of each ray among several."""
-    order = np.argmin(np.stack([hits.rho for hits in several]), 0)
-    names = [n for n in like.carried if all(n in hits.carried for hits in several)]
-
-    def pick(arrays: list[NDArray[Any]]) -> NDArray[Any]:
-        return np.asarray(np.choose(order, arrays))
-
-    return Hits(
-        pick([h.rho for h in several]),
-        pick([h.reflectance for h in several]),
-        pick([h.facing for h in several]),
-        {name: pick([h.carried[name] for h in several]) for name in names},
-    )

@@ -17,7 +17,7 @@ from lidar_synth.datasets.classes import GROUND
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
-from lidar_synth.geometry.transfer.rays import Rays
+from lidar_synth.geometry.transfer.rays import rays_from
 from lidar_synth.geometry.transfer.surfaces import Surfaces, estimate, rings_of
 from lidar_synth.labels.boxes import grown, joined, overlapping
 from lidar_synth.labels.edit.compose import composed, next_instance
@@ -262,12 +262,12 @@ def _hits(
     rings, first, which = np.unique(rays.ring[window], return_index=True, return_inverse=True)
     slope = np.array([np.median(rays.slope[window[which == k]]) for k in range(len(rings))])
     count = round(2 * np.pi / rays.step)
-    raster = Rays(slope, rays.height[window[first]], rays.azimuth[window[first]], rays.step, count)
+    raster = rays_from(slope, rays.height[window[first]], rays.azimuth[window[first]], count)
     hits = first_hits(surfaces, placed.points(surfaces.scan.points), raster, np.array([0.0, 0.0, 1.0]))
     if len(window):
         firing = np.rint((rays.azimuth[window] - raster.first[which]) / rays.step).astype(np.intp) % count
         at = np.stack([which, firing], 1)
-        rho = hits.rho[which, firing]
+        rho = hits.nearest.rho[which, firing]
         points = rays.points(window, np.where(np.isfinite(rho), rho, 0.0))
         rho[~Boxes(placed.box, ("Misc",)).enlarged(BESIDE).contain(points)[0]] = np.inf
     return rho, hits, at
@@ -299,9 +299,9 @@ def _behind(rays: ScanRays, window: NDArray[np.intp], rho: NDArray[np.float64]) 
 def _fields(scan: Scan, item: Object, hits: Hits, at: NDArray[np.intp]) -> dict[str, Any]:
     """The fields of the object's points that the scan has."""
     row, firing = at.T
-    fields: dict[str, Any] = {"reflectance": hits.reflectance[row, firing].astype(np.float32)}
+    fields: dict[str, Any] = {"reflectance": hits.nearest.value[row, firing].astype(np.float32)}
     if scan.label is not None:
-        fields["label"] = hits.carried["label"][row, firing].astype(np.uint8)
+        fields["label"] = hits.fields["label"][hits.nearest.vertex[row, firing]]
     if scan.instance is not None:
         fields["instance"] = np.full(len(row), next_instance(scan), np.int32)
     if scan.confidence is not None:
