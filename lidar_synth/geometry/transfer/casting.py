@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.transfer.kernels import (
+from lidar_synth.geometry.transfer.hits import (
     FootprintShape,
     Nearest,
     Vertices,
